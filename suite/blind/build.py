@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,6 @@ from suite.blind.oracle.information import (
     LONG_S,
     REQUIRED,
     THRESHOLD,
-    Information,
     alternatives,
     columns_of,
     detectable,
@@ -67,13 +67,13 @@ def build(case: Case) -> Built:
     Raises:
         WorkFailed: if no draw of flights and strengths gave valid flights.
     """
-    reasons = []
+    reason = ""
     for attempt in range(TRIES):
         try:
             return _attempt(case, np.random.default_rng([*case.seed, attempt]))
         except (FlightFailed, _Unsuitable) as error:
-            reasons.append(str(error))
-    raise WorkFailed(f"{case.kind} {case.hidden}: no valid flights in {TRIES} draws: {reasons[-1]}")
+            reason = str(error)
+    raise WorkFailed(f"{case.kind} {case.hidden}: no valid flights in {TRIES} draws: {reason}")
 
 
 class _Unsuitable(Exception):
@@ -82,11 +82,40 @@ class _Unsuitable(Exception):
 
 def _attempt(case: Case, rng: np.random.Generator) -> Built:
     """Make the case with one draw of flights and strengths, from `rng`."""
-    trajectories, sensors = _trajectories(case, rng), SENSORS[case.sensors]
+    trajectories = _trajectories(case, rng)
     simulator = simulator_for(case, rng)
-    nominal = simulator.nominal
-    if case.kind == "outside":
-        return _build_outside(case, simulator, sensors, trajectories, rng)
+    hide = _hide_outside if case.kind == "outside" else _hide_effects
+    truth, flown, answer = hide(case, simulator, trajectories, rng)
+    logs = flown(rng)
+    if simulator.conditions:
+        answer["conditions"] = simulator.conditions
+    answer["case"] = asdict(case)
+    answer["trajectories"] = [asdict(way) for way in trajectories]
+    # Without a salt a short answer could be guessed from its hash.
+    answer["salt"] = rng.bytes(16).hex()
+    return Built(simulator.nominal, truth, tuple(trajectories), logs, answer)
+
+
+def _trajectories(case: Case, rng: np.random.Generator) -> list[Trajectory]:
+    """Return the trajectories of a case; slow effects need long flights."""
+    if case.separation >= 0:
+        entry = SEPARATIONS[case.separation]
+        added = entry.separating if case.kind == "separated" else ()
+        return [*entry.blurred, *entry.blurred, *added]
+    if case.kind != "outside" and any(EFFECTS[name].slow for name in case.hidden):
+        return long_flights(rng)
+    return ordinary_flights(rng)
+
+
+Hidden = tuple[Vehicle, LogFlights, dict[str, Any]]
+"""The vehicle that flew, the function that makes the logs of its flights, and the answer."""
+
+
+def _hide_effects(
+    case: Case, simulator: Simulator, trajectories: Sequence[Trajectory], rng: np.random.Generator
+) -> Hidden:
+    """Fly with the hidden effects of a case; a null has none."""
+    nominal, sensors = simulator.nominal, SENSORS[case.sensors]
     # 1. Draw the hidden effects: change of the parameters, strength, values.
     changes, multiples, effects = {}, {}, {}
     # A blurred and a separated case are twins, so their truth must not depend on the channels.
@@ -101,7 +130,7 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
     if case.separation >= 0 and has_voltage:
         _depend_on_voltage(nominal, changes, effects)
     # 2. Fly, and compute the names that the flights allow; random effects are not reproducible.
-    truth = with_effects(simulator.nominal, effects)
+    truth = with_effects(nominal, effects)
     flown = simulator.fly(truth, trajectories, rng)
     steady = {name: change for name, change in changes.items() if not EFFECTS[name].random}
     expected = _expected_names(case, nominal, flown(None), sensors, steady) if steady else {}
@@ -118,7 +147,7 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
             for name in case.hidden
         ],
     }
-    return _built(case, simulator, truth, trajectories, flown, answer, rng)
+    return truth, flown, answer
 
 
 def _expected_names(
@@ -134,10 +163,17 @@ def _expected_names(
     alternatives that a diagnosis must name too, `allowed` those that it may name. `left_over` has
     the log-likelihood ratio that remains with each alternative, `left_over_of_long_stretches` the
     same for longer rollouts.
+
+    Raises:
+        _Unsuitable: for a pair of effects that are hard to separate.
     """
     info = information(nominal, logs, sensors)
     if case.kind == "pair":
-        _check_pair(info, changes, nominal)
+        # One effect must not explain most of the other: they would be hard to separate.
+        for name, other in permutations(changes):
+            alone = {name: changes[name]}
+            if remaining_ratio(info, alone, name, other, nominal) < 2.0 * THRESHOLD:
+                raise _Unsuitable(f"{other} explains most of {name}")
     long_info = information(nominal, logs, sensors, horizon_s=LONG_S)
     # Remaining log-likelihood ratios of the alternatives, in short and in long rollouts.
     short, long = (alternatives(each, changes, nominal) for each in (info, long_info))
@@ -186,19 +222,15 @@ def _blurred_strength(case: Case, nominal: Vehicle, name: str, change: np.ndarra
     return case.multiple * detectable(info.block(name), change) * change
 
 
-def _build_outside(
-    case: Case,
-    simulator: Simulator,
-    sensors: Sensors,
-    trajectories: Sequence[Trajectory],
-    rng: np.random.Generator,
-) -> Built:
-    """Make a case with physics that no effect describes.
+def _hide_outside(
+    case: Case, simulator: Simulator, trajectories: Sequence[Trajectory], rng: np.random.Generator
+) -> Hidden:
+    """Fly with physics that no effect describes.
 
     The strength is `case.multiple` times the strength that is just detectable after a fit of all
     effects of the catalogue. It is computed from a flight at the usual strength.
     """
-    name, nominal = case.hidden[0], simulator.nominal
+    name, nominal, sensors = case.hidden[0], simulator.nominal, SENSORS[case.sensors]
     kind = KINDS[name]
 
     def fly_at(strength: float) -> tuple[LogFlights, float]:
@@ -223,7 +255,7 @@ def _build_outside(
             "multiple": float(np.sqrt(ratio / THRESHOLD)),
         },
     }
-    return _built(case, simulator, simulator.nominal, trajectories, flown, answer, rng)
+    return nominal, flown, answer
 
 
 def unexplained_ratio(nominal: Vehicle, logs: Sequence[FlightLog], sensors: Sensors) -> float:
@@ -234,49 +266,3 @@ def unexplained_ratio(nominal: Vehicle, logs: Sequence[FlightLog], sensors: Sens
     jacobian = jacobian[:, column_norm > 0.0] / column_norm[column_norm > 0.0]
     fitted = np.linalg.lstsq(jacobian, residual, rcond=1e-6)[0]
     return float(0.5 * ((residual - jacobian @ fitted) ** 2).sum())
-
-
-def _trajectories(case: Case, rng: np.random.Generator) -> list[Trajectory]:
-    """Return the trajectories of a case; slow effects need long flights."""
-    if case.separation >= 0:
-        entry = SEPARATIONS[case.separation]
-        added = entry.separating if case.kind == "separated" else ()
-        return [*entry.blurred, *entry.blurred, *added]
-    if case.kind != "outside" and any(EFFECTS[name].slow for name in case.hidden):
-        return long_flights(rng)
-    return ordinary_flights(rng)
-
-
-def _check_pair(info: Information, changes: dict[str, np.ndarray], nominal: Vehicle) -> None:
-    """Reject two effects if one of them explains most of the other: they would be hard to separate.
-
-    Raises:
-        _Unsuitable: for such a pair.
-    """
-    first, second = changes
-    for name, other in ((first, second), (second, first)):
-        ratio = remaining_ratio(info, {name: changes[name]}, name, other, nominal)
-        if ratio < 2.0 * THRESHOLD:
-            raise _Unsuitable(f"{other} explains most of {name}")
-
-
-def _built(
-    case: Case,
-    simulator: Simulator,
-    truth: Vehicle,
-    trajectories: Sequence[Trajectory],
-    flown: LogFlights,
-    answer: dict[str, Any],
-    rng: np.random.Generator,
-) -> Built:
-    """Return the case with noisy logs, and with an answer that also says how it was made."""
-    logs = flown(rng)
-    answer = {
-        **answer,
-        **({"conditions": simulator.conditions} if simulator.conditions else {}),
-        "case": asdict(case),
-        "trajectories": [asdict(way) for way in trajectories],
-        # Without a salt a short answer could be guessed from its hash.
-        "salt": rng.bytes(16).hex(),
-    }
-    return Built(simulator.nominal, truth, tuple(trajectories), logs, answer)

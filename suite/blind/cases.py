@@ -1,14 +1,12 @@
 """Draw the blind cases of a set from its seed: which effects are hidden, at which strength.
 
-A blind case is a set of flights with hidden effects, which the diagnosis must name. A null is a
-case without a hidden effect. The order of the cases is random, so that it reveals nothing about the
-hidden effects.
+The order of the cases is random, so that it reveals nothing about the hidden effects.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +32,8 @@ EXCLUDED = "hysteresis"
 most flights close to the ground crash."""
 MUJOCO, ROTORPY, CONTINUOUS = "mujoco", "rotorpy", "continuous"
 """Names of the simulators of cases."""
+_SENSOR_NAMES = ("capture", "estimator", "full")
+"""Sets of sensors that a case may have."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,6 @@ class Case:
     """Simulator of the flights."""
 
 
-def full_count() -> int:
-    """Return the number of cases of a full set."""
-    return len(nameable_effects()) * len(MULTIPLES) + sum(FULL_COUNTS.values())
-
-
 def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:
     """Return the cases of a set by name (`case_001`, ...).
 
@@ -78,24 +73,24 @@ def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:
     Raises:
         ValueError: for a count below 1.
     """
-    share = _share_of(count, full_count())
+    singles = [(name, multiple) for multiple in MULTIPLES for name in nameable_effects()]
+    counts = _counts(count, {"single": len(singles), **FULL_COUNTS})
     rng = np.random.default_rng([seed, 0])
-    cases = _draw_singles(rng, seed, share)
-    for kind, number in FULL_COUNTS.items():
-        for index in range(max(round(share * number), 1)):
-            case_seed = (seed, 20_000 + 1_000 * list(FULL_COUNTS).index(kind) + index)
+    cases = []
+    for index in sorted(rng.permutation(len(singles))[: counts["single"]]):
+        name, multiple = singles[index]
+        cases.append(_draw_single(rng, name, multiple, (seed, 10_000 + index)))
+    for number, kind in enumerate(FULL_COUNTS):
+        for index in range(counts[kind]):
+            case_seed = (seed, 20_000 + 1_000 * number + index)
             cases.append(_draw_case(rng, kind, index, case_seed))
-    order = rng.permutation(len(cases))
-    digits = max(len(str(len(cases))), 3)
-    return {f"case_{i + 1:0{digits}d}": cases[number] for i, number in enumerate(order)}
+    return _by_name([cases[index] for index in rng.permutation(len(cases))])
 
 
 def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
     """Return the RotorPy set: single effects at both multiples, pairs of effects, and nulls.
 
-    The effects are those that RotorPy can simulate.
-
-    Arguments and errors are those of `draw_cases`.
+    The effects are those that RotorPy can simulate. Arguments and errors are those of `draw_cases`.
     """
     rng = np.random.default_rng([seed, 1])
     drawn: list[tuple[str, tuple[str, ...], float]] = [
@@ -106,20 +101,15 @@ def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
         drawn.append(("pair", (first, second), MULTIPLES[1]))
     drawn += [("null", (), 0.0)] * ROTORPY_COUNTS["null"]
     # Keep the first ones of each kind in a random order, as many as its share.
-    share, kind_counts = _share_of(count, len(drawn)), Counter(kind for kind, *_ in drawn)
-    remaining = {kind: max(round(share * number), 1) for kind, number in kind_counts.items()}
-    cases = {}
+    remaining = _counts(count, Counter(kind for kind, *_ in drawn))
+    cases = []
     for index in rng.permutation(len(drawn)):
         kind, hidden, multiple = drawn[index]
-        if not remaining[kind]:
-            continue
-        remaining[kind] -= 1
-        sensors = str(rng.choice(["capture", "estimator", "full"]))
-        case_seed = (seed, 50_000 + int(index))
-        cases[f"case_{len(cases) + 1:03d}"] = Case(
-            kind, hidden, multiple, "bare", sensors, case_seed, simulator=ROTORPY
-        )
-    return cases
+        if remaining[kind]:
+            remaining[kind] -= 1
+            sensors, case_seed = str(rng.choice(_SENSOR_NAMES)), (seed, 50_000 + int(index))
+            cases.append(Case(kind, hidden, multiple, "bare", sensors, case_seed))
+    return _by_name([replace(case, simulator=ROTORPY) for case in cases])
 
 
 def draw_continuous_cases(seed: int, count: int | None = None) -> dict[str, Case]:
@@ -128,24 +118,23 @@ def draw_continuous_cases(seed: int, count: int | None = None) -> dict[str, Case
     It has each single effect once at most, half of them at each of `MULTIPLES`. Arguments and
     errors are those of `draw_cases`.
     """
-    share = _share_of(count, sum(CONTINUOUS_COUNTS.values()))
+    counts = _counts(count, CONTINUOUS_COUNTS)
     rng = np.random.default_rng([seed, 2])
     singles = rng.permutation(nameable_effects())
     others = rng.permutation([kind for kind in KINDS if kind != EXCLUDED])
     cases = []
-    for kind, number in CONTINUOUS_COUNTS.items():
-        for index in range(max(round(share * number), 1)):
-            case_seed = (seed, 70_000 + 1_000 * list(CONTINUOUS_COUNTS).index(kind) + index)
+    for number, kind in enumerate(CONTINUOUS_COUNTS):
+        for index in range(counts[kind]):
+            case_seed = (seed, 70_000 + 1_000 * number + index)
             if kind == "single":
-                name, multiple = str(singles[index]), MULTIPLES[index % len(MULTIPLES)]
-                case = Case(kind, (name,), multiple, *_draw_equipment(rng, (name,)), case_seed)
+                multiple = MULTIPLES[index % len(MULTIPLES)]
+                case = _draw_single(rng, str(singles[index]), multiple, case_seed)
             else:
                 case = _draw_case(rng, kind, index, case_seed)
             if kind == "outside":
                 case = replace(case, hidden=(str(others[index]),))
             cases.append(replace(case, simulator=CONTINUOUS))
-    order = rng.permutation(len(cases))
-    return {f"case_{i + 1:03d}": cases[number] for i, number in enumerate(order)}
+    return _by_name([cases[index] for index in rng.permutation(len(cases))])
 
 
 DRAWERS: dict[str, Callable[[int, int | None], dict[str, Case]]] = {
@@ -156,27 +145,28 @@ DRAWERS: dict[str, Callable[[int, int | None], dict[str, Case]]] = {
 """Simulator -> function (seed, approximate number of cases) that draws its set."""
 
 
-def _share_of(count: int | None, full: int) -> float:
-    """Return the share of the cases of a `full` set that `count` cases are, at most 1.
+def _counts(count: int | None, full: Mapping[str, int]) -> dict[str, int]:
+    """Return kind -> number of cases, for about `count` cases of a set with the numbers `full`.
 
     Raises:
         ValueError: for a count below 1.
     """
     if count is not None and count < 1:
         raise ValueError(f"count = {count}: must be at least 1")
-    return 1.0 if count is None else min(count / full, 1.0)
+    share = 1.0 if count is None else min(count / sum(full.values()), 1.0)
+    return {kind: max(round(share * number), 1) for kind, number in full.items()}
 
 
-def _draw_singles(rng: np.random.Generator, seed: int, share: float) -> list[Case]:
-    """Return a `share` of the cases with one effect, each at both multiples."""
-    all_singles = [((name,), multiple) for multiple in MULTIPLES for name in nameable_effects()]
-    count = max(round(share * len(all_singles)), 1)
-    cases = []
-    for index in sorted(rng.permutation(len(all_singles))[:count]):
-        names, multiple = all_singles[index]
-        case_seed = (seed, 10_000 + index)
-        cases.append(Case("single", names, multiple, *_draw_equipment(rng, names), case_seed))
-    return cases
+def _by_name(cases: Sequence[Case]) -> dict[str, Case]:
+    """Return name (`case_001`, ...) -> case, in the given order."""
+    return {f"case_{number:03d}": case for number, case in enumerate(cases, 1)}
+
+
+def _draw_single(
+    rng: np.random.Generator, name: str, multiple: float, case_seed: tuple[int, int]
+) -> Case:
+    """Return a case with one effect, on MuJoCo."""
+    return Case("single", (name,), multiple, *_draw_equipment(rng, (name,)), case_seed)
 
 
 def _draw_case(rng: np.random.Generator, kind: str, index: int, case_seed: tuple[int, int]) -> Case:
@@ -207,7 +197,7 @@ def _draw_case(rng: np.random.Generator, kind: str, index: int, case_seed: tuple
 def _draw_equipment(rng: np.random.Generator, names: tuple[str, ...]) -> tuple[str, str]:
     """Return the vehicle and the sensors for a case in which the effects `names` can act."""
     vehicle = str(rng.choice(vehicle_names()))
-    sensors = str(rng.choice(["capture", "estimator", "full"]))
+    sensors = str(rng.choice(_SENSOR_NAMES))
     if any(EFFECTS[name].wind for name in names):
         vehicle = "dragged"  # wind has no effect on a vehicle without drag
     if sensors == "capture" and any("acc_b" in EFFECTS[name].needs for name in names):

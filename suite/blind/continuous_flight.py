@@ -1,8 +1,8 @@
 """Fly trajectories of blind cases in continuous time, with an engine of its own.
 
-A blind case is a set of flights with hidden effects, on which the diagnosis is tested. The engine
-(`suite/blind/continuous/`) shares no code with the model that the diagnosis fits. The tracking
-controller, which follows the trajectory, is that of the other simulators: it only gives commands.
+The engine (`suite/blind/continuous/`) shares no code with the model that the diagnosis fits. The
+tracking controller, which follows the trajectory, is that of the other simulators: it only gives
+commands.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import astuple, replace
 
 import numpy as np
 
-from eval.flights.follow import PilotGains, check_flights, steer
+from eval.flights.follow import SUM_MOST, PilotGains, check_flights, steer
 from eval.flights.simulate import FALL_V_PER_S, FULL_V, SAG_V, Extra, Sensors
 from eval.flights.trajectory import Reference, Trajectory
 from eval.logs.flight_log import FlightLog
@@ -70,12 +70,10 @@ def fly_continuous(
     plan = schedule(stamp_s, 1.0 / conditions.loop_hz, quadrotor.delay, longest_s)
     pilot = _Pilot(nominal, trajectories, stamp_s, extra)
     start = np.zeros((len(trajectories), 13))
-    for index, trajectory in enumerate(trajectories):
-        # Before time 0 a trajectory is constant, except for its heading.
-        first = trajectory.reference(stamp_s[:1, index])
-        half_yaw = 0.5 * float(first.yaw[0])
-        start[index, POS] = first.pos_w[0]
-        start[index, QUAT] = [np.cos(half_yaw), 0.0, 0.0, np.sin(half_yaw)]
+    # Before time 0 a trajectory is constant, except for its heading.
+    first = pilot.reference(0)
+    start[:, POS] = first.pos_w
+    start[:, QUAT.start], start[:, QUAT.stop - 1] = np.cos(first.yaw / 2), np.sin(first.yaw / 2)
     battery = Battery(FULL_V, FALL_V_PER_S, SAG_V)
     push = None if extra is None else pilot.push
     return fly(quadrotor, plan, start, pilot, rng, battery, push)
@@ -93,9 +91,12 @@ class _Pilot:
     ) -> None:
         self._nominal, self._stamp_s, self._extra = nominal, stamp_s, extra
         references = [t.reference(stamp_s[:, index]) for index, t in enumerate(trajectories)]
-        fields = zip(*references, strict=True)
-        self._reference = Reference(*(np.stack(field, axis=1) for field in fields))
+        self._references = [np.stack(part, axis=1) for part in zip(*references, strict=True)]
         self._integral_w = np.zeros((len(trajectories), 3))
+
+    def reference(self, row: int) -> Reference:
+        """Return the set points (N, ...) at a row."""
+        return Reference(*(part[row] for part in self._references))
 
     def __call__(self, states: Rows) -> tuple[np.ndarray, np.ndarray]:
         """Return the logged command and the command that acts, (N, 4) each.
@@ -103,17 +104,16 @@ class _Pilot:
         They differ if the additional physics changes commands.
         """
         row = states.number
-        reference = Reference(*(field[row] for field in self._reference))
-        motion = Motion(states.pos_w, states.rot_w, states.vel_w, states.rate_b)
+        reference, motion = self.reference(row), _motion(states)
         check_flights(motion, reference, states.time_s)
         dt = self._stamp_s[row] - self._stamp_s[max(row - 1, 0)]
         error_w = reference.pos_w - states.pos_w
-        self._integral_w = np.clip(self._integral_w + dt[:, None] * error_w, -1.0, 1.0)
+        self._integral_w = self._integral_w + dt[:, None] * error_w
+        self._integral_w = np.clip(self._integral_w, -SUM_MOST, SUM_MOST)
         command = steer(self._nominal, PilotGains(), reference, motion, self._integral_w)
-        acting = command
-        if self._extra is not None:
-            acting = self._extra.command(command, float(states.time_s[0]))
-        return command.packed, acting.packed
+        if self._extra is None:
+            return command.packed, command.packed
+        return command.packed, self._extra.command(command, float(states.time_s[0])).packed
 
     def push(self, states: Rows, force_b: np.ndarray, length_s: np.ndarray) -> np.ndarray:
         """Return the force of the additional physics in a step, (N, 3) in body axes [N].
@@ -121,11 +121,14 @@ class _Pilot:
         `force_b` (N, 3) is the force of everything else [N], `length_s` (N, 1) the step's length.
         """
         assert self._extra is not None
-        motion = Motion(states.pos_w, states.rot_w, states.vel_w, states.rate_b)
-        wrench = Wrench(force_b, np.zeros_like(force_b))
-        time_s = states.time_s[:, None]
+        wrench, time_s = Wrench(force_b, np.zeros_like(force_b)), states.time_s[:, None]
         # The time has one number per flight; other simulators give one number for all.
-        return self._extra.wrench(motion, wrench, time_s, length_s).force_b  # pyright: ignore[reportArgumentType]
+        return self._extra.wrench(_motion(states), wrench, time_s, length_s).force_b  # pyright: ignore[reportArgumentType]
+
+
+def _motion(states: Rows) -> Motion:
+    """Return the states of the engine in the form of the tracking controller."""
+    return Motion(states.pos_w, states.rot_w, states.vel_w, states.rate_b)
 
 
 def logs_of(
@@ -136,15 +139,9 @@ def logs_of(
     conditions: Conditions,
     rng: np.random.Generator | None,
 ) -> tuple[FlightLog, ...]:
-    """Return the logs of the flights, with the noise density of `sensors`.
+    """Return the logs of the flights of `trajectories`, with the noise density of `sensors`.
 
-    Args:
-        flown: the flights.
-        trajectories: trajectories of the flights, which determine the durations of the logs.
-        truth: the vehicle that flew.
-        sensors: logged channels and their noise.
-        conditions: rates, jitter and lost rows.
-        rng: random generator of the noise; None: no noise.
+    `truth` is the vehicle that flew. The other arguments are those of `log_of_flight`.
     """
     noise, about = Noise(*astuple(sensors)[1:]), {"source": "suite blind", "vehicle": truth.name}
     return tuple(

@@ -1,8 +1,8 @@
 """Write a set of blind cases to disk, with the answers in a separate folder, and read it again.
 
-A blind case is a set of flights with hidden effects. `OUT/set.json` has the seed and options of the
-set. `OUT/cases/case_001/` has the inputs of a diagnosis: vehicle.toml, flight_1.parquet, ...
-`OUT/answers/case_001.json` has the hidden effects, and `OUT/manifest.json` the hashes of all files.
+`OUT/set.json` has the seed and options of the set. `OUT/cases/case_001/` has the inputs of a
+diagnosis: vehicle.toml, flight_1.parquet, ... `OUT/answers/case_001.json` has the hidden effects,
+and `OUT/manifest.json` the hashes of all files.
 """
 
 from __future__ import annotations
@@ -39,8 +39,7 @@ class Manifest:
     answers: dict[str, str]
     """Case -> SHA-256 of its answer."""
     failed: dict[str, str] = field(default_factory=dict)
-    """Case -> "not made", for cases without valid flights. The reasons are with the answers, since
-    they contain the hidden effects."""
+    """Case -> "not made", for cases without valid flights; answers/failed.json has the reasons."""
 
 
 def make_set(
@@ -93,18 +92,17 @@ def make_set(
             update(len(cases) - len(names) + number + 1, name)
 
         run_pieces(_build, [cases[name] for name in names], workers or 1, keep)
-    made = [name for name in cases if name not in failed]
-    manifest = Manifest(
-        {
-            name: {path.name: _hash(path) for path in sorted((out / "cases" / name).iterdir())}
-            for name in made
-        },
-        {name: _hash(out / "answers" / f"{name}.json") for name in made},
-        {name: "not made" for name in cases if name in failed},
-    )
+    manifest = Manifest({}, {})
+    for name in cases:
+        if name in failed:
+            manifest.failed[name] = "not made"
+        else:
+            files = sorted((out / "cases" / name).iterdir())
+            manifest.cases[name] = {path.name: _hash(path) for path in files}
+            manifest.answers[name] = _hash(out / "answers" / f"{name}.json")
     write_json(out / "manifest.json", {**stamp(SCHEMA, seed), **asdict(manifest)})
     # The reasons contain the hidden effects.
-    write_json(out / "answers" / "failed.json", {n: failed[n] for n in cases if n in failed})
+    write_json(out / "answers" / "failed.json", {name: failed[name] for name in manifest.failed})
     return manifest
 
 

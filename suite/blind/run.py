@@ -1,7 +1,4 @@
-"""Run the diagnosis on the blind cases of a set, and store its results next to them.
-
-A blind case is a set of flights with hidden effects, which the diagnosis must name.
-"""
+"""Run the diagnosis on the blind cases of a set, and store its results next to them."""
 
 from __future__ import annotations
 
@@ -21,6 +18,8 @@ from tracks.common.work import Workers
 
 Diagnose = Callable[[Sequence[Path], Path, Path], None]
 """Function (flight logs, vehicle file, output folder) that writes `diagnosis.json`."""
+RESULTS = "results"
+"""Name of the folder of the results of a set."""
 TIMED, FAILED = "seconds.json", "error.json"
 """Names of two files. A case has the first one, the time of the diagnosis, or the second one, the
 reason why the diagnosis failed."""
@@ -32,23 +31,20 @@ def run_set(
     out: Path,
     diagnose: Diagnose,
     console: Console,
-    into: Path | None = None,
     workers: Workers | None = None,
 ) -> int:
     """Diagnose every case without a result, and return how many cases have a result then.
 
-    The result of a case is a folder with `diagnosis.json` and `seconds.json`. If a diagnosis fails,
-    the folder has `error.json`, and the next run tries the case again.
+    The result of a case is the folder OUT/results/CASE with `diagnosis.json` and `seconds.json`. If
+    a diagnosis fails, the folder has `error.json`, and the next run tries the case again.
 
     Args:
         out: folder of the set.
         diagnose: the diagnosis to run.
         console: shows the progress.
-        into: folder of the results; None: OUT/results.
         workers: processes that diagnose cases in parallel; None: this process.
     """
-    results = into or out / "results"
-    names = list(load_manifest(out).cases)
+    results, names = out / RESULTS, list(load_manifest(out).cases)
     jobs = [
         Job(name, results / name, out / "cases" / name)
         for name in names

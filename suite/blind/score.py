@@ -1,9 +1,8 @@
 """Score the diagnoses of blind cases: compare named effects and intervals with the answers.
 
-A blind case is a set of flights with hidden effects, which the diagnosis must name. Its answer has
-the true effects. A diagnosis may name an effect with alternatives, other effects that explain the
-flights as well. The gap is the rollout error on held-out flights; its noise floor is the error that
-measurement noise alone gives.
+The answer of a case has the true effects. A diagnosis may name an effect with alternatives, other
+effects that explain the flights as well. The gap is the rollout error on held-out flights; its
+noise floor is the error that measurement noise alone gives.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from suite.blind.cases import MULTIPLES, ROTORPY
 from suite.blind.make import load_manifest, open_answers, simulator_of
 from suite.blind.rotorpy_flight import hub_damping, is_hub_damping
-from suite.blind.run import FAILED, TIMED
+from suite.blind.run import FAILED, RESULTS, TIMED
 from suite.diagnose.estimate.parameters import effects_in
 from tracks.common.files import write_json, write_text
 from tracks.common.grid import markdown, table
@@ -148,31 +147,32 @@ def score_case(
     )
 
 
-def score_set(out: Path, results: Path | None = None) -> list[Verdict]:
+def score_set(out: Path) -> list[Verdict]:
     """Return the scores of all diagnosed cases of the set in `out`.
-
-    `results` is the folder of the diagnoses; None: OUT/results.
 
     Raises:
         ValueError: if a file of the set has changed, or no case was diagnosed.
     """
-    folder = results or out / "results"
     verdicts, in_rotorpy = [], simulator_of(out) == ROTORPY
     for name, answer in open_answers(out).items():
-        if not any((folder / name / mark).is_file() for mark in (TIMED, FAILED)):
+        folder = out / RESULTS / name
+        if not any((folder / mark).is_file() for mark in (TIMED, FAILED)):
             continue
         hubs = None
         if in_rotorpy:
             vehicle = load_vehicle(str(out / "cases" / name / "vehicle.toml"))
             hubs = hub_damping(answer["effects"], vehicle)
-        diagnosis = _read_if_valid(folder / name / "diagnosis.json")
-        timing = _read_if_valid(folder / name / TIMED)
-        # A diagnosis without its time did not end normally.
-        completed = diagnosis if timing else None
-        seconds = timing["seconds"] if timing else None
-        verdicts.append(score_case(name, answer, completed, seconds, hubs))
+        diagnosis, seconds = _read_if_valid(folder / "diagnosis.json"), None
+        timing = _read_if_valid(folder / TIMED)
+        if timing:
+            seconds = timing["seconds"]
+        else:
+            diagnosis = None  # a diagnosis without its time did not end normally
+        verdicts.append(score_case(name, answer, diagnosis, seconds, hubs))
     if not verdicts:
-        raise ValueError(f"{folder}: no case was diagnosed yet; do that with `suite blind run`")
+        raise ValueError(
+            f"{out / RESULTS}: no case was diagnosed yet; do that with `suite blind run`"
+        )
     return verdicts
 
 

@@ -1,7 +1,4 @@
-"""Select the simulator that flies a blind case: MuJoCo, RotorPy, or the continuous-time engine.
-
-A case is a set of flights with hidden effects, on which the diagnosis is tested.
-"""
+"""Select the simulator that flies a blind case: MuJoCo, RotorPy, or the continuous-time engine."""
 
 from __future__ import annotations
 

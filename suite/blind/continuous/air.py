@@ -169,23 +169,14 @@ class Wind:
         self._gusts, self._rng = effects.get("gusts"), rng
         self._gust_w = np.zeros((count, 3))
         if self._gusts is not None:
+            # Standard deviations along the world axes [m/s].
+            self._intensity = float(self._gusts.intensity) * np.array([1.0, 1.0, VERTICAL_SHARE])
             self._gust_w = self._intensity * rng.standard_normal((count, 3))
-        self.still = self._gusts is None and not self._steady_w.any()
-        """Whether the air never moves."""
+        self.start_w = self.end_w = self._steady_w + self._gust_w
+        """(N, 3) wind at the start and at the end of the present step [m/s]."""
 
-    @property
-    def _intensity(self) -> np.ndarray:
-        """(3,) standard deviation of the gusts along the world axes [m/s]."""
-        assert self._gusts is not None
-        return float(self._gusts.intensity) * np.array([1.0, 1.0, VERTICAL_SHARE])
-
-    @property
-    def now_w(self) -> np.ndarray:
-        """(N, 3) wind at the present time [m/s]."""
-        return self._steady_w + self._gust_w
-
-    def step(self, vel_w: np.ndarray, length_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Advance the wind by a step; return it (N, 3) at the start and at the end [m/s].
+    def step(self, vel_w: np.ndarray, length_s: np.ndarray) -> None:
+        """Advance the wind by a step.
 
         Gusts follow dw/dt = -w / tau + noise with tau = length / max(airspeed, 1), solved exactly
         for a tau that is constant in the step.
@@ -194,12 +185,11 @@ class Wind:
             vel_w: (N, 3) velocities of the vehicles [m/s].
             length_s: (N, 1) length of the step [s].
         """
-        gust_before_w = self._gust_w
         if self._gusts is not None:
             air_w = vel_w - self._steady_w
             airspeed = np.sqrt((air_w * air_w).sum(axis=1, keepdims=True))
             rate = np.maximum(airspeed, MIN_AIRSPEED) / float(self._gusts.length)
             decay = np.exp(-length_s * rate)
-            noise = self._intensity * self._rng.standard_normal(gust_before_w.shape)
-            self._gust_w = decay * gust_before_w + np.sqrt(1.0 - decay**2) * noise
-        return self._steady_w + gust_before_w, self._steady_w + self._gust_w
+            noise = self._intensity * self._rng.standard_normal(self._gust_w.shape)
+            self._gust_w = decay * self._gust_w + np.sqrt(1.0 - decay**2) * noise
+        self.start_w, self.end_w = self.end_w, self._steady_w + self._gust_w

@@ -30,7 +30,7 @@ class Battery(NamedTuple):
 
 
 class Body:
-    """N flying bodies with their rotors, air and battery, during one step."""
+    """N flying bodies with their rotors, air and battery."""
 
     def __init__(
         self, quadrotor: Quadrotor, wind: Wind, battery: Battery, hover_power: np.ndarray
@@ -43,7 +43,7 @@ class Body:
             battery: constants of the battery.
             hover_power: (N, 1) sum of the squared rotor speeds in hover [rad^2/s^2].
         """
-        self.quadrotor, self._wind, self._battery = quadrotor, wind, battery
+        self.quadrotor, self.wind, self._battery = quadrotor, wind, battery
         self._hover_power = hover_power
         effects = quadrotor.effects
         self._thrusts = [(change, effects[n]) for n, change in THRUSTS.items() if n in effects]
@@ -54,58 +54,15 @@ class Body:
         self._torque_by_squared_speed = np.outer(yaw_coefficient, [0.0, 0.0, 1.0])
         x, y, z = quadrotor.inertia
         self._gyroscopic = np.array([z - y, x - z, y - x])
-        self._wind_at_ends_w = wind.now_w, wind.now_w
         self._first_drop: np.ndarray | None = None
-        self._speed_cmd: np.ndarray | None = None
-        self._spin_up: np.ndarray | float = 0.0
-
-    @property
-    def wind_at_start_w(self) -> np.ndarray:
-        """(N, 3) wind at the start of the present step [m/s]."""
-        return self._wind_at_ends_w[0]
 
     def begin_row(self, time_s: np.ndarray, speed: np.ndarray) -> None:
-        """Set the wind at a row of the log, and store the voltage drop of the first row.
+        """Store the voltage drop at the first row, which is the first one at time 0 or later.
 
-        The first row is the first one at a time of 0 or later.
-
-        Args:
-            time_s: (N, 1) time of the row [s].
-            speed: (N, 4) rotor speeds [rad/s].
+        The arguments are those of `drop`.
         """
-        self._wind_at_ends_w = self._wind.now_w, self._wind.now_w
         if self._first_drop is None and (time_s >= 0.0).all():
             self._first_drop = self.drop(time_s, speed)
-
-    def advance_wind(self, state: np.ndarray, length_s: np.ndarray) -> None:
-        """Advance the wind by a step of `length_s` (N, 1) [s] from `state` (N, 13)."""
-        if not self._wind.still:
-            self._wind_at_ends_w = self._wind.step(state[:, VEL], length_s)
-
-    def set_command(self, speed: np.ndarray, speed_cmd: np.ndarray, length_s: np.ndarray) -> None:
-        """Set the commanded rotor speeds of a step.
-
-        Args:
-            speed: (N, 4) rotor speeds at the start of the step [rad/s].
-            speed_cmd: (N, 4) commanded rotor speeds [rad/s].
-            length_s: (N, 1) length of the step [s].
-        """
-        if self.quadrotor.time_constant > 0.0:
-            self._speed_cmd = speed_cmd
-        else:
-            # Rotors without lag reach the command within the step, at a constant rate.
-            self._spin_up = (speed_cmd - speed) / np.maximum(length_s, 1e-9)
-
-    def spin_up(self, speed: np.ndarray) -> np.ndarray | float:
-        """Return the derivative of the rotor speeds (N, 4) at `speed` (N, 4) [rad/s^2]."""
-        if self._speed_cmd is None:
-            return self._spin_up
-        return (self._speed_cmd - speed) / self.quadrotor.time_constant
-
-    def wind_w(self, share: float) -> np.ndarray:
-        """Return the wind (N, 3) at a fraction `share` (0 to 1) of the present step [m/s]."""
-        before, after = self._wind_at_ends_w
-        return before + share * (after - before)
 
     def drop(self, time_s: np.ndarray, speed: np.ndarray) -> np.ndarray:
         """Return how far the voltage is below that of a full battery in hover (N, 1) [V].
@@ -119,8 +76,9 @@ class Body:
         return discharge + self._battery.sag_v * (power - 1.0)
 
     def forces(
-        self, state: np.ndarray, speed: np.ndarray, time_s: np.ndarray, wind_w: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self, state: np.ndarray, speed: np.ndarray, time_s: np.ndarray, wind_w: np.ndarray,
+        spin_up: np.ndarray | float = 0.0,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
         """Return the forces and torques on the bodies.
 
         Args:
@@ -128,6 +86,7 @@ class Body:
             speed: (N, 4) rotor speeds [rad/s].
             time_s: (N, 1) time since the first row [s].
             wind_w: (N, 3) wind [m/s].
+            spin_up: (N, 4) derivative of the rotor speeds [rad/s^2]; only a torque depends on it.
 
         Returns:
             Force (N, 3) [N] and torque (N, 3) [N m] in body axes, and the rotation matrix
@@ -136,14 +95,12 @@ class Body:
         q = self.quadrotor
         rot_w = rotation(state[:, QUAT])
         air_b = ((state[:, VEL] - wind_w)[:, None] @ rot_w)[:, 0]
-        if self._first_drop is None:
-            drop_since_start = np.zeros_like(time_s)
-        else:
-            drop_since_start = self.drop(time_s, speed) - self._first_drop
+        first_drop = self._first_drop
+        fallen_v = 0.0 * time_s if first_drop is None else self.drop(time_s, speed) - first_drop
         # Everything that the equations of the effects need.
         moment = Moment(
             q.mass, q.inertia, q.arm, q.spin, state[:, POS], rot_w, air_b,
-            state[:, RATE], speed, time_s, drop_since_start, self.spin_up(speed),
+            state[:, RATE], speed, time_s, fallen_v, spin_up,
         )  # fmt: skip
         squared_speed = speed * speed
         thrust = q.thrust_coefficient * squared_speed
@@ -158,16 +115,17 @@ class Body:
         return force_b, torque_b, rot_w
 
     def derivative(
-        self, state: np.ndarray, speed: np.ndarray, time_s: np.ndarray, share: float,
-        push_b: np.ndarray,
+        self, state: np.ndarray, speed: np.ndarray, spin_up: np.ndarray, time_s: np.ndarray,
+        share: float, push_b: np.ndarray,
     ) -> np.ndarray:  # fmt: skip
         """Return the derivative of the state (N, 13) at a fraction `share` of the present step.
 
         `push_b` (N, 3) is an additional force in body axes [N]. The other arguments are those of
         `forces`.
         """
-        q = self.quadrotor
-        force_b, torque_b, rot_w = self.forces(state, speed, time_s, self.wind_w(share))
+        q, wind = self.quadrotor, self.wind
+        wind_w = wind.start_w + share * (wind.end_w - wind.start_w)
+        force_b, torque_b, rot_w = self.forces(state, speed, time_s, wind_w, spin_up)
         rate_b = state[:, RATE]
         gyroscopic_b = self._gyroscopic * rate_b[:, [1, 2, 0]] * rate_b[:, [2, 0, 1]]
         change = np.empty_like(state)

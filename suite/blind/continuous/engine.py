@@ -106,7 +106,7 @@ def fly(
         time_s = plan.stamp_s[row][:, None]
         # Sensors measure before the row's command acts.
         body.begin_row(time_s, speed)
-        force_b = body.forces(state, speed, time_s, body.wind_at_start_w)[0]
+        force_b = body.forces(state, speed, time_s, body.wind.end_w)[0]
         last_push_b = pushes[plan.block[row] - 1] if row else np.zeros((count, 3))
         accs[row] = (force_b + last_push_b) / quadrotor.mass
         volts[row] = battery.full_v - body.drop(time_s, speed)[:, 0]
@@ -122,9 +122,9 @@ def fly(
                     command_row[:, None] >= 0, actings[command_row, flight], hover_command
                 )
                 speed_cmd = commanded_speeds(nominal, command, rate_b)
-            body.advance_wind(state, length)
+            body.wind.step(state[:, VEL], length)
             if push is not None:
-                force_b = body.forces(state, speed, begin, body.wind_at_start_w)[0]
+                force_b = body.forces(state, speed, begin, body.wind.start_w)[0]
                 pushes[step] = push(_rows(row, begin[:, 0], state), force_b, length)
             state, speed = _step(body, state, speed, speed_cmd, begin, length, pushes[step])
     states[steps], speeds[steps] = state, speed
@@ -137,25 +137,26 @@ def _step(
     length: np.ndarray, push_b: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return state and rotor speeds after a step of `length` (N, 1) [s] from `begin` (N, 1) [s]."""
-    lag = body.quadrotor.time_constant
-    body.set_command(speed, speed_cmd, length)
-    half = 0.5 * length
-    # Rotor speeds at the middle and the end of the step, exactly.
+    lag, half = body.quadrotor.time_constant, 0.5 * length
+    # Rotor speeds and their derivatives at the start, the middle and the end of the step, exactly.
     if lag > 0.0:
         error = speed - speed_cmd
-        middle_speed = speed_cmd + error * np.exp(-half / lag)
-        end_speed = speed_cmd + error * np.exp(-length / lag)
+        speeds = [speed, *(speed_cmd + error * np.exp(-passed / lag) for passed in (half, length))]
+        spin_ups = [(speed_cmd - each) / lag for each in speeds]
     else:
-        speed = middle_speed = end_speed = speed_cmd
+        # Rotors without lag reach the command within the step, at a constant rate.
+        spin_ups = [(speed_cmd - speed) / np.maximum(length, 1e-9)] * 3
+        speeds = [speed_cmd] * 3
+    start, middle, end = zip(speeds, spin_ups, strict=True)
     # Runge-Kutta of order 4 for the rigid body.
-    k1 = body.derivative(state, speed, begin, 0.0, push_b)
-    k2 = body.derivative(state + half * k1, middle_speed, begin + half, 0.5, push_b)
-    k3 = body.derivative(state + half * k2, middle_speed, begin + half, 0.5, push_b)
-    k4 = body.derivative(state + length * k3, end_speed, begin + length, 1.0, push_b)
+    k1 = body.derivative(state, *start, begin, 0.0, push_b)
+    k2 = body.derivative(state + half * k1, *middle, begin + half, 0.5, push_b)
+    k3 = body.derivative(state + half * k2, *middle, begin + half, 0.5, push_b)
+    k4 = body.derivative(state + length * k3, *end, begin + length, 1.0, push_b)
     state = state + length / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
     quat = state[:, QUAT]
     state[:, QUAT] = quat / np.sqrt((quat * quat).sum(axis=1, keepdims=True))
-    return state, end_speed
+    return state, speeds[-1]
 
 
 def _rows(number: int, time_s: np.ndarray, state: np.ndarray) -> Rows:

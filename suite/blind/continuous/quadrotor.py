@@ -43,8 +43,6 @@ class NominalConstants(NamedTuple):
     """Largest thrust of one rotor [N]."""
     thrust_coefficient: float
     """Thrust coefficient k_T of a rotor [N/(rad/s)^2]."""
-    period_s: float
-    """Period of the rate loop [s]."""
 
 
 class Quadrotor(NamedTuple):
@@ -108,7 +106,6 @@ def quadrotor_of(vehicle: Vehicle) -> Quadrotor:
         shares=np.linalg.inv(np.array([np.ones(4), hubs[:, 1], -hubs[:, 0], yaw_per_thrust])),
         thrust_max=rotors.thrust_coefficient * rotors.speed_max**2,
         thrust_coefficient=rotors.thrust_coefficient,
-        period_s=1.0 / controller.frequency,
     )
     return Quadrotor(
         nominal=nominal,
