@@ -84,7 +84,7 @@ def gusts(*values, **others):
     return Wind(effects, 20_000, np.random.default_rng(1))
 
 
-def test_gusts_have_their_intensity_and_forget_with_their_length():
+def test_gusts_have_their_intensity_and_forget_with_their_length_at_a_metre_a_second_or_more():
     wind = gusts(1.5, 4.0, constant_wind=((2.0, 0.0, 0.0),))
     # 7 m/s over ground against a mean wind of 2 m/s along it: 5 m/s through the air.
     vel_w, length_s = np.tile([7.0, 0.0, 0.0], (20_000, 1)), np.full((20_000, 1), 0.02)
@@ -100,9 +100,6 @@ def test_gusts_have_their_intensity_and_forget_with_their_length():
     np.testing.assert_allclose(kept, np.exp(-0.5), atol=0.02)
     np.testing.assert_array_equal(wind.now_w, after)
     np.testing.assert_array_equal(*wind.step(vel_w, 0.0 * length_s))
-
-
-def test_a_slow_vehicle_sees_gusts_change_as_at_a_metre_a_second():
     wind = gusts(1.0, 2.0)
     first = wind.now_w
     _, after = wind.step(np.zeros((20_000, 3)), np.full((20_000, 1), 1.0))
