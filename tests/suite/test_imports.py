@@ -83,7 +83,7 @@ def test_no_two_files_import_each_other():
     TopologicalSorter(graph).prepare()  # raises where there is a circle, and names it
 
 
-def test_rooms_open_empty_and_their_folders_without_a_heavy_library():
+def test_rooms_are_typed_and_open_empty_and_their_folders_without_a_heavy_library():
     light = (*ROOMS, *sys.stdlib_module_names)
     heavy = [
         f"{path.relative_to(ROOT)} imports {name}"
@@ -93,9 +93,6 @@ def test_rooms_open_empty_and_their_folders_without_a_heavy_library():
         if name.split(".")[0] not in (light if path.parent.parent == ROOT else (*light, "numpy"))
     ]
     assert not heavy
-
-
-def test_every_package_is_typed_and_has_an_init():
     for room in ROOMS:
         assert (ROOT / room / "py.typed").is_file()
     missing = {path.parent for path in FILES if not (path.parent / "__init__.py").is_file()}
@@ -111,12 +108,10 @@ class Blocker:
             raise ImportError(f"{name} is blocked")
 sys.meta_path.insert(0, Blocker())
 """
-LIGHT = (
-    BLOCKER
-    + """
+LIGHT = f"""{BLOCKER}
 import contextlib, io
 from suite import cli
-said = {}
+said = dict()
 for line, heavy in json.loads(sys.argv[1]):
     blocked.update(heavy)
     blocked.intersection_update(heavy)
@@ -130,10 +125,7 @@ for name in json.loads(sys.argv[3]):
     __import__(name)
 print(json.dumps(said))
 """
-)
-BARE = (
-    BLOCKER
-    + """
+BARE = f"""{BLOCKER}
 import pathlib
 blocked.update(json.loads(sys.argv[1]))
 for name in json.loads(sys.argv[2]):
@@ -154,7 +146,6 @@ try:
 except ImportError as error:
     print(error)
 """
-)
 
 
 def _said(code, *arguments):

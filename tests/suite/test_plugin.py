@@ -62,17 +62,9 @@ def test_all_four_are_used_by_commands(installed, tmp_path, root):
     )
     np.savetxt(tmp_path / "flight.simlog", rows, header="simlog")
     fly = "eval --policy race-paper --track staircase --trials 1 --workers 1 --simulator"
-    effects, tracks, imported, *_ = suite(
-        [
-            "effects",
-            "tracks",
-            "import flight.simlog --no-fix --out flight.parquet",
-            f"{fly} coarse --out coarse",
-            f"{fly} mujoco --vehicle finned.toml --out finned",
-        ],
-        installed,
-        tmp_path,
-    )
+    lines = ["effects", "tracks", "import flight.simlog --no-fix --out flight.parquet"]
+    lines += [f"{fly} coarse --out coarse", f"{fly} mujoco --vehicle finned.toml --out finned"]
+    effects, tracks, imported, *_ = suite(lines, installed, tmp_path)
     assert list(effects["effects"])[-1] == "fin_drag"
     assert tracks["families"]["staircase"] == {
         "about": "Staircase: eight gates in a line along world x, each higher than the one before.",

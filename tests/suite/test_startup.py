@@ -135,13 +135,12 @@ def test_a_working_folder_that_is_gone_is_refused_by_what_needs_it(suite, tmp_pa
         assert (found, len(said.splitlines())) == (code, code // 2), said
 
 
-def test_a_home_that_the_shell_did_not_write_out_is_refused(capsys):
+def test_names_that_are_not_utf8_or_begin_with_a_home_not_written_out_are_refused_before_work(
+    capsys, tmp_path, monkeypatch
+):
     for line in (["eval", "--out=~/runs"], ["diagnose", "~/flights"]):
         assert cli.main(line) == 2
         assert "write $HOME for it" in capsys.readouterr().err
-
-
-def test_names_that_are_not_utf8_are_refused_before_work(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for line in (["eval", "--out", "a\udcff"], ["eval", "--policy", "a\udcff"]):
         assert cli.main(line) == 2

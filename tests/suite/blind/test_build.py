@@ -52,7 +52,7 @@ def test_outside_cases_say_how_much_the_catalogue_cannot_explain():
 BARE = nominal_vehicle("bare")
 
 
-def test_physics_outside_the_catalogue_moves_the_vehicle():
+def test_physics_outside_the_catalogue_moves_the_vehicle_and_a_load_weighs_what_it_weighs():
     way = Trajectory("climb", duration_s=2.0, speed=3.0, size=1.0)
     plain = fly(BARE, BARE, [way])[0]
     for name, kind in OUTSIDE.items():
@@ -60,18 +60,14 @@ def test_physics_outside_the_catalogue_moves_the_vehicle():
         acts = np.abs(moved.extra.force_b).max()
         acts += np.abs(moved.acting.thrust - moved.command.thrust).max()
         assert acts > 0.0 and np.abs(moved.motion.pos_w - plain.motion.pos_w).max() > 1e-5, name
-
-
-def test_a_hanging_load_weighs_what_it_weighs():
     load = make_outside("slung_load", 0.03, BARE.mass)
     flight = fly(BARE, BARE, [Trajectory("hover", 0.2)], extra=load)[0]
     assert flight.extra.force_b[0, 2] == pytest.approx(-0.03 * 9.81, rel=1e-6)
 
 
 def test_a_strength_is_the_multiple_of_the_table_or_cut_at_a_bound():
-    nominal = nominal_vehicle("bare")
     for name in nameable_effects():
-        vehicle = nominal if name not in ("constant_wind", "gusts") else nominal_vehicle("dragged")
+        vehicle = BARE if name not in ("constant_wind", "gusts") else nominal_vehicle("dragged")
         rng = np.random.default_rng(3)
         change, multiple = draw_change(rng, vehicle, "full", name, 2.0)
         values = changed_values(vehicle, "full", name, change, rng)

@@ -34,7 +34,9 @@ def test_the_continuous_set_has_its_numbers_and_each_single_effect_once():
 
 
 @pytest.mark.parametrize("simulator", DRAWERS)
-def test_a_few_cases_are_of_every_kind(simulator):
+def test_a_few_cases_are_of_every_kind_and_none_of_an_effect_that_no_flight_can_tell(
+    simulator, monkeypatch
+):
     draw = DRAWERS[simulator]
     whole = Counter(case.kind for case in draw(1, None).values())
     for count in (1, 12):
@@ -44,12 +46,7 @@ def test_a_few_cases_are_of_every_kind(simulator):
     assert draw(1, whole.total()) == draw(1, 10**5) == draw(1, None)
     with pytest.raises(ValueError, match="count = 0: must be at least 1"):
         draw(1, 0)
-
-
-@pytest.mark.parametrize("simulator", DRAWERS)
-def test_an_effect_that_no_flight_can_tell_is_never_drawn(simulator, monkeypatch):
-    """Sets that are published stay what they are, whatever such effects the catalogue gains."""
-    draw = DRAWERS[simulator]
+    # Sets that are published stay what they are, whatever such effects the catalogue gains.
     cases = draw(SETS["published"], None)
     assert "slung_load" in EFFECTS and "slung_load" not in nameable_effects()
     assert not any("slung_load" in c.hidden for c in cases.values() if c.kind != "outside")

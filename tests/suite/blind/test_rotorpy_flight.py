@@ -36,16 +36,12 @@ def test_flights_side_by_side_are_each_as_if_alone_and_move_as_their_acceleromet
     np.testing.assert_allclose(moved, between, atol=2e-3)
 
 
-def test_without_air_it_flies_as_mujoco_does():
+def test_without_air_it_flies_as_mujoco_does_and_into_the_ground_it_fails():
     pytest.importorskip("rotorpy")
     (here,) = fly(LAGGED, LAGGED, WAYS[:1])
     (there,) = fly_rotorpy(LAGGED, LAGGED, WAYS[:1], 100.0)
     off = Motion(*(np.abs(a - b).max() for a, b in zip(here.motion, there.motion, strict=True)))
     assert off.pos_w < 1e-3 and off.vel_w < 3e-3 and off.rate_b < 0.03
-
-
-def test_a_flight_into_the_ground_fails():
-    pytest.importorskip("rotorpy")
     with pytest.raises(FlightFailed, match=r"flight 1 failed at \d\.\d\d s"):
         fly_rotorpy(LAGGED, LAGGED, [Trajectory("hover", 0.3, height=0.0)], 100.0)
 

@@ -82,7 +82,7 @@ def test_intervals_count_by_component_and_leave_out_what_cannot_be_seen():
         assert score(truth, found).covered == (covered,)
 
 
-def test_the_table_counts_and_the_files_are_written(tmp_path):
+def test_the_table_counts_what_is_named_and_a_diagnosis_that_failed_as_no_null(tmp_path):
     right = effect("rotor_drag", "linear_drag", coefficient=[1e-5, 5e-5])
     verdicts = [
         score_case("a", TRUTH, said(right, after=0.56), 3.0),
@@ -104,9 +104,6 @@ def test_the_table_counts_and_the_files_are_written(tmp_path):
     text = report(tmp_path, verdicts)
     assert "| c | null |" in text and "| a |" not in text
     assert json.loads((tmp_path / "table.json").read_text())["seconds_median"] == 2.0
-
-
-def test_a_diagnosis_that_failed_is_not_one_that_rightly_named_nothing():
     verdicts = [
         score_case("a", NULL, said(verdict="no_gap"), 1.0),
         score_case("b", NULL, said(effect("inflow")), 1.0),

@@ -77,7 +77,9 @@ def test_nothing_is_concluded_of_a_log_with_an_open_fault(tmp_path, capsys, flig
         assert "gyro_scale" in refused(capsys, *line, "--accept", "gyro_scales")
 
 
-def test_what_an_import_left_open_is_repeated(tmp_path, capsys, flight):
+def test_what_an_import_left_open_is_repeated_and_findings_of_earlier_versions_are_read(
+    tmp_path, capsys, flight
+):
     doubt = Finding("doubt", "motors", "6 motors turn", "motor_count", 6.0, 0.97, "none")
     path = flight(1.0, about={"findings": [doubt._asdict()]})
     assert findings_of(read_flight(path).about) == (doubt,)
@@ -85,9 +87,6 @@ def test_what_an_import_left_open_is_repeated(tmp_path, capsys, flight):
     assert "motor_count" in {f["fault"] for f in answered["findings"]}
     line = ("diagnose --vehicle", tmp_path / "plain.toml", "--out", tmp_path / "out", path)
     assert "6 motors turn" in refused(capsys, *line, lines=3)
-
-
-def test_findings_of_earlier_versions_are_read():
     old = {"level": "doubt", "subject": "attitude", "text": "39 % off"}
     assert findings_of({"findings": [old, "odd"]}) == (Finding("doubt", "attitude", "39 % off"),)
 

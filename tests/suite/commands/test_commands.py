@@ -62,14 +62,13 @@ def test_options_become_settings():
         resolve(Config(recipe="rcaer"))
 
 
-def test_training_goes_on_from_a_shipped_policy_by_its_name(tmp_path, capsys):
+def test_training_goes_on_from_a_policy_by_its_name_and_does_not_write_over_it(
+    tmp_path, capsys, monkeypatch
+):
     assert checkpoint_folder("race-paper", "--init-from") == shipped.folder("race-paper")
     said = refused(capsys, "train --init-from rac --out", tmp_path / "run")
     assert "--init-from rac: " in said and "a shipped policy's name (race, race-paper" in said
     assert not (tmp_path / "run").exists()
-
-
-def test_the_policy_that_is_trained_on_is_not_written_over(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(training, "train", None)
     own = shutil.copytree(shipped.folder("race-paper"), tmp_path / "policy")
     said = refused(capsys, "train --out", tmp_path, "--init-from", own)

@@ -13,15 +13,12 @@ from tests.support.commands import answer, refused, run
 FILES = sorted(FOLDER.glob("*.parquet"))
 
 
-def test_a_log_becomes_a_flight_log(tmp_path, capsys):
+def test_a_log_becomes_a_flight_log_and_json_is_one_object(tmp_path, capsys):
     log, out = made.write_ulog(tmp_path / "log.ulg"), tmp_path / "flight.parquet"
     assert run("import --full-thrust 30 --out", out, log) == 0
     said, flight = capsys.readouterr().out, read_flight(out)
     assert "attitude: the force off body z is" in said
     assert f"{len(flight.time_s)} rows" in said and flight.about["source"] == "px4"
-
-
-def test_json_is_one_object(tmp_path, capsys):
     log, out = made.write_usd(tmp_path / "log00"), tmp_path / "flight.csv"
     found = answer(capsys, "import --vehicle racer5 --out", out, log)
     assert found["rows"] == len(read_flight(out).time_s)

@@ -24,7 +24,9 @@ class Writer:
         pass
 
 
-def test_numbers_reach_tensorboard_from_the_first_step_that_is_computed(tmp_path, monkeypatch):
+def test_numbers_reach_tensorboard_from_the_first_step_or_the_missing_package_is_named(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr(Writer, "made", [])
     package = types.SimpleNamespace(SummaryWriter=Writer)
     monkeypatch.setitem(sys.modules, "tensorboardX", package)
@@ -35,9 +37,6 @@ def test_numbers_reach_tensorboard_from_the_first_step_that_is_computed(tmp_path
     (writer,) = Writer.made
     assert (writer.folder, writer.first) == (str(tmp_path / "tensorboard"), 7)
     assert writer.rows == [("loss", 0.5, 7), ("loss", 0.25, 8)]
-
-
-def test_a_missing_package_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     with pytest.raises(ValueError, match=r"pip install 'diffracing-suite\[tensorboard\]'"):
         curve.tensorboard(tmp_path)

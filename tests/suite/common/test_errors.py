@@ -22,15 +22,12 @@ def _pad_one_box(to_boxes, center_w):
     return pad(scene, Counts(to_boxes, 0, 0, 0))
 
 
-def test_a_value_error_that_numpy_throws_in_our_rooms_is_a_bug():
+def test_numpys_value_error_is_a_bug_and_one_raised_on_purpose_in_a_worker_process_a_message():
     with pytest.raises(ValueError) as met:
         _pad_one_box(2, [0.0, 0.0])
     frames = traceback.extract_tb(met.value.__traceback__)
     assert frames[-1].filename.endswith("scene.py"), "the case is one with no frame of numpy's"
     assert explain(met.value) is None
-
-
-def test_an_error_raised_on_purpose_in_a_worker_process_is_a_message():
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         with pytest.raises(ValueError, match="more than the 0") as met:
             list(pool.map(_pad_one_box, [0], [[0.0, 0.0, 0.0]]))

@@ -41,7 +41,7 @@ def test_a_figure_is_a_png_file_of_its_size():
     assert struct.unpack(">II", file[16:24]) == (2 * DPI, DPI)
 
 
-def test_levels():
+def test_levels_and_tracks():
     for text, levels in (
         ("3", [3]), ("0,3, 9", [0, 3, 9]), ("7-9,0,8", [7, 8, 9, 0]), ("all", list(range(10))),
     ):  # fmt: skip
@@ -49,9 +49,6 @@ def test_levels():
     for text in ("10", "-1", "3-1", "", "easy", "1,,2", "0-10"):
         with pytest.raises(ValueError, match="--difficulty"):
             parse_levels(text)
-
-
-def test_tracks():
     assert parse_tracks("all") == ["zigzag", "circular", "ellipse"]
     assert parse_tracks("ellipse,my/course.toml") == ["ellipse", "my/course.toml"]
     with pytest.raises(ValueError, match="Did you mean 'zigzag'"):

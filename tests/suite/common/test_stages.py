@@ -62,11 +62,14 @@ def test_a_folder_of_another_configuration_is_refused(tmp_path):
         claim(tmp_path, Settings(), 0)
 
 
-def test_an_estimate_is_said_and_missing_memory_is_warned_of(capsys):
+def test_an_estimate_is_said_in_figures_for_people_and_missing_memory_is_warned_of(capsys):
     announce(Console(), "training", Estimate(seconds=130, memory_bytes=2e9))
     assert capsys.readouterr().err == "training: about 2 min 10 s and 2.0 GB of memory\n"
     announce(Console(), "training", Estimate(seconds=1, memory_bytes=1e18))
     assert "warning" in capsys.readouterr().err
+    durations = ["0.4 s", "10 s", "1 min 00 s", "3 min 20 s", "2 h 05 min"]
+    assert [duration(s) for s in (0.44, 9.96, 59.6, 200, 7500)] == durations
+    assert [size(b) for b in (5, 812e3, 2.06e9)] == ["5 B", "812 kB", "2.1 GB"]
 
 
 def test_a_run_record_holds_what_is_needed_to_repeat_it(tmp_path):
@@ -77,16 +80,6 @@ def test_a_run_record_holds_what_is_needed_to_repeat_it(tmp_path):
     assert record["seed"] == 3 and record["schema"] == 1
     assert set(record) >= {"suite_version", "git_commit", "python", "packages", "machine"}
     assert run_record(config, None)["config_type"] == "suite.common.stages.Estimate"
-
-
-def test_a_folder_of_another_kind_of_run_is_refused(tmp_path):
-    refuse_other_run(tmp_path, Evaluation())  # nothing is there
-    write_run_record(tmp_path, Evaluation(), 0)
-    refuse_other_run(tmp_path, Evaluation(trials=3))
-    with pytest.raises(ValueError, match="holds a run of another kind .* give another --out"):
-        refuse_other_run(tmp_path, Collection())
-    (tmp_path / "run.json").write_text("[]")
-    refuse_other_run(tmp_path, Collection())  # none of ours
 
 
 def test_a_run_that_goes_on_keeps_the_commits_that_made_it(tmp_path, monkeypatch):
@@ -100,6 +93,16 @@ def test_a_run_that_goes_on_keeps_the_commits_that_made_it(tmp_path, monkeypatch
     write_run_record(tmp_path, Estimate(1.0, 2.0), seed=3)
     assert training_commit(tmp_path / "policy") == "bbb", "another run in the same folder"
     assert training_commit(tmp_path / "none" / "policy") == "unknown"
+
+
+def test_a_folder_of_another_kind_of_run_is_refused(tmp_path):
+    refuse_other_run(tmp_path, Evaluation())  # nothing is there
+    write_run_record(tmp_path, Evaluation(), 0)
+    refuse_other_run(tmp_path, Evaluation(trials=3))
+    with pytest.raises(ValueError, match="holds a run of another kind .* give another --out"):
+        refuse_other_run(tmp_path, Collection())
+    (tmp_path / "run.json").write_text("[]")
+    refuse_other_run(tmp_path, Collection())  # none of ours
 
 
 def test_progress_without_a_terminal_is_a_plain_line_now_and_then(capsys):
@@ -117,9 +120,3 @@ def test_progress_without_a_terminal_is_a_plain_line_now_and_then(capsys):
         now[0] = 12.0
         update(90)
     assert capsys.readouterr().err == "training: 90 of 100, 12 s left\n"
-
-
-def test_figures_for_people():
-    durations = ["0.4 s", "10 s", "1 min 00 s", "3 min 20 s", "2 h 05 min"]
-    assert [duration(s) for s in (0.44, 9.96, 59.6, 200, 7500)] == durations
-    assert [size(b) for b in (5, 812e3, 2.06e9)] == ["5 B", "812 kB", "2.1 GB"]

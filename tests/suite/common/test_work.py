@@ -40,19 +40,11 @@ def test_more_processes_than_cores_are_refused_where_each_needs_some(monkeypatch
 
 
 @pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
-def test_jobs_come_back_in_order_from_processes_that_share_no_core():
+def test_jobs_come_back_in_order_from_processes_that_share_no_core_or_say_what_failed():
     found = do_jobs(double, jobs(5, 6, 7), 2, Console(), "doubling")
     assert [value for value, _ in found] == [10, 12, 14]
     assert {tuple(cores) for _, cores in found} <= set(map(tuple, core_shares(2)))
-
-
-@pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
-def test_a_process_that_dies_is_said():
     with pytest.raises(WorkFailed, match=r"dying: a process died; the products.*exit code 7"):
         do_jobs(die, jobs(1, 2), 2, Console(), "dying")
-
-
-@pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
-def test_work_that_fails_says_so_in_its_own_words():
     with pytest.raises(WorkFailed, match=r"^training 1 diverged$"):
         do_jobs(diverge, jobs(1), 2, Console(), "training")

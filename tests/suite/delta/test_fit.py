@@ -24,7 +24,7 @@ PHYSICS = PointMassConfig(drag=(0.3, 0.3), drag_up=(0.3, 0.3), action_delay=(0.5
 CONFIG = FitConfig(horizon_s=0.6, iterations=100, batch=32, rate=1e-2)
 
 
-def test_lag_drag_and_delay_of_a_point_mass_are_identified():
+def test_lag_drag_and_delay_of_a_point_mass_are_identified_in_a_third_of_the_steps(monkeypatch):
     """Far from the middle: a rival that is fitted by half would flatter the network."""
     truth = PointMassModel(np.float32(6.0), np.array([0.1, 0.6, 0.25], np.float32), np.float32(1.6))
     windows = cut_windows(fly(truth, 6), 0.6, 0.15)
@@ -33,9 +33,6 @@ def test_lag_drag_and_delay_of_a_point_mass_are_identified():
     assert float(found.lag) == pytest.approx(6.0, rel=0.05)
     assert float(found.delay) == pytest.approx(1.6, abs=0.1)
     np.testing.assert_allclose(found.drag, truth.drag, atol=0.04)
-
-
-def test_lag_drag_and_delay_take_a_third_of_the_steps_and_at_least_one(monkeypatch):
     taken: list[int] = []
     nothing: Any = None
 

@@ -80,15 +80,12 @@ def test_a_split_has_no_overlap_and_leaves_nobody_out(logs, share):
     assert len(set(splits)) > 1, "another seed holds out others"
 
 
-def test_what_cannot_be_split_is_refused(logs):
+def test_what_cannot_be_split_is_refused_and_flights_shorter_than_a_window_are_left_out(logs):
     with pytest.raises(ValueError, match="1 flight given, at least 2"):
         split(logs[:1], 0.25, 0)
     for share in (0.0, 1.0, float("nan")):
         with pytest.raises(ValueError, match=f"held_out is {share}"):
             split(logs, share, 0)
-
-
-def test_a_flight_shorter_than_a_window_is_not_what_is_held_out(logs):
     crash = replace(fly(nominal_model(PHYSICS), 1, seconds=0.8)[0], name="crash")
     kept, words = long_enough([*logs, crash], 1.0)
     assert [log.name for log in kept] == [log.name for log in logs]
@@ -103,7 +100,7 @@ def corrects(fitted, flown, rate_hz=15.0):
     check_corrects(kept, flown, rate_hz, Path("runs/delta/delta"))
 
 
-def test_the_middle_of_the_ranges_and_the_rate_count():
+def test_the_middle_of_the_ranges_the_rate_and_all_of_a_vehicle_but_its_name_count():
     physics = race().physics
     corrects(None, physics)
     corrects(physics, replace(physics, drag=(0.0, 0.9), lag_std=0.0))
@@ -114,9 +111,6 @@ def test_the_middle_of_the_ranges_and_the_rate_count():
         corrects(physics, replace(physics, action_delay=(0.5, 1.5)))
     with pytest.raises(ValueError, match="with 15 decisions a second, and this run has 30: .*=15"):
         corrects(physics, physics, rate_hz=30.0)
-
-
-def test_of_a_vehicle_all_but_its_name_counts():
     renamed = replace(QUAD, vehicle=replace(QUAD.vehicle, name="mine"), mass_std=0.0)
     corrects(QUAD, renamed)
     other = QuadrotorConfig(replace(with_lag(QUAD.vehicle, 0.05), name="other"))

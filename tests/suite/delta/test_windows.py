@@ -47,7 +47,7 @@ def test_the_heading_of_any_attitude_is_recovered():
     np.testing.assert_allclose(again, rot, atol=1e-4)
 
 
-def test_windows_leave_out_what_is_missing():
+def test_windows_begin_a_stride_apart_and_leave_out_gaps_and_what_is_missing():
     (log,) = flight()
     whole = cut_windows([log], 0.5, 0.1)
     pos_w = np.where(np.arange(len(log.time_s))[:, None] == 90, np.nan, log.pos_w)
@@ -58,10 +58,6 @@ def test_windows_leave_out_what_is_missing():
         cut_windows([log], 5.0, 0.1)
     with pytest.raises(ValueError, match="flight 0: columns action_x"):
         cut_windows([replace(log, extra={})], 0.5, 0.1)
-
-
-def test_windows_begin_a_stride_apart_and_none_spans_a_gap():
-    (log,) = flight()
     for stride_s, apart_s in ((0.3, 0.3), (0.001, 1.0 / 30.0)):
         starts = cut_windows([log], 0.5, stride_s).pos_w[:, 0]
         at = [np.flatnonzero(np.isclose(log.pos_w, p, atol=1e-6).all(-1))[0] for p in starts]
@@ -101,7 +97,7 @@ def test_the_period_of_decisions_that_stand_on_rows_is_that_of_the_policy(rate_h
     assert np.isnan(decision_period(time[:1], 0.01))
 
 
-def test_the_rate_of_flights_is_that_of_their_policy():
+def test_the_rate_of_flights_is_that_of_their_policy_and_decisions_in_a_row_are_near():
     first, *rest = flight(3)
     # Rates within 5 % of the median are one.
     for share in (1.0, 1.04):
@@ -111,9 +107,6 @@ def test_the_rate_of_flights_is_that_of_their_policy():
         decision_rate([replace(first, time_s=first.time_s * 1.06), *rest])
     with pytest.raises(ValueError, match=r"has 15 decisions a second, and most flights 30"):
         decision_rate([thinned(first), *rest])
-
-
-def test_decisions_in_a_row_are_less_than_one_and_a_half_periods_and_a_row_apart():
     found = are_consecutive(np.array([1.0, 1.99, 2.0]), period_s=1.0, row_s=0.5)
     np.testing.assert_array_equal(found, [True, True, False])
 
@@ -129,7 +122,7 @@ def test_a_burn_in_ends_at_the_window_and_is_blank_before_the_flight():
     np.testing.assert_array_equal(inputs[:, :3], vel_w[1:4])
 
 
-def test_what_was_not_seen_is_not_remembered():
+def test_what_was_not_seen_is_not_remembered_and_a_share_of_the_windows_forgets():
     params = delta_network.init(jax.random.key(1))
     inputs = np.random.default_rng(0).normal(size=(2, 4, 9))
     late = BurnIn(inputs, np.tile([0.0, 0.0, 1.0, 1.0], (2, 1)))
@@ -140,9 +133,6 @@ def test_what_was_not_seen_is_not_remembered():
     np.testing.assert_array_equal(
         found, state_after(params, BurnIn(inputs[:, 2:], late.seen[:, 2:]))
     )
-
-
-def test_a_share_of_the_windows_forgets_what_it_saw():
     inputs = np.ones((5, 3, 9))
     part = without_memory(BurnIn(inputs, np.ones((5, 3))), 0.4)
     np.testing.assert_array_equal(part.seen, [[0.0] * 3] * 2 + [[1.0] * 3] * 3)

@@ -26,7 +26,15 @@ LAGGED = with_lag(PLAIN, 0.03)
 SET = {"effects": [{"name": "rotor_drag", "alternatives": ["linear_drag"]}]}
 
 
-def test_a_plan_comes_back_from_its_file(tmp_path):
+def test_the_plan_is_for_the_sets_alone_and_comes_back_from_its_file(tmp_path):
+    ways, words = trajectories_for(SET)
+    entry = next(e for e in SEPARATIONS if set(e.pair) == {"rotor_drag", "linear_drag"})
+    assert {way.kind for way in ways} == {way.kind for way in entry.separating}
+    assert len(ways) == 2 * len(entry.separating) and entry.words in words[0]
+    alone = {"effects": [{"name": "rotor_drag", "alternatives": []}]}
+    assert trajectories_for(alone) == ([], [])
+    assert write_plan(tmp_path / "plan", [], [])["flights"] == []
+    assert not (tmp_path / "plan").exists()
     ways = [Trajectory("punches", 3.0, speed=2.0), Trajectory("hover", 2.0, turn="sweep")]
     plan = write_plan(tmp_path / "plan", ways, ["fly them"])
     written = json.loads((tmp_path / "plan" / "plan.json").read_text())
@@ -39,17 +47,6 @@ def test_a_plan_comes_back_from_its_file(tmp_path):
     assert plan["flights"][0]["top_speed"] == pytest.approx(
         np.linalg.norm(wanted.vel_w, axis=1).max()
     )
-
-
-def test_the_plan_is_for_the_sets_and_only_for_them(tmp_path):
-    ways, words = trajectories_for(SET)
-    entry = next(e for e in SEPARATIONS if set(e.pair) == {"rotor_drag", "linear_drag"})
-    assert {way.kind for way in ways} == {way.kind for way in entry.separating}
-    assert len(ways) == 2 * len(entry.separating) and entry.words in words[0]
-    alone = {"effects": [{"name": "rotor_drag", "alternatives": []}]}
-    assert trajectories_for(alone) == ([], [])
-    assert write_plan(tmp_path / "plan", [], [])["flights"] == []
-    assert not (tmp_path / "plan").exists()
 
 
 def test_an_earlier_plan_goes_and_what_is_not_of_it_stays(tmp_path):

@@ -80,14 +80,13 @@ def test_a_file_with_a_load_on_a_line_is_refused_before_flights_are_read(command
     assert "effects.slung_load" in said and "remove it" in said and "\n" not in said
 
 
-def test_what_is_read_is_not_written_over(tmp_path, capsys):
+def test_what_is_read_is_not_written_over_and_flights_too_short_or_missing_are_refused(
+    tmp_path, capsys
+):
     save_vehicle(PLAIN, tmp_path / "vehicle.toml")
     own, out = str(tmp_path / "vehicle.toml"), ["--out", str(tmp_path)]
     assert main(["diagnose", str(tmp_path), "--vehicle", own, *out]) == 2
     assert "vehicle.toml is also an input and would be overwritten" in capsys.readouterr().err
-
-
-def test_flights_that_are_too_short_or_missing_are_refused(tmp_path, capsys):
     assert main(["diagnose", str(tmp_path / "none.csv"), "--vehicle", "reference"]) == 2
     path = write_flight(tmp_path / "short.parquet", fly(PLAIN, 0, duration_s=1.2))
     assert main(["diagnose", str(path), "--vehicle", "reference"]) == 2

@@ -39,9 +39,14 @@ def test_a_written_flight_comes_back(tmp_path, judged, format):
     near(back.rotor_speed, rows.motor, 40.0)
 
 
-def test_the_printed_order_of_motors_corrects_an_import(tmp_path, judged):
+def test_a_wrong_order_of_motors_holds_for_speeds_and_commands_and_the_printed_one_corrects_it(
+    judged, tmp_path
+):
     _, log, _ = judged
     parts = flight_signals(log, PLAIN, np.random.default_rng(0))
+    faulty = inject(KINDS["motors 3 and 4 swapped"], parts, PLAIN)
+    for name in ("motor", "pwm"):
+        np.testing.assert_array_equal(faulty[name], parts[name][:, [0, 1, 3, 2]])
     parts["motor"] = parts["motor"][:, [1, 3, 2, 0]]
     written = WRITERS["px4"](tmp_path, parts, PLAIN.full_thrust)
     options = replace(written.options, vehicle=PLAIN, fix=False)
@@ -49,14 +54,6 @@ def test_the_printed_order_of_motors_corrects_an_import(tmp_path, judged):
     (found,) = (f for f in findings if f.fault == "motor_order")
     _, findings = import_log(written.path, "px4", replace(options, read=readings_in(found.fix)))
     assert "motor_order" not in {f.fault for f in findings}
-
-
-def test_a_wrong_order_of_motors_holds_for_their_speeds_and_commands(judged):
-    _, log, _ = judged
-    parts = flight_signals(log, PLAIN, np.random.default_rng(0))
-    faulty = inject(KINDS["motors 3 and 4 swapped"], parts, PLAIN)
-    for name in ("motor", "pwm"):
-        np.testing.assert_array_equal(faulty[name], parts[name][:, [0, 1, 3, 2]])
 
 
 def test_outcomes_are_counted_by_name(judged):

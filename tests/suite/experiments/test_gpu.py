@@ -53,6 +53,7 @@ def test_worlds_that_are_repeated_have_numbers_of_their_own(monkeypatch):
 
 
 A, B = jnp.ones((3, 4)), jnp.ones((4, 5))
+IMAGES, KERNELS, SQUARE = jnp.ones((2, 1, 6, 6)), jnp.ones((3, 1, 3, 3)), jnp.ones((4, 4))
 LOOPED = 6
 
 
@@ -60,23 +61,19 @@ def looped(a):
     return jax.lax.scan(lambda c, _: (c @ c, None), a, None, length=LOOPED)[0]
 
 
+def product_or_not(a):
+    return jax.lax.cond(a[0, 0] > 0, lambda a: a @ a, lambda a: a, a)
+
+
 @pytest.mark.parametrize(
     ("function", "given", "operations"),
     [
         (lambda a, b: a @ b, (A, B), 2 * 3 * 4 * 5),
         (lambda a: a + 1.0, (A,), 12),
-        (jax.jit(looped), (jnp.ones((4, 4)),), LOOPED * 2 * 4**3),
-        (
-            # 2 images of 1 x 6 x 6, 3 kernels of 1 x 3 x 3, at 4 x 4 places each.
-            lambda x, k: jax.lax.conv(x, k, (1, 1), "VALID"),
-            (jnp.ones((2, 1, 6, 6)), jnp.ones((3, 1, 3, 3))),
-            2 * 2 * 3 * 16 * 9,
-        ),
-        (
-            lambda a: jax.lax.cond(a[0, 0] > 0, lambda a: a @ a, lambda a: a, a),
-            (jnp.ones((4, 4)),),
-            pytest.approx(2 * 4**3, abs=4),
-        ),
+        (jax.jit(looped), (SQUARE,), LOOPED * 2 * 4**3),
+        # 2 images of 1 x 6 x 6, 3 kernels of 1 x 3 x 3, at 4 x 4 places each.
+        (lambda x, k: jax.lax.conv(x, k, (1, 1), "VALID"), (IMAGES, KERNELS), 2 * 2 * 3 * 16 * 9),
+        (product_or_not, (SQUARE,), pytest.approx(2 * 4**3, abs=4)),
     ],
 )
 def test_operations_are_counted_by_hand(function, given, operations):

@@ -34,7 +34,7 @@ def test_a_page_is_older_than_another_policy_or_other_code(tmp_path, capsys):
     assert "not made" in capsys.readouterr().out
 
 
-def test_all_makes_every_page_with_its_own_options(tmp_path, monkeypatch):
+def test_all_makes_every_page_by_the_command_of_the_published_one(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(command, "_make_page", lambda config, console: asked.append(config) or {})
     _, config = parse("reproduce", ["all", "--out", str(tmp_path)])
@@ -44,9 +44,6 @@ def test_all_makes_every_page_with_its_own_options(tmp_path, monkeypatch):
     )
     assert set(published.PUBLISHED) <= set(EXPERIMENTS)
     assert all(replace(c, experiment=None) == replace(config, experiment=None) for c in asked)
-
-
-def test_all_repeats_the_commands_of_the_published_pages():
     results = Path(__file__).parents[3] / "docs" / "results"
     compared = []
     for name, options in published.PUBLISHED.items():

@@ -35,7 +35,7 @@ def test_the_hierarchical_bootstrap_of_a_difference_covers_as_it_says():
     assert 0.93 <= hit / count <= 0.97, hit
 
 
-def test_the_interval_of_a_small_layout_is_that_of_its_mean_squares():
+def test_the_interval_of_a_small_layout_is_that_of_its_mean_squares_and_one_seed_has_none():
     """Satterthwaite 1946: the mean's variance is (MS seeds + MS trials - MS rest) / (S T)."""
     table = [[-1, -4, 2, -1, 3], [3, 0, 0, 3, -1], [2, -3, -1, -4, 1], [2, 0, 2, 0, 1]]
     values = np.array(table, float)
@@ -52,9 +52,6 @@ def test_the_interval_of_a_small_layout_is_that_of_its_mean_squares():
     found = over_seeds(values)
     half = student.ppf(0.975, degrees) * sqrt(variance)
     assert (found.high - found.low) / 2 == pytest.approx(half, rel=0.03)
-
-
-def test_one_seed_or_other_trials_are_refused():
     for values in ((np.ones((1, 5)),), (np.ones((2, 5)), np.ones((2, 4)))):
         with pytest.raises(ValueError, match="two or more of each"):
             over_seeds(*values)

@@ -17,7 +17,7 @@ def answers(policy):
     return policy.act(policy.start(64), state, image, np.ones(64, bool))[0]
 
 
-def test_a_policy_that_came_as_content_is_the_same_without_its_files(tmp_path):
+def test_a_policy_that_came_as_content_keeps_its_name_and_is_the_same_without_its_files(tmp_path):
     folder = tmp_path / "my.policy"
     folder.mkdir()
     for name in ("config.json", "weights.safetensors", "card.md"):
@@ -30,9 +30,6 @@ def test_a_policy_that_came_as_content_is_the_same_without_its_files(tmp_path):
     found = unpack(packed)()
     assert found.name == "my.policy" and unpack(packed)() is found, "loaded once"
     assert np.array_equal(answers(found), expected)
-
-
-def test_a_file_keeps_its_name_and_what_lies_beside_it(tmp_path):
     (tmp_path / "policy.h").write_text("a header")
     (tmp_path / "policy.c").write_text("a program")
     content = PolicyContent.of(tmp_path / "policy.c")

@@ -33,14 +33,11 @@ def policy():
     return load_policy("race-paper")
 
 
-def test_policies_of_one_name_are_told_apart_and_none_flies_twice():
+def test_policies_have_the_name_of_their_run_or_are_told_apart_and_none_flies_twice(tmp_path):
     names = ["a/last", "b/last", "c"]
     assert policy_labels(names, ["last", "last", "c"]) == names
     with pytest.raises(ValueError, match="given twice"):
         policy_labels(["a", "a"], ["a", "a"])
-
-
-def test_a_trained_policy_has_the_name_of_its_run(tmp_path):
     shutil.copytree(shipped.folder("race-small"), tmp_path / "mine" / "policy")
     assert load_policy(tmp_path / "mine" / "policy").name == "mine"
 
@@ -50,17 +47,14 @@ def test_a_policy_object_that_lacks_a_method_is_refused_by_name():
         suite.evaluate_policy(SimpleNamespace(spec=None))  # type: ignore[arg-type]
 
 
-def test_a_track_file_is_flown_once_a_seed(pilots, tmp_path):
+def test_a_track_file_is_flown_once_a_seed_and_once_where_nothing_acts_by_chance(pilots, tmp_path):
     trials = trial_list([YARD, "zigzag"], [0, 9], trials=2, seed=3)
     assert [t[1:] for t in trials] == [(0, 3), (0, 4), (0, 3), (0, 4), (9, 3), (9, 4)]
     line = f"--track {YARD} --difficulty 4 --trials 1 --policy"
     assert evaluate(tmp_path, line, pilots["diver"]) == 0
     (row,) = read_trials(tmp_path / "trials.parquet")
     assert (row.track, row.difficulty, row.ended_by) == (YARD, 0, "collision")
-
-
-def test_where_nothing_acts_by_chance_a_track_file_is_flown_once(tmp_path):
-    """Further seeds are the same flight, and would make the interval of a rate too narrow."""
+    # Further seeds are the same flight, and would make the interval of a rate too narrow.
     asked = Evaluation(track=f"{YARD},zigzag", difficulty="0", trials=3)
     trials, notes = (getattr(read_trial_set(asked), name) for name in ("trials", "notes"))
     assert [trial.seed for trial in trials if trial.track == YARD] == [0] and len(trials) == 4
@@ -106,16 +100,15 @@ def test_what_a_world_flies_otherwise_is_said_once_and_written(
     assert {row.world for row in read_trials(tmp_path / "trials.parquet")} == {"rotorpy"}
 
 
-def test_every_speed_is_flown_and_again_with_the_monitor():
+def test_every_speed_is_flown_and_again_with_the_monitor_where_a_policy_takes_one(
+    policy, tmp_path, capsys
+):
     assert manners((), False) == [Manner()]
     assert manners((0.0, 1.0), True) == [
         Manner(speed=0.0), Manner(speed=1.0), Manner(True, 0.0), Manner(True, 1.0)
     ]  # fmt: skip
     assert Manner(True, 0.25).label("mine") == "mine@0.25+monitor"
     assert Manner().label("mine") == "mine"
-
-
-def test_a_speed_goes_into_the_spec_of_a_policy_that_takes_one(policy, tmp_path, capsys):
     quick = replace(policy, spec=replace(policy.spec, speed_input=True))
     assert Manner(speed=0.0)(quick).spec.speed == 0.0
     assert Manner()(quick) is quick

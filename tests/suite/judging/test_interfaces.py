@@ -20,15 +20,12 @@ from suite.judging.trials import _in_millimetres
 from tests.support.courses import straight
 
 
-def test_a_start_that_touches_the_ground_or_a_frame_is_refused():
+def test_a_start_that_touches_the_ground_is_refused_and_a_track_in_millimetres_reported():
     vehicle, track = load_vehicle("racer5"), straight()
     refuse_start_contact("here", track, vehicle)
     low = replace(track, start_pos_w=np.array([*track.start_pos_w[:2], 0.02]))
     with pytest.raises(ValueError, match="here: at start.position .* touches ground; move"):
         refuse_start_contact("here", low, vehicle)
-
-
-def test_a_track_in_millimetres_is_asked_about():
     track = straight()
     assert _in_millimetres("here", track) == []
     gates = track.scene.gates._replace(center_w=1000 * track.scene.gates.center_w)
@@ -55,14 +52,12 @@ def test_modules_in_the_working_folder_do_not_stand_for_ours_or_pythons(tmp_path
     assert done.returncode == 0 and "mine" not in done.stderr, done.stderr
 
 
-def test_check_reports_the_contract_and_what_looks_wrong():
+def test_check_reports_the_contract_and_a_file_that_says_nothing_and_is_unscaled(tmp_path):
     answer = check.run(check.Config(policy="race-small", trials=1), Quiet())
     assert answer["findings"] == [] and answer["contract"]["digest"]
     with pytest.raises(ValueError, match="nothing to check"):
         check.run(check.Config(), Quiet())
 
-
-def test_check_reports_a_file_that_says_nothing_and_is_unscaled(tmp_path):
     class Unscaled(torch.nn.Module):
         def forward(self, state, image):
             return torch.tanh(state[:, 6:9]) + 0 * image.mean((1, 2))[:, None]

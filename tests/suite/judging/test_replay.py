@@ -108,7 +108,7 @@ def test_a_trial_ends_at_the_time_that_is_given_and_is_seen_so_again(pilots, tmp
     assert "--time-limit-s is 0.0, allowed is" in words
 
 
-def test_options_that_do_not_fit_are_refused(tmp_path, capsys):
+def test_options_that_do_not_fit_and_what_is_no_finished_run_are_refused(tmp_path, capsys):
     (tmp_path / "trials.parquet").touch()
     for line, words in (
         (f"{tmp_path} --seed 3", "--seed is 3, but"),
@@ -119,6 +119,11 @@ def test_options_that_do_not_fit_are_refused(tmp_path, capsys):
         ("race --difficulty 0 --speed 1.4", "--speed is 1.4"),
     ):
         assert words in refused(capsys, f"view --out {tmp_path} {line}")
+    (tmp_path / "begun").mkdir()
+    (tmp_path / "begun" / "journal-0.jsonl").write_text("{}\n")
+    assert "not finished; repeat its command" in refused(capsys, "view", tmp_path / "begun")
+    (tmp_path / "trials.parquet").write_text("no parquet")
+    assert "run.json" in refused(capsys, "view", tmp_path)
 
 
 def test_a_recording_shows_who_flew_and_asks_for_a_speed(pilots, tmp_path):
@@ -130,11 +135,3 @@ def test_a_recording_shows_who_flew_and_asks_for_a_speed(pilots, tmp_path):
     assert (layout["width"], layout["height"]) == (36, 20)
     evaluation, *_ = view._choose_trials(view.Config(run="race", speed=0.4))
     assert manners(evaluation.speed, monitor=False) == [Manner(speed=0.4)]
-
-
-def test_view_of_something_else_is_refused(tmp_path, capsys):
-    (tmp_path / "begun").mkdir()
-    (tmp_path / "begun" / "journal-0.jsonl").write_text("{}\n")
-    assert "not finished; repeat its command" in refused(capsys, "view", tmp_path / "begun")
-    (tmp_path / "trials.parquet").write_text("no parquet")
-    assert "run.json" in refused(capsys, "view", tmp_path)

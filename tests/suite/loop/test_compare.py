@@ -14,7 +14,7 @@ def _result(seed, success, v_mean, level=0):
     return result(seed, success, "p", level)._replace(v_max=v_mean + 1, v_mean=v_mean)
 
 
-def test_differences_are_of_the_same_trials():
+def test_differences_are_of_the_same_trials_and_none_is_called_none():
     n = 40
     speed = np.linspace(2, 6, n)
     won = {"before": 10, "without": 20, "with": 30}
@@ -40,9 +40,6 @@ def test_differences_are_of_the_same_trials():
     assert "75 % of 40 trials succeed: more than" in verdict(overall)
     with pytest.raises(ValueError, match="same trials"):
         compare({**results, "with": results["with"][::-1]})
-
-
-def test_no_difference_is_called_none():
     rows = [_result(k, k < 5, 3.0) for k in range(10)]
     lines: list[CellComparison] = compare({"before": rows, "without": rows, "with": rows})
     assert "not significantly different from" in verdict(lines[-1])

@@ -50,17 +50,16 @@ def test_what_cannot_be_used_is_said_before_anything_is_written(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_copy_under_another_name_hides_nothing(tmp_path, root):
+def test_a_copy_under_another_name_hides_nothing_and_a_load_on_a_line_may_be_hidden_only(
+    tmp_path, root
+):
     copy = tmp_path / "copy.toml"
     text = (root / "eval" / "vehicles" / "racer5.toml").read_text(encoding="utf-8")
     copy.write_text(text.replace('name = "racer5"', 'name = "another"'), encoding="utf-8")
     assert load_vehicle(copy) != load_vehicle("racer5")
     with pytest.raises(ValueError, match="nothing is hidden"):
         resolve(recipe="quick", vehicle="racer5", hidden_vehicle=str(copy))
-
-
-def test_a_load_on_a_line_may_be_hidden_but_not_known(tmp_path):
-    """No stretch of a flight tells the diagnosis how it swings."""
+    # No stretch of a flight tells the diagnosis how it swings.
     loaded = str(tmp_path / "loaded.toml")
     save_vehicle(with_effects(slung_load=(0.05, 0.5)), loaded)
     assert hidden_loop(hidden=loaded).true_vehicle == loaded
@@ -68,7 +67,7 @@ def test_a_load_on_a_line_may_be_hidden_but_not_known(tmp_path):
         resolve(recipe="quick", vehicle=loaded, hidden_vehicle="reference")
 
 
-def test_sizes_are_the_recipes_and_options_go_first(root, monkeypatch):
+def test_sizes_are_the_recipes_options_go_first_and_a_policy_has_its_own_recipe(root, monkeypatch):
     monkeypatch.chdir(root)
     loop = resolve(recipe="quick", seed=3, flights=4)
     assert isinstance(loop, DeltaLoopConfig)
@@ -83,10 +82,6 @@ def test_sizes_are_the_recipes_and_options_go_first(root, monkeypatch):
     assert hidden.tuning.optimizer.iterations == 60 and hidden.tuning.quadrotor is not None
     assert hidden.true_vehicle == EXAMPLE and hidden.policy == shipped.DEFAULT
     assert set(hidden.digests) == {"vehicle", "hidden_vehicle", "sensors", "policy"}
-
-
-def test_a_policy_is_fine_tuned_by_its_own_recipe(root, monkeypatch):
-    monkeypatch.chdir(root)
     for policy in ("race-paper", "race-small", None):
         assert resolve(policy=policy) == resolve(policy=policy, recipe=policy or "race")
         hidden, own = {"policy": policy, "hidden_vehicle": EXAMPLE}, policy or shipped.DEFAULT

@@ -79,7 +79,7 @@ def finished(out, stages, pictures):
     return found, table, page
 
 
-def test_the_loop_leaves_tables_report_and_recording(whole):
+def test_the_loop_leaves_tables_report_and_recording_and_its_control_sees_the_same_tracks(whole):
     out, _ = whole
     stages = ["train", "eval-before", "flights", "delta", "tuned-without", "tuned-with"]
     found, table, _ = finished(out, [*stages, "eval-without", "eval-with", "replays"], 5)
@@ -89,9 +89,6 @@ def test_the_loop_leaves_tables_report_and_recording(whole):
     recording = (out / "recording.rrd").read_bytes()
     assert b"before, zigzag level 0 seed 4" in recording
     assert b"tuned with delta, zigzag level 0 seed 4" in recording
-
-
-def test_the_control_sees_the_tracks_of_the_corrected_training_and_new_ones(whole):
     trained = whole[1].trained
     assert [with_delta for _, with_delta, _ in trained] == [False] * 5 + [True] * 2
     for (config, _, pos_w), (config_2, _, pos_2_w) in zip(trained[3:5], trained[5:], strict=True):
@@ -198,7 +195,7 @@ def test_a_loop_with_a_hidden_effect_leaves_tables_report_and_recording(hidden):
     assert "<td>offset z [m]</td><td>not identifiable</td>" in rows
 
 
-def test_only_the_judge_flies_the_hidden_vehicle(hidden):
+def test_only_the_judge_flies_the_hidden_vehicle_and_all_are_tuned_alike(hidden):
     out, stub = hidden
     rows = {name: read_trials(out / f"eval-{name}" / "trials.parquet") for name in LABELS}
     for name, trials in rows.items():
@@ -210,10 +207,6 @@ def test_only_the_judge_flies_the_hidden_vehicle(hidden):
     assert [with_delta for _, with_delta, _ in stub.trained] == [False, False, True, True] * 2
     corrected = [vehicle.effects.get("com_offset") for vehicle, _ in stub.fitted]
     assert corrected == [None, FOUND]
-
-
-def test_all_are_tuned_alike_on_the_same_tracks(hidden):
-    out, stub = hidden
     for k in (0, 1):
         starts = [worlds for _, _, worlds in stub.trained[k::2]]
         assert all(np.array_equal(starts[0], other) for other in starts[1:])
@@ -236,7 +229,6 @@ def test_measured_flights_are_others_than_the_judged_and_noisy(hidden):
     assert one.time_s[-1] - logs[0].time_s[-1] <= CONTACT_MARGIN_S + 0.011
     spread = (logs[0].pos_w - one.pos_w[:count]).std()
     assert spread == pytest.approx(Noise().pos, rel=0.2)
-    assert one.thrust_cmd is not None and one.action_b is not None
     np.testing.assert_array_equal(logs[0].thrust_cmd, one.thrust_cmd[:count])
     np.testing.assert_array_equal(logs[0].action_b, one.action_b[:count])
 

@@ -51,15 +51,12 @@ def test_settings_are_changed_by_name():
     assert config.spec.camera == replace(plain.spec.camera, width=48)
 
 
-def test_what_only_the_point_mass_reads_is_refused_through_quadrotors():
+def test_settings_that_would_do_nothing_or_that_the_command_sets_itself_are_refused():
     run = named_recipe("race")
     for change in ("physics.wind_std=(3,3,1)", "physics.action_delay=(0,2)"):
         with pytest.raises(ValueError, match=r"is of the point mass.*set one of quadrotor\."):
             override(run, [change])
     assert override(run, ["physics.image_delay=2"]).physics.image_delay == 2
-
-
-def test_what_would_do_nothing_is_refused():
     run = named_recipe("race-paper")
     for change, need, given in (
         ("loss.projection_decay=1", "loss.projection", "3"),
@@ -69,9 +66,6 @@ def test_what_would_do_nothing_is_refused():
             override(run, [change])
         both = [change, f"{need}={given}"]
         assert override(run, both) == override(run, both[::-1])
-
-
-def test_only_a_setting_that_the_command_sets_itself_is_refused():
     check_owned(["loss.progress=1"], {"loss.prog": "", "spec": ""})
     with pytest.raises(ValueError, match=r"'spec.rate_hz=30': this command sets spec.*; take"):
         check_owned(["spec.rate_hz=30"], {"spec": "take another policy"})
@@ -141,7 +135,7 @@ PHASES = (
 RUN = with_iterations(TrainConfig(phases=PHASES), 10)
 
 
-def test_a_phase_changes_what_it_says_and_keeps_what_came_before():
+def test_a_phase_keeps_what_came_before_and_a_change_holds_in_all_or_in_the_one_that_is_named():
     assert phase_ends(RUN) == (5, 8, 10)
     first, second, third = phase_configs(RUN)
     assert [one.optimizer.iterations for one in (first, second, third)] == [5, 3, 2]
@@ -149,17 +143,6 @@ def test_a_phase_changes_what_it_says_and_keeps_what_came_before():
     assert [one.spec.rate_hz for one in (first, second, third)] == [15.0, 15.0, 30.0]
     assert all(one.phases == () for one in (first, second, third))
     assert phase_configs(TrainConfig()) == (TrainConfig(),)
-
-
-def test_recipes_are_within_the_limits_and_their_phases_share_any_number_of_iterations():
-    for recipe in map(named_recipe, RECIPES):
-        check_phases(recipe)
-        for total in (3, 7, 100, 4500, 4501):
-            ends = phase_ends(with_iterations(recipe, total))
-            assert ends[-1] == total and list(ends) == sorted(ends)
-
-
-def test_a_change_holds_in_every_phase_or_in_the_one_that_is_named():
     everywhere = phase_configs(with_changes(RUN, ["loss.progress=0.4"]))
     assert [one.loss.progress for one in everywhere] == [0.4] * 3
     assert everywhere[1].optimizer.rate == 1e-3, "other changes of the phase stay"
@@ -174,6 +157,14 @@ def test_a_change_holds_in_every_phase_or_in_the_one_that_is_named():
     recipe = without_quadrotor(named_recipe("race"))
     check_phases(recipe)
     assert all(one.quadrotor is None for one in phase_configs(recipe))
+
+
+def test_recipes_are_within_the_limits_and_their_phases_share_any_number_of_iterations():
+    for recipe in map(named_recipe, RECIPES):
+        check_phases(recipe)
+        for total in (3, 7, 100, 4500, 4501):
+            ends = phase_ends(with_iterations(recipe, total))
+            assert ends[-1] == total and list(ends) == sorted(ends)
 
 
 @pytest.mark.parametrize(

@@ -112,7 +112,7 @@ def around(count, seed):
     return jnp.asarray(np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 3)))
 
 
-def test_obstacle_terms_are_the_papers():
+def test_obstacle_terms_are_the_papers_and_means_over_the_path_of_a_step():
     config = LossConfig(safety_radius_m=0.15)
     vel, path = jnp.array([1.0, 2.0, -1.0]), around(30, seed=0)
     distance, away_w = map(np.array, from_sphere(path))
@@ -122,9 +122,6 @@ def test_obstacle_terms_are_the_papers():
     np.testing.assert_allclose(collide, closing * np.maximum(1 - gap, 0) ** 2, rtol=1e-9)
     slope = jax.grad(lambda vel: terms_at(path, vel, config)[1].sum())(vel)
     assert not np.any(slope), "the closing speed carries no gradient"
-
-
-def test_the_terms_of_a_step_are_means_over_its_path():
     config, path, vel = LossConfig(), around(4, seed=2), jnp.asarray([1.0, 2.0, -1.0])
     distance, away_w = from_sphere(path[None])
     whole = obstacle_terms(config, distance, away_w, path[None], vel[None])
@@ -168,7 +165,7 @@ def test_progress_counts_up_to_the_commanded_speed_and_a_faster_flight_costs():
         np.testing.assert_allclose(pull[:, 0], slopes, rtol=1e-6)
 
 
-def test_progress_is_the_papers_and_differentiates():
+def test_progress_and_smoothness_are_the_papers_and_progress_differentiates():
     config = LossConfig(progress=0.4)
     rng = np.random.default_rng(2)
     pos, vel, target = (jnp.asarray(rng.normal(0, 3, (5, 3))) for _ in range(3))
@@ -186,6 +183,11 @@ def test_progress_is_the_papers_and_differentiates():
             lambda p, v, c=varied: progress_term(c, p, v, target, pos - target),
             (pos, vel), order=1, modes=["rev"], atol=1e-6, rtol=1e-6,
         )  # fmt: skip
+    acc, jerk = np.random.default_rng(4).normal(0, 5, (2, 3, 3))
+    step = a_step(3, acc_w=jnp.asarray(acc), jerk_w=jnp.asarray(jerk))
+    found = weighted(LossConfig(acceleration=0.01, jerk=0.001), step)
+    np.testing.assert_allclose(found["acceleration"], 0.01 * np.linalg.norm(acc, axis=-1) ** 2)
+    np.testing.assert_allclose(found["jerk"], 0.001 * np.linalg.norm(jerk, axis=-1) ** 2)
 
 
 def test_projection_pulls_to_the_axis_and_its_range_carries_no_gradient():
@@ -202,14 +204,6 @@ def test_projection_pulls_to_the_axis_and_its_range_carries_no_gradient():
     assert float(term(pos)) == pytest.approx(1.5 * (0.5**2 + 1.0**2) * near)
     expected = 1.5 * 2 * near * np.array([[0, 0.5, 1.0]])
     np.testing.assert_allclose(jax.grad(term)(pos), expected, atol=1e-9)
-
-
-def test_smoothness_is_the_papers():
-    acc, jerk = np.random.default_rng(4).normal(0, 5, (2, 3, 3))
-    step = a_step(3, acc_w=jnp.asarray(acc), jerk_w=jnp.asarray(jerk))
-    found = weighted(LossConfig(acceleration=0.01, jerk=0.001), step)
-    np.testing.assert_allclose(found["acceleration"], 0.01 * np.linalg.norm(acc, axis=-1) ** 2)
-    np.testing.assert_allclose(found["jerk"], 0.001 * np.linalg.norm(jerk, axis=-1) ** 2)
 
 
 def unit_gate(count, yaw=0.4):

@@ -155,17 +155,14 @@ def test_the_policy_is_shown_the_gate_after_the_next():
     np.testing.assert_array_equal(seen.second_axis_w, gates.rot_w[rows, [1, 4, 7], :, 0])
 
 
-def test_what_is_delayed_is_shown_so_many_steps_later():
+def test_what_is_delayed_is_shown_so_many_steps_later_and_before_them_the_start():
     for delay, expected in ((0, [1, 2, 3, 4]), (2, [0, 0, 1, 2])):
         waiting, shown = jnp.zeros((1, delay, 1)), []
         for new in range(1, 5):
             now, waiting = rollout.queue(waiting, jnp.full((1, 1), float(new)))
             shown.append(float(now[0, 0]))
         assert shown == expected
-
-
-def test_a_state_on_its_way_at_the_start_is_that_of_the_start():
-    """A world that starts in flight knows its speed and its gate from the first decision on."""
+    # A world that starts in flight knows its speed and its gate from the first decision on.
     config = replace(small_config(2), physics=PointMassConfig(state_delay=2))
     config = replace(config, spec=replace(config.spec, speed_input=True))
     worlds = sample_worlds(config, 0)

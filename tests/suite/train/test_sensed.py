@@ -104,7 +104,9 @@ def test_an_old_view_lies_between_two_decisions():
     assert np.array_equal(old.depth_m[:, 0, 0], [1, 1, 2, 2, 3, 3])
 
 
-def test_the_command_trains_through_a_file(tmp_path):
+def test_the_command_trains_through_a_file_and_a_fine_tuning_is_the_last_phase_at_small_steps(
+    tmp_path,
+):
     path = tmp_path / "mine.toml"
     path.write_text('name = "mine"\n[depth]\nkind = "stereo"\nnoise = 0.2\n')
     change = ("sensors.magnitude=(0.0,1.5)",)
@@ -113,9 +115,6 @@ def test_the_command_trains_through_a_file(tmp_path):
     assert run.sensors.seen == sensor_set({"stereo": {"noise": 0.2}}, "mine")
     with pytest.raises(ValueError, match="has no sensor models; suite train: add --sensors"):
         resolve(Config(recipe="quick", set=change))
-
-
-def test_a_fine_tuning_is_the_last_phase_at_small_steps():
     run = resolve(Config(sensors="vio", finetune=True, init_from="race"))
     assert run.phases == () and run.spec.rate_hz == 30.0 and run.sensors is not None
     assert (run.optimizer.iterations, run.optimizer.rate) == (525, pytest.approx(1.2e-4))

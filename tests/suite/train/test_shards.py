@@ -70,7 +70,7 @@ def test_shards_have_the_gradient_of_the_whole_batch(sharded):
         assert largest_difference(found, expected) < 1e-3
 
 
-def test_the_curve_is_of_steps_that_count():
+def test_the_curve_and_remembered_states_are_of_steps_that_counted():
     worlds, params = boxes_worlds(NOISY), fresh_params()
     worlds = worlds._replace(stop=np.array([1, 1, 1, 1]))
     gradient, loss, records = gradient_of(NOISY)(params, worlds, KEY, None)
@@ -88,10 +88,6 @@ def test_the_curve_is_of_steps_that_count():
     assert numbers["collided"] == numbers["gates"] == 0 and "counted" not in numbers
     assert numbers["memory"] == pytest.approx(np.abs(records.hidden).mean())
     assert 0 < numbers["memory"] < 0.5, "a fresh network's is far from saturated"
-
-
-def test_remembered_states_are_of_steps_that_counted():
-    worlds, params = boxes_worlds(NOISY), fresh_params()
     worlds = worlds._replace(stop=np.array([6, 6, 6, 1]))
     records = gradient_of(NOISY)(params, worlds, KEY, None)[2]
     before = jnp.full((4, NOISY.spec.hidden_size), 9.0)

@@ -11,7 +11,6 @@ import pytest
 
 from suite.delta.replay import nominal_model
 from suite.train import worlds as sampling
-from suite.train.dynamics.point_mass import PointMassParams
 from suite.train.rollout import SEEN
 from suite.train.step import NEAR
 from suite.train.worlds import WorldsAhead, sample_worlds
@@ -24,12 +23,21 @@ from tracks.geometry.gates import yaw_rotation
 from tracks.geometry.scene import stack
 
 
-def test_gates_heights_follow_the_setting():
+def test_gates_heights_and_drag_along_the_bodys_z_follow_settings_of_their_own():
     usual, wide = (
         sample_worlds(small_config(batch=16, height_spread=share), 0).scene.gates.center_w[..., 2]
         for share in (1.0, 2.0)
     )
     assert np.ptp(wide, axis=1).mean() > 1.4 * np.ptp(usual, axis=1).mean()
+    config = small_config()
+    plain = sample_worlds(config, 2)
+    physics = replace(config.physics, drag_up=(3.0, 4.0))
+    changed = sample_worlds(replace(config, physics=physics), 2)
+    before, after = (worlds.constants for worlds in (plain, changed))
+    np.testing.assert_array_equal(after.drag[:, :2], before.drag[:, :2])
+    assert np.all((after.drag[:, 2] >= 3.0) & (after.drag[:, 2] <= 4.0))
+    np.testing.assert_array_equal(changed.pos_w, plain.pos_w)
+    np.testing.assert_allclose(nominal_model(physics).drag, [0.45, 0.45, 3.5])
 
 
 @pytest.mark.parametrize(("share", "least", "most"), [(0.5, 0.35, 0.65), (1.0, 0.9, 1.0)])
@@ -57,19 +65,6 @@ def test_the_speed_command_is_drawn_where_it_is_an_input_and_moves_nothing_else(
     others = worlds.speed_command[~races]
     assert 0.3 < races.mean() < 0.7 and abs(others.mean() - 0.5) < 0.15
     assert others.min() < 0.2 and 0.8 < others.max() < 1.0
-
-
-def test_drag_along_the_bodys_z_has_a_range_of_its_own():
-    config = small_config()
-    plain = sample_worlds(config, 2)
-    physics = replace(config.physics, drag_up=(3.0, 4.0))
-    changed = sample_worlds(replace(config, physics=physics), 2)
-    before, after = (worlds.constants for worlds in (plain, changed))
-    assert isinstance(before, PointMassParams) and isinstance(after, PointMassParams)
-    np.testing.assert_array_equal(after.drag[:, :2], before.drag[:, :2])
-    assert np.all((after.drag[:, 2] >= 3.0) & (after.drag[:, 2] <= 4.0))
-    np.testing.assert_array_equal(changed.pos_w, plain.pos_w)
-    np.testing.assert_allclose(nominal_model(physics).drag, [0.45, 0.45, 3.5])
 
 
 def test_worlds_at_rest_stop_early_and_forget_the_others_remember():

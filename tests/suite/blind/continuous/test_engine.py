@@ -48,7 +48,7 @@ def test_steady_wind_is_what_drag_brings_the_vehicle_to():
     np.testing.assert_allclose(vel_w, (1 - np.exp(-2.0)) * np.array([3.0, -1.0, 0]), atol=1e-8)
 
 
-def test_the_rate_loop_measures_at_its_ticks_and_anew_at_every_row():
+def test_the_rate_loop_measures_at_its_ticks_and_at_rows_and_not_at_a_late_command():
     # Held torque: a period of length h moves the rate by K h (command - rate).
     run = flown(PLAIN, [0.0, 0.0037, 0.01], [(HOVER, 0.4, 0, 0), (HOVER, 0.4, 0, 0)])
     rate, expected = 0.0, []
@@ -58,9 +58,6 @@ def test_the_rate_loop_measures_at_its_ticks_and_anew_at_every_row():
     ticks = np.flatnonzero(run.schedule.is_tick[:, 0])
     np.testing.assert_allclose(run.state[ticks[1:], 0, RATE][:, 0], expected[:-1], rtol=1e-9)
     assert run.state[-1, 0, RATE][0] == pytest.approx(expected[-1], rel=1e-9)
-
-
-def test_a_command_inside_a_period_meets_the_rates_of_the_last_tick():
     late = with_effects(command_delay=(0.0013,))
     run = flown(late, [0.0, 0.002, 0.004], [(HOVER, 0.4, 0, 0), (HOVER, -5.0, 0, 0)])
     measured = 20.0 * 0.4 * 0.0007
@@ -79,7 +76,7 @@ def test_a_push_is_felt_and_kept():
     assert many.acc_b[1:, 0, 0] == pytest.approx(np.full(2, 0.75 / PLAIN.mass))
 
 
-def test_the_accelerometer_is_that_of_before_the_command_and_the_voltage_falls():
+def test_the_accelerometer_is_that_of_before_the_command_and_the_voltage_falls_from_the_first_row():
     run = flown(PLAIN, [0.0, 0.5, 1.0], [(HOVER, 0, 0, 0), (2 * HOVER, 0, 0, 0)])
     np.testing.assert_allclose(run.acc_b[:, 0], [[0, 0, HOVER]] * 2, atol=1e-12)
     np.testing.assert_allclose(run.voltage[:, 0], [16.5, 16.5 - 0.02 * 0.5])
@@ -87,9 +84,6 @@ def test_the_accelerometer_is_that_of_before_the_command_and_the_voltage_falls()
     # Twice the squared speeds of a hover cost 0.35 V more.
     assert later.voltage[2, 0] == pytest.approx(16.5 - 0.02 - 0.35)
     assert later.acc_b[2, 0, 2] == pytest.approx(2 * HOVER)
-
-
-def test_sag_goes_by_the_voltage_of_the_first_row():
     truth = with_effects(battery_sag=(0.0, 0.1))
     run = flown(truth, [-0.2, 0.0, 0.5], [(2 * HOVER, 0, 0, 0)])
     # The first row, at time 0, sees 16.15 V; half a second later it is 10 mV less.

@@ -31,13 +31,10 @@ def test_the_controller_is_the_documented_one_with_nominal_constants():
     assert here.max() == pytest.approx(most) and 0.1 < free.mean() < 0.9
 
 
-def test_rotors_lag_and_commands_are_late():
+def test_lag_delay_and_every_effect_of_the_catalogue_have_an_equation_and_another_is_refused():
     assert quadrotor_of(PLAIN)[-3:-1] == (0.0, 0.0)
     late = quadrotor_of(with_effects(motor_lag=(0.04,), command_delay=(0.013,)))
     assert (late.time_constant, late.delay) == (0.04, 0.013)
-
-
-def test_every_effect_of_the_catalogue_has_an_equation_and_another_is_refused():
     drawn = drawn_effects(np.random.default_rng(0)).effects
     assert set(drawn) == set(EFFECTS)
     quadrotor_of(replace(PLAIN, effects={name: drawn[name] for name in nameable_effects()}))

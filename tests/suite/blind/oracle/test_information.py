@@ -10,14 +10,6 @@ from eval.effects import nameable_effects
 from eval.flights.simulate import SENSORS, log_of
 from suite.blind.oracle import information as oracle
 from suite.blind.oracle import strength
-from suite.blind.oracle.information import (
-    Column,
-    alternatives,
-    columns_of,
-    detectable,
-    information,
-    remaining_ratio,
-)
 from suite.blind.oracle.strength import columns_in_table, detectable_along, strengths
 from tests.support.ways import BARE, bare_flights
 
@@ -31,36 +23,37 @@ def flights():
 
 @pytest.fixture(scope="module")
 def info(flights):
-    return information(BARE, flights, SENSORS["capture"])
+    return oracle.information(BARE, flights, SENSORS["capture"])
 
 
 def test_information_grows_with_flights_and_knows_hand_worked_parts(flights, info):
-    one = information(BARE, flights[:1], SENSORS["capture"], NAMES)
+    one = oracle.information(BARE, flights[:1], SENSORS["capture"], NAMES)
     of_both = [info.columns.index(column) for column in one.columns]
     assert (np.diag(info.matrix)[of_both] >= np.diag(one.matrix) - 1e-9).all()
     # A gyro bias moves one channel by itself; each row says 1 / sigma^2, less what the unknown
     # start takes (its rate and its drift in attitude).
-    index = one.columns.index(Column("gyro_bias", "bias", 2))
+    index = one.columns.index(oracle.Column("gyro_bias", "bias", 2))
     stretches = int(flights[0].time_s[-1] - 0.3)
     most = 101 * stretches / SENSORS["capture"].gyro ** 2
     assert 0.1 * most < one.matrix[index, index] < most
 
 
 def test_lookalikes_look_alike_and_strangers_do_not(info):
-    change = {"rotor_drag": 6.0 * detectable(info.block("rotor_drag"), np.ones(1)) * np.ones(1)}
-    near = remaining_ratio(info, change, "rotor_drag", "linear_drag", BARE)
-    far = remaining_ratio(info, change, "rotor_drag", "com_offset", BARE)
+    size = 6.0 * oracle.detectable(info.block("rotor_drag"), np.ones(1))
+    change = {"rotor_drag": size * np.ones(1)}
+    near = oracle.remaining_ratio(info, change, "rotor_drag", "linear_drag", BARE)
+    far = oracle.remaining_ratio(info, change, "rotor_drag", "com_offset", BARE)
     whole = 36.0 * 12.5
     assert near < 0.05 * whole and 0.5 * whole < far <= whole * (1 + 1e-6)
-    (found,) = alternatives(info, change, BARE).values()
+    (found,) = oracle.alternatives(info, change, BARE).values()
     assert "com_offset" not in found and "accelerometer_bias" not in found
 
 
 def test_every_effect_has_columns_but_what_cannot_be_told():
-    names = {column.effect for column in columns_of(False)}
+    names = {column.effect for column in oracle.columns_of(False)}
     assert names == set(nameable_effects()) - {"gusts"}
-    assert Column("com_offset", "offset", 2) not in columns_of(False)
-    sag = [c.parameter for c in columns_of(True) if c.effect == "battery_sag"]
+    assert oracle.Column("com_offset", "offset", 2) not in oracle.columns_of(False)
+    sag = [c.parameter for c in oracle.columns_of(True) if c.effect == "battery_sag"]
     assert sag == ["per_volt"]
 
 
@@ -98,6 +91,6 @@ def test_an_effect_that_is_not_in_the_table_is_worked_out(monkeypatch):
     monkeypatch.setattr(strength, "_entry", strength._entry.__wrapped__)
     entry = {"columns": [["turn", 0], ["late", 0]], "matrix": [[25.0, 0.0], [0.0, 100.0]]}
     monkeypatch.setattr(strength, "strengths", lambda vehicle, sensors, names: {names[0]: entry})
-    assert columns_in_table("bare", "full", "imu_fault")[1] == Column("imu_fault", "late", 0)
+    assert columns_in_table("bare", "full", "imu_fault")[1] == oracle.Column("imu_fault", "late", 0)
     assert detectable_along("bare", "full", "imu_fault", np.eye(2)[0]) == pytest.approx(1.0)
     assert detectable_along("bare", "full", "imu_fault", np.eye(2)[1]) == pytest.approx(0.5)

@@ -14,7 +14,9 @@ from suite.common.running.lock import HOLDER, LOCK, one_writer, one_writer_each
 from tests.support.commands import refused
 
 
-def test_the_second_is_told_who_was_first(tmp_path, monkeypatch):
+def test_the_second_is_told_who_was_first_and_a_holder_that_says_nothing_still_holds(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr(sys, "argv", ["/bin/suite", "eval", "--out", "a b"])
     with one_writer(tmp_path / "run"):
         words = rf"run is being written by `suite eval --out 'a b'` \(pid {os.getpid()} on .*since"
@@ -25,9 +27,20 @@ def test_the_second_is_told_who_was_first(tmp_path, monkeypatch):
             pass
     with one_writer(tmp_path / "run"):
         pass
+    for text in ("", "[" * 100_000, "[]", '{"command": "\x1b[31m", "pid": 1}'):
+        with one_writer(tmp_path):
+            (tmp_path / HOLDER).write_text(text)
+            with pytest.raises(ValueError, match="being written by another command"):
+                with one_writer(tmp_path):
+                    pass
 
 
-def test_a_folder_in_which_nothing_came_is_not_left(tmp_path):
+def test_a_lock_that_a_killed_command_left_is_taken_over_and_an_empty_folder_is_not_left(tmp_path):
+    (tmp_path / LOCK).touch()
+    (tmp_path / HOLDER).write_text('{"command": "suite train", "pid": 1, "host": "x"}')
+    with one_writer(tmp_path):
+        assert json.loads((tmp_path / HOLDER).read_text())["pid"] == os.getpid()
+    assert not list(tmp_path.iterdir())
     with pytest.raises(KeyError):
         with one_writer_each([tmp_path / "a" / "b", tmp_path / "a" / ".." / "a" / "b"]):
             raise KeyError
@@ -35,23 +48,6 @@ def test_a_folder_in_which_nothing_came_is_not_left(tmp_path):
     with one_writer(tmp_path / "a"):
         (tmp_path / "a" / "result").touch()
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["result"]
-
-
-def test_a_lock_that_a_killed_command_left_is_taken_over(tmp_path):
-    (tmp_path / LOCK).touch()
-    (tmp_path / HOLDER).write_text('{"command": "suite train", "pid": 1, "host": "x"}')
-    with one_writer(tmp_path):
-        assert json.loads((tmp_path / HOLDER).read_text())["pid"] == os.getpid()
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_holder_that_says_nothing_still_holds(tmp_path):
-    for text in ("", "[" * 100_000, "[]", '{"command": "\x1b[31m", "pid": 1}'):
-        with one_writer(tmp_path):
-            (tmp_path / HOLDER).write_text(text)
-            with pytest.raises(ValueError, match="being written by another command"):
-                with one_writer(tmp_path):
-                    pass
 
 
 def test_files_of_others_are_left_as_they_are(tmp_path):

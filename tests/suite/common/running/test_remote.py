@@ -43,16 +43,7 @@ def test_a_folder_goes_there_and_comes_back_with_what_was_done(tmp_path, far):
     assert content(tmp_path / "out")["lines"] == b"before\n" and not list(far.glob("*"))
 
 
-def test_what_was_cut_off_there_is_gone_on_with(tmp_path, far):
-    (parcel,) = parcels([make_job(tmp_path)])
-    work = partial(count_on, str(tmp_path / "mark"))
-    with pytest.raises(KeyboardInterrupt):
-        list(do_remotely(work, parcel))
-    ((_, files),) = do_remotely(work, parcel)
-    assert files["lines"] == b"before\nsaid\nsaid\n"
-
-
-def test_a_place_that_another_works_in_is_left_to_it(tmp_path, far):
+def test_what_was_cut_off_there_is_gone_on_with_where_no_other_works(tmp_path, far):
     (parcel,) = parcels([make_job(tmp_path)])
     work = partial(count_on, str(tmp_path / "mark"))
     with pytest.raises(KeyboardInterrupt):
@@ -62,3 +53,5 @@ def test_a_place_that_another_works_in_is_left_to_it(tmp_path, far):
         ((_, files),) = do_remotely(work, parcel)
     assert files["lines"] == b"before\nsaid\n"
     assert os.listdir(place / "out") == ["lines", "kept"] or len(os.listdir(place / "out")) == 2
+    ((_, files),) = do_remotely(work, parcel)
+    assert files["lines"] == b"before\nsaid\nsaid\n"

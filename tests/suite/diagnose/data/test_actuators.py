@@ -45,32 +45,26 @@ def test_lag_and_delay_are_estimated_separately(lag, delay):
         np.testing.assert_allclose(found.scale, 1.0, atol=1e-3)
 
 
-def test_a_rotor_that_does_not_reach_its_speed_is_seen(log):
+def test_a_rotor_that_does_not_reach_its_speed_is_seen_also_by_logged_motor_commands(log):
     share = np.array([1.0, 0.97, 1.0, 1.0])
     (found,) = actuator_mismatches([with_speeds(log, log.rotor_speed * share)], LAGGED)
     np.testing.assert_allclose(found.scale, share, atol=2e-3)
     # A quarter of the thrust falls by 6 %.
     lost = (1.0 - 0.97**2) * log.thrust_cmd.mean() / 4.0
     assert found.thrust[0] == pytest.approx(-lost, rel=0.1)
-
-
-def test_logged_motor_commands_are_compared_with_the_speeds_too(log):
     commanded = replace(log, rotor_speed_cmd=log.rotor_speed / 0.9)
     found = actuator_mismatches([commanded], with_lag(PLAIN, 0.0))
     logged = {one.commanded_by: one for one in found}["logged motor commands"]
     np.testing.assert_allclose(logged.scale, 0.9, atol=5e-3)
 
 
-def test_logs_without_speeds_or_with_holes_give_no_mismatch(log):
+def test_logs_without_speeds_give_no_mismatch_and_speeds_of_another_controller_are_its_own(log):
     assert actuator_mismatches([with_speeds(log, None)], LAGGED) == []
     speed = np.array(log.rotor_speed)
     speed[::20] = np.nan
     speed[5:60] = np.nan
     assert len(actuator_mismatches([with_speeds(log, speed)], LAGGED)) <= 1
     assert actuator_mismatches([with_speeds(log, np.nan * speed)], LAGGED) == []
-
-
-def test_speeds_that_the_loop_does_not_command_are_another_controllers(log):
     other = with_speeds(log, np.roll(log.rotor_speed, 1, axis=1))
     assert flown_by_other_controller([other], LAGGED)
     assert not flown_by_other_controller([with_speeds(log, None)], LAGGED)

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data.noise import noise_of, rotor_noise
-from suite.diagnose.data.sampling import (
-    on_every_row,
-    thinned,
-    with_fewer_rows,
-    without_slow_rotors,
-)
+from suite.diagnose.data.sampling import on_every_row, thinned, with_fewer_rows, without_slow_rotors
 from suite.diagnose.data.windows import SLICES, cut
 from suite.diagnose.thresholds import Thresholds
 from tests.support.diagnosis_flights import NOISE, fly
@@ -55,11 +50,21 @@ def test_a_slower_signal_is_joined_by_lines_a_command_is_held_and_a_hole_stays(l
     assert near.min() > 0.999
 
 
-def test_rotor_speeds_at_three_hertz_are_left_out_with_the_bound(log, row):
+def test_slow_rotor_speeds_are_left_out_and_of_too_many_rows_a_share_of_each_signal_stays(log, row):
     slow = replace(log, rotor_speed=on_rows(log.rotor_speed, row % 30 == 0))
     kept, (note,) = without_slow_rotors([log, slow])
     assert kept[0] is log and kept[1].rotor_speed is None
     assert "3.3 Hz" in note and "at least 10 Hz" in note
+    sparse = replace(log, rate_b=on_rows(log.rate_b, row % 3 == 1))
+    (same,), notes = with_fewer_rows([sparse], Thresholds(most_rows=len(row)))
+    assert same is sparse and notes == []
+    (few,), (note,) = with_fewer_rows([sparse], Thresholds(most_rows=len(row) // 2))
+    assert "every 3. row" in note
+    position = np.isfinite(few.pos_w).all(axis=1)
+    np.testing.assert_array_equal(few.time_s[position], log.time_s[::3])
+    turning = np.isfinite(few.rate_b).all(axis=1)
+    np.testing.assert_array_equal(few.rate_b[turning], log.rate_b[row % 3 == 1][::3])
+    assert len(few.rotor_speed) == len(few.time_s) < len(row)
 
 
 @pytest.mark.parametrize(
@@ -88,16 +93,3 @@ def test_rows_are_thinned_so_that_no_signal_is_lost():
     assert seen[kept].sum(axis=0).min() >= 18
     every_third = thinned(np.ones((250, 2), bool), time_s[:250], 101)
     np.testing.assert_array_equal(every_third, np.arange(0, 250, 3))
-
-
-def test_of_too_many_rows_every_so_many_th_of_each_signal_stays(log, row):
-    sparse = replace(log, rate_b=on_rows(log.rate_b, row % 3 == 1))
-    (same,), notes = with_fewer_rows([sparse], Thresholds(most_rows=len(row)))
-    assert same is sparse and notes == []
-    (few,), (note,) = with_fewer_rows([sparse], Thresholds(most_rows=len(row) // 2))
-    assert "every 3. row" in note
-    position = np.isfinite(few.pos_w).all(axis=1)
-    np.testing.assert_array_equal(few.time_s[position], log.time_s[::3])
-    turning = np.isfinite(few.rate_b).all(axis=1)
-    np.testing.assert_array_equal(few.rate_b[turning], log.rate_b[row % 3 == 1][::3])
-    assert len(few.rotor_speed) == len(few.time_s) < len(row)

@@ -15,12 +15,17 @@ from suite.diagnose.data.steps import (
 from tests.support.vehicles import PLAIN, with_lag
 
 
-def test_a_slow_loop_samples_at_its_own_times_and_steps_between():
+def test_a_slow_loop_samples_at_its_own_times_and_padding_adds_steps_of_no_length():
     grid = step_grid(np.array([0.0, 0.01, 0.02]), 0.005)
     samples_s = grid.edge_s[:-1][grid.sample_s > 0]
     np.testing.assert_allclose(samples_s, [0.0, 0.005, 0.01, 0.015])
     assert np.diff(grid.edge_s).max() < 0.003
     np.testing.assert_allclose(grid.lead_s, 0.0, atol=1e-12)
+    grid = step_grid(np.array([0.0, 0.01, 0.02]), 0.002)
+    for at_front, steps in ((False, slice(10)), (True, slice(6, None))):
+        longer = padded_grid(grid, 16, at_front)
+        np.testing.assert_array_equal(longer.sample_s[steps], grid.sample_s)
+        assert (np.diff(longer.edge_s) == 0.0).sum() == 6 == (longer.sample_s == 0.0).sum()
 
 
 @pytest.mark.parametrize(
@@ -54,14 +59,6 @@ def test_a_lost_row_is_put_in_on_a_line_and_jitter_is_none():
     np.testing.assert_allclose(filled_s[20], time_s[[19, 21]].mean())
     np.testing.assert_allclose(filled[:, 1], filled_s, atol=1e-12)
     np.testing.assert_array_equal(filled[-1], command[-1])
-
-
-def test_padding_adds_steps_of_no_length_at_either_end():
-    grid = step_grid(np.array([0.0, 0.01, 0.02]), 0.002)
-    for at_front, steps in ((False, slice(10)), (True, slice(6, None))):
-        longer = padded_grid(grid, 16, at_front)
-        np.testing.assert_array_equal(longer.sample_s[steps], grid.sample_s)
-        assert (np.diff(longer.edge_s) == 0.0).sum() == 6 == (longer.sample_s == 0.0).sum()
 
 
 def test_measurements_are_joined_across_holes_and_commands_held():

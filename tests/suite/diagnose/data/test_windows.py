@@ -45,7 +45,6 @@ def test_few_shapes_hold_rows_of_every_rate(log):
         rows_s = np.arange(0.0, 1.9, 1.0 / rate_hz)
         near = np.clip(np.searchsorted(log.time_s, rows_s), 0, len(log.time_s) - 1)
         windows, _ = cut([replace(rows(log, near), time_s=rows_s)], PLAIN, False)
-        assert windows is not None
         shape = (windows.edge_s.shape[1], windows.command_s.shape[1])
         shapes.setdefault(shape, []).append(rate_hz)
     assert shapes == {
@@ -59,7 +58,6 @@ def test_few_shapes_hold_rows_of_every_rate(log):
 def test_what_is_an_input_or_derived_is_no_measurement(log):
     for rotor_input in (False, True):
         windows, _ = cut([replace(log, velocity_derived=True)], PLAIN, rotor_input)
-        assert windows is not None
         seen = windows.valid.any(axis=(0, 1))
         assert seen[SLICES["rotor speed"]].all() != rotor_input
         assert bool(windows.rotor_speed.any()) == rotor_input
@@ -69,7 +67,6 @@ def test_what_is_an_input_or_derived_is_no_measurement(log):
 def test_no_window_lies_over_a_hole_and_a_log_of_holes_is_named(log):
     holed = rows(log, (log.time_s < 0.8) | (log.time_s > 1.15))
     windows, _ = cut([holed], PLAIN, False)
-    assert windows is not None
     assert windows.start_s.min() > 1.15 + BURN_IN_S, "the rotors follow commands before it"
     none, warnings = cut([holed], PLAIN, False, limits=Thresholds(longest_hole_s=1e-3))
     assert none is None and warnings == [f"{log.name}: no stretch of 1.3 s without a hole"]
@@ -101,7 +98,6 @@ def test_of_many_windows_as_many_as_allowed_are_spread_over_the_flights(log):
 
 def test_noise_is_estimated_under_a_models_error(log):
     windows, _ = cut([log], PLAIN, True)
-    assert windows is not None
     rng = np.random.default_rng(0)
     time_s = np.asarray(windows.row_s)[..., None]
     residual = 0.3 * time_s**2 + 0.002 * rng.standard_normal(windows.valid.shape)
@@ -112,16 +108,15 @@ def test_noise_is_estimated_under_a_models_error(log):
     assert rotor_noise(windows) == pytest.approx(NOISE["motor"], rel=0.5)
 
 
-def test_a_flight_that_alone_identifies_something_is_fitted(log):
+def test_a_flight_that_alone_identifies_something_is_fitted_and_of_a_single_one_the_end_held_out(
+    log,
+):
     logs = [replace(log, name=f"flight_{k}") for k in range(3)]
     windows, _ = cut(logs, PLAIN, False)
     information = np.ones((len(windows.flight), 2))
     information[windows.flight != 2, 1] = 1e-3
     fitted, names = choose_held_out(logs, windows.flight, windows.start_s, information)
     assert names == ["flight_1"] and set(windows.flight[fitted]) == {0, 2}
-
-
-def test_of_a_single_flight_the_end_is_held_out(log):
     windows, _ = cut([log], PLAIN, False)
     information = np.ones((len(windows.flight), 1))
     fitted, names = choose_held_out([log], windows.flight, windows.start_s, information)

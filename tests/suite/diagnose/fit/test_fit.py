@@ -17,7 +17,7 @@ def linearised(flown):
     return model, windows, model.linearise(begin.theta, begin.free, windows, None)
 
 
-def test_slopes_are_those_of_small_changes(linearised):
+def test_slopes_are_those_of_small_changes_and_a_disturbance_pushes_the_windows(linearised):
     model, windows, linear = linearised
     begin = start_estimate(model, windows)
     index = model.space.layout.index(("linear_drag", "coefficient", 0))
@@ -28,11 +28,6 @@ def test_slopes_are_those_of_small_changes(linearised):
     np.testing.assert_allclose(linear.slope[..., index], slope, atol=1e-4)
     few = model.linearise(begin.theta, begin.free, windows, [index])
     np.testing.assert_allclose(few.slope[..., 0], linear.slope[..., index], atol=1e-9)
-
-
-def test_a_disturbance_pushes_the_windows(linearised):
-    model, windows, _ = linearised
-    begin = start_estimate(model, windows)
     response = model.respond(begin.theta, begin.free, windows)
     assert response.slope.shape[-1] == KNOTS * 6
     assert response.knot.rotor_speed.shape == (len(windows.flight), KNOTS, 4)

@@ -31,14 +31,11 @@ def leaning(*, attitude, speed=0.0):
     return fit_force([flight], driven, unknowns, LAGS), felt
 
 
-@pytest.mark.parametrize("attitude", [True, False])
-def test_the_thrust_is_what_path_and_gravity_need(attitude):
-    found, felt = leaning(attitude=attitude)
+def test_the_thrust_is_what_path_and_gravity_need_in_fast_windows_with_an_attitude_alone():
     by_rotors = 4e6 * PLAIN.rotors.thrust_coefficient / PLAIN.mass
-    np.testing.assert_allclose(np.exp(found.value[0]), felt / by_rotors, rtol=1e-6)
-
-
-def test_without_an_attitude_fast_windows_are_left_out():
+    for attitude in (True, False):
+        found, felt = leaning(attitude=attitude)
+        np.testing.assert_allclose(np.exp(found.value[0]), felt / by_rotors, rtol=1e-6)
     with pytest.raises(NoWholeWindow):
         leaning(attitude=False, speed=6.0)
 
@@ -64,14 +61,12 @@ def rolled(noise, **limits):
     return fit_torque([rolling(noise)], DrivenVehicle(PLAIN, "rotors"), unknowns, LAGS)
 
 
-@pytest.mark.parametrize(("noise", "half"), [(0.0, 0.015), (100.0, 0.16)])
-def test_noise_of_the_rotor_speeds_widens_the_interval_and_makes_no_body_heavier(noise, half):
+def test_noise_of_the_rotor_speeds_widens_the_interval_and_makes_no_body_heavier():
     """At 100 rad/s 15 % of the variance is noise, by which the inertia would seem larger."""
-    found = rolled(noise)
-    assert found.identifies("inertia_x") and abs(found.value[0] - np.log(2.0)) < 0.02
-    assert found.half_width[0] == pytest.approx(half, rel=0.1)
-
-
-def test_what_is_mostly_noise_or_at_its_limit_is_not_identified():
+    for noise, half in ((0.0, 0.015), (100.0, 0.16)):
+        found = rolled(noise)
+        assert found.identifies("inertia_x") and abs(found.value[0] - np.log(2.0)) < 0.02
+        assert found.half_width[0] == pytest.approx(half, rel=0.1)
+    # What is mostly noise, or at its limit, is not identified.
     assert not rolled(300.0).identifies("inertia_x")
     assert not rolled(0.0, high=0.3).identifies("inertia_x")

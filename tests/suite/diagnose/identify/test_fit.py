@@ -24,15 +24,12 @@ def flights(slopes, noise=0.1, count=200, seed=0):
     return residuals
 
 
-def test_a_number_that_nothing_hangs_on_stays_as_it_was():
+def test_a_number_that_nothing_hangs_on_stays_and_flights_that_differ_are_the_units():
     found = fit(flights([2.0] * 4), [SLOPE, BLIND])
     assert found.not_identified == ("blind",)
     assert found.value[1] == 4.0
     assert np.isnan(found.half_width[1])
     assert abs(found.value[0] - 2.0) < 0.02
-
-
-def test_flights_that_differ_are_the_units():
     alike = fit(flights([2.0] * 5), [SLOPE])
     apart = fit(flights([1.8, 1.9, 2.0, 2.1, 2.2]), [SLOPE])
     assert apart.half_width[0] > 5.0 * alike.half_width[0]
@@ -91,12 +88,9 @@ def test_intervals_of_few_blocks_are_as_much_wider_as_students_t():
     assert 1.6 < ratio < 3.0
 
 
-def test_a_fit_without_rows_is_refused():
+def test_missing_values_are_left_out_and_a_fit_without_rows_is_refused():
     with pytest.raises(NoWholeWindow):
         fit(flights([2.0], count=0), [SLOPE])
-
-
-def test_missing_values_are_left_out():
     residuals = flights([2.0] * 4)
 
     def with_holes(value):

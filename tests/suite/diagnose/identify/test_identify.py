@@ -120,16 +120,13 @@ def test_a_hover_identifies_thrust_and_reports_what_it_does_not(missing, lines):
     assert found.vehicle.inertia == known.start().inertia
 
 
-def test_without_rates_the_attitude_identifies_the_inertia():
+def test_what_turns_is_identified_by_the_attitude_without_rates_and_without_positions():
     fleet, rng = Fleet(known.truth(), known.WAYS), np.random.default_rng(0)
     sensors = replace(known.SENSORS, attitude=0.002)
     logs = logs_of(fleet, known.recordings(), "pwm", rng, sensors=sensors)
     off = pulls(identify(without(logs, "rate_b"), known.start(), leave=("loop",)))
     assert {("inertia", 0), ("inertia", 1)} <= set(off)
     assert np.max(np.abs(list(off.values()))) < 2.5
-
-
-def test_without_positions_the_rates_identify_what_turns():
     found = identify(without(known.logs("pwm", 0), "pos_w", "vel_w"), known.start())
     assert "rotors.torque_coefficient" in numbers_json(found.numbers)
     assert any(

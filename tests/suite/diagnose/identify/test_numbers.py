@@ -35,21 +35,23 @@ def test_the_inertia_about_z_follows_the_others():
     assert np.all(found <= found.sum() - found + 1e-15), "no body has one larger than both others"
 
 
-def test_identified_numbers_are_put_in_and_the_rest_stays():
+def test_rotors_that_are_too_slow_to_hover_get_the_speed_that_they_flew_at():
+    """1.6e-6 x 1000^2 = 1.6 N a rotor, of 1.84 N that are needed; one row is no speed."""
+    speeds = [np.full((50, 4), 1100.0), np.full((60, 4), 1200.0), np.full((1, 4), 9e4)]
+    slow = replace(PLAIN, rotors=replace(PLAIN.rotors, speed_max=1000.0))
+    assert with_reachable_speed(slow, speeds).rotors.speed_max == 1200.0
+    assert with_reachable_speed(PLAIN, speeds) == PLAIN
+
+
+def test_identified_numbers_are_put_in_and_what_no_file_may_hold_is_noted():
     lag = Number("rotors.time_constant", "s", [0.05], [(0.04, 0.06)])
     assert with_entries(PLAIN, [lag])[0].rotors.time_constant == 0.05
     assert with_entries(PLAIN, [lag._replace(ci95=[None])])[0] == PLAIN
-
-
-def test_a_value_that_no_file_may_hold_becomes_the_nearest_with_a_note():
     spans = [(0.2, 0.4), (-0.2, 0.0), None]
     drag = Number(DRAG, "1/s", [0.3, -0.1, 0.0], spans)
     vehicle, (entry,), (note,) = with_entries(PLAIN, [drag])
     assert vehicle.effects["linear_drag"].coefficient == tuple(entry.value) == (0.3, 0.0, 0.0)
     assert entry.ci95 == spans and note.startswith(f"{DRAG}[1]: these flights give -0.1")
-
-
-def test_a_delay_that_flights_contradict_is_removed_with_a_note():
     late = with_effects(PLAIN, command_delay=(0.03,), linear_drag=((0.1, 0.1, 0.1),))
     none = Number(DELAY, "s", [-0.001], [(-0.002, 0.0)])
     vehicle, numbers, (note,) = with_entries(late, [none])
@@ -70,14 +72,6 @@ def test_a_delay_is_no_better_known_than_the_lag_however_well_their_sum_is(half,
     assert with_entries(PLAIN, [delay])[0].effects["command_delay"].delay == pytest.approx(0.02)
     negative = delay._replace(value=[-0.003])
     assert "command_delay" not in with_entries(PLAIN, [negative])[0].effects
-
-
-def test_rotors_that_are_too_slow_to_hover_get_the_speed_that_they_flew_at():
-    """1.6e-6 x 1000^2 = 1.6 N a rotor, of 1.84 N that are needed; one row is no speed."""
-    speeds = [np.full((50, 4), 1100.0), np.full((60, 4), 1200.0), np.full((1, 4), 9e4)]
-    slow = replace(PLAIN, rotors=replace(PLAIN.rotors, speed_max=1000.0))
-    assert with_reachable_speed(slow, speeds).rotors.speed_max == 1200.0
-    assert with_reachable_speed(PLAIN, speeds) == PLAIN
 
 
 def found(*names, left=()):

@@ -7,22 +7,10 @@ import pytest
 
 from suite.common.report import html
 from suite.diagnose.estimate.parameters import make_space
-from suite.diagnose.report import charts
+from suite.diagnose.report import charts, sections
 from suite.diagnose.report.charts import series_chart
-from suite.diagnose.report.diagnosis_json import (
-    actuators_json,
-    diagnosis_json,
-    parameters_json,
-)
+from suite.diagnose.report.diagnosis_json import actuators_json, diagnosis_json, parameters_json
 from suite.diagnose.report.page import channels_grid, page
-from suite.diagnose.report.sections import (
-    actuators_section,
-    candidates_section,
-    evidence_section,
-    logs_section,
-    noise_section,
-    residual_section,
-)
 from suite.diagnose.report.summary import NOT_IDENTIFIABLE, answer, components, in_digits
 from suite.diagnose.verdict.actuators import actuator_mismatches
 from tests.support.diagnosis_flights import fly
@@ -95,15 +83,15 @@ def test_a_weak_motor_has_its_number_and_the_motors_that_it_may_be():
 
 
 def test_sections_show_the_numbers(drag, found):
-    noise = noise_section(drag).parts[1]
+    noise = sections.noise_section(drag).parts[1]
     assert isinstance(noise, Grid) and texts(noise)[0][0] == "position [m]"
-    assert len(actuators_section(found)) == 1
-    assert actuators_section({**found, "actuators": []}) == []
+    assert len(sections.actuators_section(found)) == 1
+    assert sections.actuators_section({**found, "actuators": []}) == []
     rest = {**found, "unexplained": {"where": "a shape", "share": 0.25}}
-    assert residual_section(rest).parts[0] == "25 % of the gap remains: a shape."
-    held = evidence_section(drag, found).parts[-1]
+    assert sections.residual_section(rest).parts[0] == "25 % of the gap remains: a shape."
+    held = sections.evidence_section(drag, found).parts[-1]
     assert isinstance(held, Grid) and texts(held)[-1][0] == "with the named effects"
-    tried = candidates_section(drag).parts[0]
+    tried = sections.candidates_section(drag).parts[0]
     assert isinstance(tried, Grid) and len(tried.rows) > 10
     assert [row[0] for row in texts(tried) if row[3] == "named"] == ["linear_drag"]
     # A channel that no log measured is not in the table.
@@ -116,7 +104,7 @@ def test_sections_show_the_numbers(drag, found):
 def test_a_log_is_shown_with_duration_rate_holes_and_signals():
     log = fly(PLAIN, 0, duration_s=3.0, motors=True)
     log.pos_w[30:60] = np.nan
-    (row,) = texts(logs_section([log]).parts[0])
+    (row,) = texts(sections.logs_section([log]).parts[0])
     assert row[1:6] == ["3.0 s", "301", "100 Hz", "10 ms", "10.0 %"]
     assert row[7] == "commands, velocity, rotor speeds"
 

@@ -22,7 +22,7 @@ def found(verdict, effects=(), where=None, **more):
     return {**base, **more}
 
 
-def test_an_answer_has_the_effect_its_values_and_its_size():
+def test_an_answer_has_the_effect_its_values_and_its_size_or_what_is_too_small():
     assert answer(found("named", [DRAG])) == (
         "Wrong or missing in the vehicle file: Drag proportional to the airspeed (linear_drag or "
         "rotor_drag): coefficient x 0.31 1/s, coefficient y 0.302 1/s. On these flights it causes "
@@ -33,9 +33,6 @@ def test_an_answer_has_the_effect_its_values_and_its_size():
     partly = answer(found("partly", [by_force]))
     assert "causes 0.8 m/s² (RMS). This explains a part" in partly
     assert "has changed since the reference" in answer(found("named", [DRAG], reference=["a"]))
-
-
-def test_no_gap_lists_what_is_too_small_and_what_was_not_examined():
     small = found("no_gap", negligible=[{"name": "torque_trim"}], not_examined=["torque"])
     assert answer(small).endswith("Significant but too small to matter: torque_trim.")
     assert any("These logs do not show: torque." in step for step in next_steps(small))

@@ -116,15 +116,12 @@ def test_the_noise_fits_held_out_flights_unless_theirs_has_another_colour():
     assert not held_out(mixed)["velocity_z"].fits
 
 
-def test_a_drift_is_found():
+def test_a_drift_and_a_tilt_by_neglected_drag_are_found_where_they_are():
     none = {"position_x": 0.0, "position_y": 0.0}
     drifting = flown(range(20, 24), 0.0, position_drift=0.05, **none)
     drift = fit_sensors(drifting).axes["position_x"].drift
     assert drift.low <= 0.05 <= drift.high
     assert drift.value > 0.02
-
-
-def test_a_tilt_by_neglected_drag_is_found_where_it_is():
     assert not fit_sensors(flights()).tilt.drag.value
     tilt = fit_sensors(flown(range(30, 36), drag=0.4)).tilt
     assert tilt.drag.value == pytest.approx(0.4, abs=0.01)

@@ -40,11 +40,14 @@ def test_a_constant_push_has_its_own_size_however_long_a_stretch_is_trusted(unti
     assert size.drift == pytest.approx(0.04)
 
 
-def test_a_bias_of_the_accelerometer_counts_as_a_force():
+def test_a_bias_of_the_accelerometer_counts_as_a_force_and_a_views_size_is_in_its_own_unit():
     moved = np.zeros((3, 101, 19))
     moved[..., 12] = 0.06
     assert rollout_size(moved, windows()).force == pytest.approx(0.06)
     assert rollout_size(moved, windows(without=("accelerometer",))).force == 0.0
+    moved = np.tile([0.3, 0.0, 0.4], (5, 1))
+    assert view_size(moved, True) == EffectSize(pytest.approx(0.5), 0.0, None)
+    assert view_size(moved, False) == EffectSize(0.0, pytest.approx(0.5), None)
 
 
 def test_the_upper_end_of_a_size_holds_what_the_interval_allows():
@@ -66,12 +69,6 @@ def test_one_threshold_is_enough_and_none_at_all_keeps_everything(size):
     assert size.relevant(LIMITS)
     below = EffectSize(*(0.99 * (value or 0.0) for value in size))
     assert not below.relevant(LIMITS) and below.relevant(Thresholds(relevance=(0.0, 0.0, 0.0)))
-
-
-def test_a_views_size_is_in_its_own_unit():
-    moved = np.tile([0.3, 0.0, 0.4], (5, 1))
-    assert view_size(moved, True) == EffectSize(pytest.approx(0.5), 0.0, None)
-    assert view_size(moved, False) == EffectSize(0.0, pytest.approx(0.5), None)
 
 
 def test_a_gap_matters_beyond_its_noise_by_more_than_the_thresholds(found_drag):

@@ -75,14 +75,11 @@ def test_structure_is_a_shape_a_colour_or_the_largest_channel():
     assert structure_where(loud, left(), True, replace(THRESHOLDS, structure_rotor_input=1.1))
 
 
-def test_the_share_that_remains_is_that_of_the_gaps():
+def test_a_gap_has_its_interval_its_noise_floor_and_the_share_that_remains_of_it():
     before, after, none = (Gap(np.full(8, 1.0 + above), np.zeros(8), {}) for above in (24, 6, -0.1))
     assert (before.rms, after.rms) == (5.0, pytest.approx(np.sqrt(7.0)))
     assert remaining_share(before, after) == pytest.approx((7**0.5 - 1.0) / 4.0)
     assert remaining_share(after, before) == 1.0 and remaining_share(before, none) == 0.0
-
-
-def test_a_gaps_interval_holds_it_and_a_rise_is_seen():
     rng = np.random.default_rng(0)
     energies = rng.chisquare(10, 80), rng.chisquare(10, 80) + 8.0
     before, after = (Gap(energy / 10.0, energy, {}) for energy in energies)
@@ -93,9 +90,6 @@ def test_a_gaps_interval_holds_it_and_a_rise_is_seen():
     assert not before.exceeds(after, 0.25, 0, THRESHOLDS)
     assert not before.exceeds(before, 0.25, 0, THRESHOLDS)
     assert not after.exceeds(before, 0.25, 0, Thresholds(refuting_chi2=1e6))
-
-
-def test_the_noise_floor_is_that_of_start_and_row():
     slope, noise = np.zeros((1, STATE, STATE)), np.zeros(STATE)
     slope[0, 0, 6], noise[[0, 6]] = 0.5, (0.3, 0.8)
     np.testing.assert_allclose(noise_floor(slope, noise)[0, [0, 6]], [0.5, 0.8])
@@ -109,15 +103,19 @@ def test_a_diagnosis_is_measured_on_what_was_held_out(drag, found_drag, flown):
     assert found_drag.after.rms < 1.3 < found_drag.before.rms
 
 
-def test_without_the_name_its_shape_is_left(found_drag, flown):
+def test_without_the_name_its_shape_is_left_and_a_drag_is_not_taken_for_wind(found_drag, flown):
     found, details = found_drag.search, found_drag.remaining.details
     evidence, bare = of_rollouts(found.last), found.estimate._replace(theta=flown.start.theta)
     windows = evidence.trusted
-    equations = disturbance_equations(flown.model, windows, evidence.whitening, bare)
+    equations, with_it = (
+        disturbance_equations(flown.model, windows, evidence.whitening, one)
+        for one in (bare, found.estimate)
+    )
     fold = np.arange(len(windows.flight)) % 5
     with_gap = residual_structure(equations, fold)
     assert with_gap.shapes[0].gain > 10.0 * max(details["shapes"][0]["gain"], 1.0)
     assert min(with_gap.coloured.values()) < 1e-6 <= min(details["coloured"].values())
+    assert find_turbulence(flown.model, found.estimate.theta, with_it) is None
 
 
 def test_the_likelihood_of_a_random_disturbance_peaks_at_its_size():
@@ -130,11 +128,3 @@ def test_the_likelihood_of_a_random_disturbance_peaks_at_its_size():
     sizes = np.array([0.5, 1.0, 2.0, 4.0, 8.0])
     found = _likelihood(equations, np.broadcast_to(np.eye(6), (count, 6, 6)), sizes)
     assert sizes[found.argmax()] == size
-
-
-def test_a_drag_is_not_taken_for_wind(found_drag, flown):
-    found = found_drag.search
-    evidence = of_rollouts(found.last)
-    with_it = (evidence.trusted, evidence.whitening, found.estimate)
-    equations = disturbance_equations(flown.model, *with_it)
-    assert find_turbulence(flown.model, found.estimate.theta, equations) is None

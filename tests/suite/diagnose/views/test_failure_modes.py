@@ -69,12 +69,9 @@ def test_a_force_that_nothing_explains_is_not_no_gap():
     assert shown.label.partition("body ")[2][0] in "xy", "the picture shows where the error is"
 
 
-def test_one_effect_is_named_without_a_second_small_one():
+def test_one_effect_is_named_without_a_second_small_one_but_with_what_looks_alike():
     label, names, _ = found_in(flights(4, seed=11, speed=4.0, blade_flapping=(2e-6,)))
     assert label == "named" and len(names) == 1
     assert "blade_flapping" in {*names, *next(iter(names.values()))}
-
-
-def test_a_thrust_scale_that_no_torque_separates_from_a_mass_has_it_as_an_alternative():
     _, names, _ = found_in(flights(4, seed=12, speed=1.0, hidden={"mass_offset": (0.08,)}))
     assert {"mass_offset", "thrust_scale"} <= {*names, *set().union(*names.values())}

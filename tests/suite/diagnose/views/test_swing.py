@@ -30,16 +30,13 @@ def swing_of(*flights):
     return find_swing([flight for flight, _ in flights], [left for _, left in flights])
 
 
-def test_a_pull_at_one_period_is_a_swing():
+def test_a_pull_at_one_period_is_a_swing_and_own_motion_noise_or_other_periods_are_none():
     rng = np.random.default_rng(0)
     found = swing_of(*(made(1.4, 0.3, 0.1, rng) for _ in range(3)))
     assert found is not None and found.ci95[0] < 1.4 < found.ci95[1]
     assert found.ci95[1] - found.ci95[0] < 0.2 and found.p_value < 1e-3
     assert found.length_m == pytest.approx(9.81 * found.period_s**2 / 39.48, rel=1e-3)
     assert "1.4" in found.words and "0.49 m" in Swing(1.4, (1.3, 1.5), 0.5, 0.0).words
-
-
-def test_own_motion_noise_and_periods_that_flights_do_not_share_are_no_swing():
     for seed in range(10):
         rng = np.random.default_rng(seed)
         assert swing_of(*(made(1.4, 0.0, 0.0, rng) for _ in range(3))) is None

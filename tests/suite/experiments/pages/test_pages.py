@@ -33,7 +33,7 @@ def made(number="1"):
     return PageContents({"recipe": "quick"}, {"Part": [grid, picture, picture]}, {"x": 1})
 
 
-def test_a_page_has_its_facts_its_tables_and_numbered_figures(tmp_path):
+def test_a_page_has_its_facts_tables_and_figures_and_keeps_other_text(tmp_path):
     place = Workspace(tmp_path / "docs", tmp_path)
     said = write_document(place, "schemes", Config(7), made(), Console())
     text = (tmp_path / "docs" / "schemes.md").read_text()
@@ -44,11 +44,8 @@ def test_a_page_has_its_facts_its_tables_and_numbered_figures(tmp_path):
     numbers = json.loads((tmp_path / "docs" / "schemes.json").read_text())
     assert numbers["seed"] == numbers["config"]["seed"] == 7 and numbers["x"] == 1
     assert said["out"].endswith("schemes.md")
-
-
-def test_a_page_made_again_keeps_the_text_around_what_is_made(tmp_path):
-    place, page = Workspace(tmp_path, tmp_path), tmp_path / "schemes.md"
-    write_document(place, "schemes", Config(7), made(), Console())
+    # Made again, it keeps the text around what is made.
+    page = tmp_path / "docs" / "schemes.md"
     page.write_text(page.read_text().replace("# schemes", "# My own title") + "\nWhat it means.\n")
     write_document(place, "schemes", Config(7), made("3"), Console())
     text = page.read_text()

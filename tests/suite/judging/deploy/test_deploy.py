@@ -54,13 +54,21 @@ def test_int8_is_scaled_by_flights(folder, tmp_path, monkeypatch, capsys):
     assert load_policy(tmp_path, trust=True).name == "tiny-int8.c"
 
 
-def test_what_cannot_be_exported_is_refused(folder, tmp_path, capsys):
+def test_what_cannot_be_exported_or_would_write_over_the_card_of_a_policy_is_refused(
+    folder, tmp_path, capsys
+):
     for args, message in (
         ("--format onnx --dtype int8", "supports float32 only"),
         ("--policy race-paper", "give one"),
     ):
         assert message in refused(capsys, f"export {args} --out {tmp_path}", folder)
     assert list(tmp_path.iterdir()) == []
+    own = shutil.copytree(folder, tmp_path / "own")
+    (own / exporting.CARD).write_text("mine")
+    said = refused(capsys, "export --format c --out", own, own)
+    assert "card.md is also an input and would be overwritten" in said
+    names = {path.name for path in folder.iterdir()}
+    assert {path.name for path in own.iterdir()} == {*names, exporting.CARD}
 
 
 @pytest.mark.parametrize(("wanted", "file"), [("onnx", "policy.onnx"), ("c", "policy.c")])
@@ -106,16 +114,7 @@ def test_a_card_has_the_success_of_a_shipped_policys_card(folder):
     assert "training seed unknown" in card("tiny", replace(stored, config=config))
 
 
-def test_the_card_of_a_policy_is_not_written_over(tmp_path, folder, capsys):
-    own = shutil.copytree(folder, tmp_path / "own")
-    (own / exporting.CARD).write_text("mine")
-    said = refused(capsys, "export --format c --out", own, own)
-    assert "card.md is also an input and would be overwritten" in said
-    names = {path.name for path in folder.iterdir()}
-    assert {path.name for path in own.iterdir()} == {*names, exporting.CARD}
-
-
-def test_what_a_policy_is_given_on_flights_is_kept(monkeypatch):
+def test_what_a_policy_is_given_on_flights_is_kept_but_for_rows_in_which_nothing_flies(monkeypatch):
     monkeypatch.setattr(parity, "TRACK", "zigzag")
     pilot = Steady((0.0, 0.0, -8.0), spec=PolicySpec(rate_hz=10.0))
     heard = parity.observed_flights(pilot, levels=(0, 1))
@@ -124,9 +123,6 @@ def test_what_a_policy_is_given_on_flights_is_kept(monkeypatch):
     assert len(heard.state) == len(heard.image) == len(heard.fresh)
     # It falls: every flight starts at rest, and sinks from then on.
     assert (heard.state[heard.fresh, :3] == 0).all() and (heard.state[~heard.fresh, 2] < 0).all()
-
-
-def test_rows_in_which_nothing_flies_are_no_observations():
     recorder = parity.Recorder(Steady())
     hidden = recorder.start(2)
     for k, flying in enumerate(((1, 1), (1, 0), (1, 0))):

@@ -14,7 +14,7 @@ from tests.support.pilots import Steady
 pytest.importorskip("pymavlink", reason="pymavlink is not installed (the extra mavlink)")
 
 
-def test_a_state_is_answered_with_body_rates_and_thrust(bench):
+def test_a_state_is_answered_with_body_rates_and_thrust_but_never_on_an_old_image(bench):
     one = bench(Steady((0.0, 0.0, 0.0)))
     assert one.tell() == []  # nothing is flown blind
     one.show()
@@ -22,9 +22,16 @@ def test_a_state_is_answered_with_body_rates_and_thrust(bench):
     hover = 9.81 / load_vehicle("reference").full_thrust
     assert point.thrust == pytest.approx(hover, rel=1e-3)
     assert np.abs(point.rate_b[:2]).max() < 1e-6
+    one = bench()
+    one.show()
+    one.now += 0.6
+    assert one.tell() == [] and one.companion.over is None
+    one.show()
+    one.now += 0.01
+    assert isinstance(one.tell()[0], SetPoint)
 
 
-def test_silence_hands_over_and_nothing_is_sent_any_more(bench):
+def test_silence_a_computer_that_stood_still_and_a_camera_that_stops_hand_over(bench):
     one = bench().fly()
     one.now += 0.085
     assert one.companion.receive([]) == []
@@ -32,6 +39,16 @@ def test_silence_hands_over_and_nothing_is_sent_any_more(bench):
     (note,) = one.wire.decode(one.companion.receive([]))
     assert "no state for 0.1 s" in note.text
     assert one.tell() == [] and not one.companion.flying
+    one = bench().fly()
+    one.now += 0.2
+    assert isinstance(one.tell()[0], OperatorText)
+    assert one.companion.over == "this computer stood still for 0.21 s"
+    one = bench().fly(40)
+    assert one.companion.flying
+    for _ in range(20):
+        one.tell()
+        one.now += 0.01
+    assert one.companion.over == "no image for 0.5 s"
 
 
 @pytest.mark.parametrize(
@@ -68,14 +85,11 @@ def odometry(quality=0, frames=(1, 12), vel=(2.0, 0.0, 0.0)):
     return made.pack(mav)
 
 
-def test_a_velocity_is_in_the_frame_that_its_message_says():
+def test_a_velocity_is_in_the_frame_of_its_message_and_other_frames_are_not_flown(bench):
     for frames, vel_w in (((1, 12), [0.0, 2.0, 0.0]), ((1, 1), [2.0, 0.0, 0.0])):
         (state,) = Wire(2, 1).decode([odometry(frames=frames)])
         assert isinstance(state, State) and state.fault == "" and state.resets == 3
         np.testing.assert_allclose(state.vel_w, vel_w, atol=1e-6)
-
-
-def test_a_state_in_other_frames_or_of_a_failed_estimator_is_not_flown(bench):
     for changed, reason in (
         ({"frames": (20, 12)}, "in frames 20 and 12, allowed are 1"),
         ({"frames": (1, 8)}, "in frames 1 and 8, allowed are 1"),
@@ -107,7 +121,7 @@ def test_of_a_backlog_the_newest_state_is_flown_and_gates_are_counted_in_all(ben
     assert one.companion.gate == 1 and len(one.companion.rows) == 2
 
 
-def test_a_delay_that_creeps_in_is_found(bench):
+def test_a_delay_that_creeps_in_is_found_and_clocks_may_drift_apart(bench):
     one = bench().fly(1)
     begin = one.now
     while one.companion.flying and one.now < begin + 10.0:
@@ -116,9 +130,6 @@ def test_a_delay_that_creeps_in_is_found(bench):
         one.now += 0.01
     assert "states are that late" in one.companion.over
     assert one.now - begin == pytest.approx(2.0, abs=0.15)
-
-
-def test_clocks_may_drift_apart(bench):
     one = bench().fly(1)
     for drift in (1.0 - 5e-4, 1.0 + 5e-4):
         begin, stamp = one.now, one.companion.rows[-1].state.time_s + 0.01
@@ -127,23 +138,6 @@ def test_clocks_may_drift_apart(bench):
             one.tell(one.state(time_s=stamp + drift * (one.now - begin)))
             one.now += 0.09
         assert one.companion.flying, one.companion.over
-
-
-def test_a_computer_that_stood_still_hands_over(bench):
-    one = bench().fly()
-    one.now += 0.2
-    assert isinstance(one.tell()[0], OperatorText)
-    assert one.companion.over == "this computer stood still for 0.21 s"
-
-
-def test_no_flight_begins_on_an_old_image(bench):
-    one = bench()
-    one.show()
-    one.now += 0.6
-    assert one.tell() == [] and one.companion.over is None
-    one.show()
-    one.now += 0.01
-    assert isinstance(one.tell()[0], SetPoint)
 
 
 def no_answer():
@@ -214,15 +208,6 @@ def test_what_a_gap_between_states_missed_is_counted_and_not_made_up_for(bench):
     # States at 0, 10, 20, 30, 100, 110, 120 ms; those of 40, 60 and 80 ms did not come.
     assert [row.decided for row in one.companion.rows] == [True, False] * 3 + [True]
     assert one.companion.missed_decisions == 3
-
-
-def test_a_camera_that_stops_hands_over(bench):
-    one = bench().fly(40)
-    assert one.companion.flying
-    for _ in range(20):
-        one.tell()
-        one.now += 0.01
-    assert one.companion.over == "no image for 0.5 s"
 
 
 def test_half_of_the_messages_cut_off_is_flown_on_and_all_of_them_is_silence(bench):

@@ -71,7 +71,7 @@ def test_states_set_points_and_words_come_as_they_went():
     assert vehicle.decode([companion.encode(OperatorText("words"))]) == [OperatorText("words")]
 
 
-def test_an_image_comes_whole_or_not_at_all():
+def test_an_image_comes_whole_or_not_at_all_also_where_16_bits_do_not_count_its_bytes():
     rng = np.random.default_rng(2)
     depth = rng.uniform(0.1, 12.0, (24, 32))
     vehicle, companion = Wire(1, 2), Wire(2, 1)
@@ -93,6 +93,13 @@ def test_an_image_comes_whole_or_not_at_all():
     later = [vehicle.encode(packet) for packet in image_packets(depth + 1.0, 20.0)]
     assert seen(sent[:6] + sent[7:] + later[1:]) == []
     assert len(seen(sent[:6] + later)) == 1
+    depth = np.linspace(0.1, 9.9, 256 * 256).reshape(256, 256)
+    wire, picture = Wire(1, 1), ImageAssembler(256, 256, 10.0)
+    packets = wire.decode(wire.encode(packet) for packet in image_packets(depth, 10.0))
+    found = [picture.add(packet) for packet in packets if isinstance(packet, Packet)]
+    np.testing.assert_allclose(found[-1], depth, atol=5.1e-4)
+    with pytest.raises(ValueError, match="a camera of 4000 x 4000 pixels"):
+        ImageAssembler(4000, 4000, 10.0)
 
 
 def test_what_is_cut_off_or_of_another_system_is_left_out_and_counted(bench):
@@ -107,17 +114,6 @@ def test_what_is_cut_off_or_of_another_system_is_left_out_and_counted(bench):
     assert companion.foreign == 1
     # A set point for another vehicle is none for this one.
     assert sender.decode([Wire(2, 7).encode(SetPoint(np.zeros(3), 0.5))]) == []
-
-
-def test_an_image_of_more_bytes_than_16_bits_count_comes_whole():
-    depth = np.linspace(0.1, 9.9, 256 * 256).reshape(256, 256)
-    wire, picture = Wire(1, 1), ImageAssembler(256, 256, 10.0)
-    packets = wire.decode(wire.encode(packet) for packet in image_packets(depth, 10.0))
-    found = [picture.add(packet) for packet in packets if isinstance(packet, Packet)]
-    assert found[-1] is not None
-    np.testing.assert_allclose(found[-1], depth, atol=5.1e-4)
-    with pytest.raises(ValueError, match="a camera of 4000 x 4000 pixels"):
-        ImageAssembler(4000, 4000, 10.0)
 
 
 @pytest.fixture(scope="module")
@@ -193,7 +189,7 @@ def links():
         one.close()
 
 
-def test_datagrams_are_taken_from_one_caller(links):
+def test_datagrams_are_taken_from_one_caller_that_speaks_for_the_vehicle(links, bench):
     waiting = links("udpin:127.0.0.1:0")
     first, second = (links(f"udpout:127.0.0.1:{waiting.port}") for _ in range(2))
     first.send([b"one"])
@@ -207,9 +203,6 @@ def test_datagrams_are_taken_from_one_caller(links):
     waiting.close()
     first.send([b"gone"])
     assert first.receive(0.01) == []
-
-
-def test_who_does_not_speak_for_the_vehicle_does_not_take_the_link(bench, links):
     waiting = links("udpin:127.0.0.1:0", bench().companion._wire.is_from_peer)
     stranger, other, vehicle = (links(f"udpout:127.0.0.1:{waiting.port}") for _ in range(3))
     stranger.send([b"anybody there?"])

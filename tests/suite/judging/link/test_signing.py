@@ -19,16 +19,13 @@ def key(tmp_path):
     return signing_key(tmp_path / "phrase")
 
 
-def test_what_is_signed_is_heard_once(key):
+def test_what_is_signed_is_heard_once_and_what_is_not_or_by_another_is_left_out(key):
     vehicle, companion = Wire(1, 2, key), Wire(2, 1, key)
     sent = companion.encode(POINT)
     assert vehicle.is_from_peer(sent) and vehicle.is_from_peer(sent), "to look is not to take"
     assert len(vehicle.decode([sent])) == 1 and vehicle.broken == 0
     assert vehicle.decode([sent]) == [] and vehicle.broken == 1, "sent again by someone else"
     assert vehicle.decode([companion.encode(OperatorText("a"))]) == [OperatorText("a")]
-
-
-def test_what_is_not_signed_or_by_another_is_left_out(key):
     vehicle, companion = Wire(1, 2, key), Wire(2, 1, key)
     first = companion.encode(POINT)
     forged = bytearray(companion.encode(OperatorText("b")))
@@ -36,9 +33,6 @@ def test_what_is_not_signed_or_by_another_is_left_out(key):
     for odd in (Wire(2, 1).encode(POINT), Wire(2, 1, bytes(32)).encode(POINT), bytes(forged)):
         assert vehicle.decode([odd]) == [] and not vehicle.is_from_peer(odd)
     assert vehicle.broken == 3 and len(vehicle.decode([first])) == 1
-
-
-def test_without_a_key_nothing_is_signed():
     sent = Wire(2, 1).encode(POINT)
     assert sent[2] == 0, "no flag of a signature"
     assert len(Wire(1, 2).decode([sent])) == 1 == len(Wire(1, 2).decode([sent]))

@@ -54,13 +54,10 @@ def held_step(decay, drag=(0.3, 0.4, 0.45)):
     return jax.jit(f), (*start, ACTION)
 
 
-def test_gradients_are_those_of_finite_differences():
+def test_gradients_are_those_of_finite_differences_and_decay_fades_position_and_velocity_alone():
     f, args = held_step(0.0)
     check_grads(f, args, order=1, modes=["rev"], atol=1e-6, rtol=1e-6)
-
-
-def test_gradient_decay_fades_position_and_velocity_alone():
-    """Zhang et al. 2025: e^(-alpha dt) a step, acceleration and command not faded."""
+    # Zhang et al. 2025: e^(-alpha dt) a step, acceleration and command not faded.
     alpha, dt = 0.916, 0.033
     jacobians = []
     for decay in (0.0, alpha):
@@ -145,7 +142,7 @@ def test_a_fine_rollout_is_the_solution_of_its_differential_equation(monkeypatch
     assert errors[0] < 0.03 and errors[1] < 0.6 * errors[0]
 
 
-def test_a_delayed_command_is_the_one_of_steps_before():
+def test_a_delayed_command_is_the_one_of_steps_before_and_a_steady_one_is_followed_exactly():
     body = some_body(1)
     fixed = constants(1)
     first, second = body.commands_w[:, 0], body.commands_w[:, 1]
@@ -156,9 +153,6 @@ def test_a_delayed_command_is_the_one_of_steps_before():
         now = flown(body, delayed, action, TARGET[:1], 0.0)
         expected = command * (1 - keep) + body.thrust_w * keep
         np.testing.assert_allclose(now.thrust_w, expected, atol=1e-9)
-
-
-def test_a_steady_acceleration_is_followed_exactly():
     fixed = constants(1, drag=(0.0, 0.0, 0.0), delay=0.0)
     body, held = some_body(1), jnp.array(ACTION[:1] @ ROLL.T)
     body = body._replace(thrust_w=held, acc_w=held)

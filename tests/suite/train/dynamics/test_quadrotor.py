@@ -115,7 +115,6 @@ def test_on_the_judges_steps_the_trainers_quadrotor_flies_the_judges_flight(floa
 def test_the_default_recipe_draws_vehicles_that_fly():
     """A second of mild actions tips none over, around the lightest of the shipped vehicles."""
     config = with_quadrotor(named_recipe("race"), load_vehicle("crazyflie21")).quadrotor
-    assert config is not None
     actions = 0.5 * lively_actions(15, batch=64)
     pos_w, rot_w, _ = fly_trainer(config, actions, 15.0)
     assert np.isfinite(pos_w).all() and rot_w[..., 2, 2].min() > 0.5
@@ -183,7 +182,7 @@ def test_quadrotors_vary_around_the_vehicle_and_the_tracks_stay_the_same():
     assert "com_offset" not in effects, "what does not vary stays the vehicle's"
 
 
-def test_draws_stay_within_what_a_vehicle_can_have():
+def test_draws_stay_within_what_a_vehicle_can_have_and_move_no_other_draw():
     bare = drawn(QuadrotorConfig(PLAIN), 8)
     assert np.all(bare["motor_lag"].time_constant == 0), "a share of no lag is none"
     assert np.all((bare["command_delay"].delay >= 0) & (bare["command_delay"].delay <= 0.01))
@@ -191,9 +190,6 @@ def test_draws_stay_within_what_a_vehicle_can_have():
     lag, offset = wide["motor_lag"].time_constant, wide["mass_offset"].offset
     assert lag.min() == 0 and 0.045 < lag.max() <= 0.05
     assert offset.min() == pytest.approx(-0.5 * PLAIN.mass) and np.ptp(offset) > PLAIN.mass
-
-
-def test_thrust_centre_of_mass_and_trim_vary_where_asked_and_move_no_other_draw():
     own = {
         "com_offset": EFFECTS["com_offset"].values(np.array([0.006, 0.0, 0.001])),
         "thrust_scale": EFFECTS["thrust_scale"].values(np.float64(0.9)),
@@ -236,14 +232,11 @@ def stepped(config):
     return worlds, body, now, jax.jit(dynamics.step)(body, *now, keys)
 
 
-def test_the_point_mass_is_stepped_with_the_runs_settings():
+def test_point_mass_and_quadrotor_are_stepped_by_one_interface_with_the_runs_settings():
     worlds, body, now, found = stepped(CONFIG)
     assert isinstance(worlds.constants, point_mass.PointMassParams)
     expected = jax.jit(point_mass.step)(body, *now, 0.4)
     jax.tree.map(np.testing.assert_array_equal, found, expected)
-
-
-def test_a_vehicle_is_flown_as_a_quadrotor_of_the_same_interface():
     config = replace(CONFIG, quadrotor=QuadrotorConfig(PLAIN))
     worlds, body, _, after = stepped(config)
     np.testing.assert_allclose(body.rot_w[:, 2, 2], 1.0, atol=1e-6, err_msg="upright")
@@ -263,7 +256,7 @@ def test_environments_draw_their_vehicles_as_the_trainer_does():
     assert copy.deepcopy(drawn) == pickle.loads(pickle.dumps(drawn)) == drawn
 
 
-def test_vehicles_of_their_own_fly_at_once_as_they_fly_alone():
+def test_vehicles_fly_at_once_as_they_fly_alone_where_they_differ_in_effects_alone():
     settings = {**race_settings("race"), "track": "circular", "rules": Rules(0.3)}
     many = RaceVectorEnv(3, **settings)
     alone = [RaceEnv(**settings) for _ in range(3)]
@@ -278,9 +271,6 @@ def test_vehicles_of_their_own_fly_at_once_as_they_fly_alone():
             states[k] = alone[k].reset()[0]["state"]
     speeds = np.linalg.norm(seen["state"][:, :3], axis=-1)
     assert len(set(speeds.round(4).tolist())) == 3
-
-
-def test_vehicles_that_differ_in_more_than_effects_are_refused():
     names = iter(("racer5", "racer5", "reference"))
     env = RaceVectorEnv(2, vehicle=lambda rng: load_vehicle(next(names)))
     with pytest.raises(ValueError, match="the function drew name reference after racer5"):

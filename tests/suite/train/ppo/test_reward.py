@@ -76,7 +76,7 @@ def test_far_from_everything_there_is_progress_and_smoothness_alone():
     assert total == pytest.approx(sum(terms.values()))
 
 
-def test_a_solid_that_comes_closer_costs_by_distance_and_closing_speed():
+def test_a_solid_that_comes_closer_costs_by_distance_and_speed_and_within_the_radius_a_collision():
     place = (-3.0, 0, 50)
     body = body_at(place, vel_w=(0, 2, 0))
     # A sphere of 0.5 m whose centre is 0.9 m to the left: 0.4 m away, closing in at 2 m/s.
@@ -87,9 +87,6 @@ def test_a_solid_that_comes_closer_costs_by_distance_and_closing_speed():
     assert terms["collision"] == 0
     away, *_ = rewarded(body_at(place), body_at(place, (0, -2, 0)), sphere_w=(-3, 0.9, 50))
     assert away["avoid"] == pytest.approx(-6 * barrier, rel=1e-4)
-
-
-def test_a_collision_is_coming_closer_than_the_safety_radius_also_on_the_way():
     here = body_at((-3, 0, 50))
     for gap, collision in ((0.21, 0.0), (0.19, -30.0), (-0.1, -30.0)):
         terms, *_ = rewarded(here, here, sphere_w=(-3, 0.5 + gap, 50))

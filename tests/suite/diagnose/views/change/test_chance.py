@@ -40,7 +40,7 @@ def test_chance_names_as_often_as_it_is_allowed_however_alike_candidates_are():
     assert names_by_chance(slope, several, fitted=(9,)) == pytest.approx(0.1, abs=0.055)
 
 
-def test_candidates_that_are_one_cost_as_much_as_one_and_others_more():
+def test_candidates_that_are_one_or_fitted_anyhow_cost_as_much_as_one_and_others_more():
     slope = np.random.default_rng(6).standard_normal((6, 3, 10))
     one, gains = searched(slope, [(0,)], truth=0.8)
     ten = [(k,) for k in range(10)]
@@ -49,9 +49,6 @@ def test_candidates_that_are_one_cost_as_much_as_one_and_others_more():
     assert others_gains[0] == pytest.approx(gains[0])
     assert twins == pytest.approx(one * 10)
     assert 3.0 * one[0] < others[0] < 15.0 * one[0]
-
-
-def test_what_is_fitted_anyhow_counts_no_more():
     slope = np.random.default_rng(8).standard_normal((6, 3, 3)) * [1e6, 1.0, 1e-6]
     slope[..., 2] = 0.3 * slope[..., 0]
 

@@ -10,15 +10,7 @@ from suite.diagnose.data.view import FORCE, TORQUE
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.moments import ForceModel, ViewData
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
-from suite.diagnose.search.change import (
-    RotorSpread,
-    change_evidence,
-    equations_by_flight,
-    fit_each_flight,
-    rotor_spread,
-    search_motion_change,
-    within_flights,
-)
+from suite.diagnose.search import change
 from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.real_flights import VEHICLE, flights
@@ -48,10 +40,10 @@ def test_a_change_stands_out_of_how_flights_differ_though_the_file_is_wrong(befo
     motor = {"weak_motor": ((1.0, 1.0, share, 1.0),)} if share < 1.0 else {}
     logs = flights(3, seed=6, speed=1.0, thrust_scale=(0.9,), linear_drag=(DRAG,), **motor)
     after = {view.name: task_of(logs, view) for view in (FORCE, TORQUE)}
-    spread = rotor_spread([*before.values(), *after.values()])
+    spread = change.rotor_spread([*before.values(), *after.values()])
     found = {}
     for name, task in after.items():
-        evidence, start = change_evidence(before[name], task.flights, spread)
+        evidence, start = change.change_evidence(before[name], task.flights, spread)
         known = evidence.relinearise(start)
         among = view_candidates(candidates(SPACE, False, ()), known[1])
         found[name] = named(search(evidence, start, among, known=known))
@@ -72,7 +64,7 @@ def test_an_axis_along_which_flights_are_alike_has_a_spread_of_its_own():
         flight._replace(measured=flight.measured + push * np.array([1.0, 1.0, 0.1]))
         for flight, push in zip(torque.flights, (-2.0, 0.0, 2.0), strict=True)
     ]
-    spread = rotor_spread([force, replace(torque, flights=apart)])
+    spread = change.rotor_spread([force, replace(torque, flights=apart)])
     prior, own = THRESHOLDS.spread_freedom, 2
     assert spread.freedom == 4 * own
     assert {view: list(one) for view, one in spread.freedom_along.items()} == {
@@ -85,7 +77,9 @@ def test_an_axis_along_which_flights_are_alike_has_a_spread_of_its_own():
 
 
 def test_sizes_are_drawn_as_the_spread_is_estimated():
-    spread = RotorSpread(0.01, 8, {}, {"force": np.array([0, 0, 2]), "torque": np.full(3, 2)}, 4)
+    spread = change.RotorSpread(
+        0.01, 8, {}, {"force": np.array([0, 0, 2]), "torque": np.full(3, 2)}, 4
+    )
     sizes = {
         view: spread.variance_ratios(view, 20000, np.random.default_rng(1))
         for view in ("force", "torque")
@@ -98,23 +92,15 @@ def test_sizes_are_drawn_as_the_spread_is_estimated():
     assert sizes["torque"].var(axis=0) == pytest.approx(np.full(3, both / 36.0), rel=0.05)
 
 
-@pytest.fixture(scope="module")
-def dragged():
-    return task_of(flights(3, seed=5, linear_drag=(DRAG,)))
-
-
-def test_more_drag_is_named_with_its_whole_size(dragged):
-    more = (0.6, 0.5, 0.2)
+def test_more_drag_is_named_with_its_whole_size_and_other_speeds_are_no_change():
+    more, dragged = (0.6, 0.5, 0.2), task_of(flights(3, seed=5, linear_drag=(DRAG,)))
     after = task_of(flights(3, seed=6, speed=2.5, linear_drag=(more,)))
-    found = search_motion_change(dragged, after, candidates(SPACE, False, ()))
+    found = change.search_motion_change(dragged, after, candidates(SPACE, False, ()))
     assert found is not None and named(found) == ["linear_drag"]
     np.testing.assert_allclose(found.estimate.theta[found.indices], more, atol=0.06)
     np.testing.assert_allclose(found.start.theta[found.indices], DRAG, atol=0.06)
-
-
-def test_other_speeds_of_the_same_vehicle_are_no_change(dragged):
     after = task_of(flights(3, seed=7, speed=2.0, linear_drag=(DRAG,)))
-    assert search_motion_change(dragged, after, candidates(SPACE, False, ())) is None
+    assert change.search_motion_change(dragged, after, candidates(SPACE, False, ())) is None
 
 
 def test_the_fit_of_each_flight_ignores_its_trim():
@@ -123,5 +109,6 @@ def test_the_fit_of_each_flight_ignores_its_trim():
     true, trim = np.array([[0.5, -1.0], [0.7, 0.0]]), np.array([3.0, -2.0])
     residual = np.einsum("mak,mk->ma", slope, true[flight]) + trim[flight, None]
     data = ViewData(flight, np.arange(400.0), residual, residual, slope, np.zeros((400, 3, 0)))
-    found = fit_each_flight(equations_by_flight(within_flights(data), np.ones(3)))
+    equations = change.equations_by_flight(change.within_flights(data), np.ones(3))
+    found = change.fit_each_flight(equations)
     np.testing.assert_allclose(found, true, atol=1e-9)

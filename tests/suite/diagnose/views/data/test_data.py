@@ -28,7 +28,7 @@ def hover_speed(vehicle=VEHICLE, share=1.0):
     return float(np.sqrt(push / vehicle.rotors.thrust_coefficient))
 
 
-def test_a_bump_has_the_mean_acceleration_of_what_the_velocity_changes_by():
+def test_a_bump_has_the_mean_acceleration_and_reaches_across_no_hole_or_bad_row():
     rng = np.random.default_rng(0)
     time_s = np.sort(rng.uniform(0.0, 3.0, 400))
     form = weak_form(time_s, np.ones(400, bool), 0.2, 0.1)
@@ -39,9 +39,6 @@ def test_a_bump_has_the_mean_acceleration_of_what_the_velocity_changes_by():
     form = weak_form(even_s, np.ones(400, bool), 0.2, 0.1)
     velocity, acceleration = np.sin(3.0 * even_s), 3.0 * np.cos(3.0 * even_s)
     assert np.abs(form.change @ velocity - form.mean @ acceleration).max() < 1e-3
-
-
-def test_no_bump_reaches_across_a_hole_or_a_bad_row():
     time_s = np.arange(0.0, 4.0, 0.01)
     good = np.ones(400, bool)
     good[100] = False
@@ -51,7 +48,7 @@ def test_no_bump_reaches_across_a_hole_or_a_bad_row():
     assert np.abs(form.middle_s - 3.1).min() > 0.095
 
 
-def test_motor_commands_give_the_speeds_of_the_vehicles_map_and_need_one():
+def test_motor_commands_give_the_speeds_of_the_vehicles_map_with_its_delay_and_lag():
     time_s = np.arange(0.0, 2.0, 0.01)
     pwm, volt = np.full((200, 4), 0.6), np.full(200, 3.5)
     vehicle = replace(VEHICLE, motors=MotorMap((0.0, 8.0), 3.7, 1.0))
@@ -61,16 +58,11 @@ def test_motor_commands_give_the_speeds_of_the_vehicles_map_and_need_one():
     assert np.allclose(rotors.speed**2 * vehicle.rotors.thrust_coefficient, thrust)
     with pytest.raises(ValueError, match=r"\[motors\]"):
         ready([level(time_s, np.zeros((200, 3)), pwm=pwm)], VEHICLE)
-
-
-def test_delay_and_lag_of_the_vehicle_file_are_those_of_its_effects():
-    time_s = np.arange(0.0, 2.0, 0.01)
     step = np.where(time_s[:, None] < 1.0, 0.3, 0.6) * np.ones(4)
     log = level(time_s, np.zeros((200, 3)), pwm=step)
     vehicle = replace(VEHICLE, motors=MotorMap((0.0, 8.0), 3.7, 0.0))
     slow = with_effects(vehicle, motor_lag=(0.1,), command_delay=(0.05,))
     lagged = acting_rotors(log, slow)
-    assert lagged is not None
     speed = lagged.speed[:, 0]
     assert np.ptp(speed[time_s < 1.045]) == 0.0
     after = speed[np.searchsorted(time_s, 1.15 - 1e-9)]
@@ -136,7 +128,7 @@ def test_of_a_single_flight_the_end_of_what_flew_is_held_out(pair, ground_s):
         assert share == pytest.approx(THRESHOLDS.lone_fitted_share, abs=0.1)
 
 
-def test_a_log_without_a_stretch_is_left_out_and_an_error_only_where_it_is_the_only_one(pair):
+def test_a_log_without_a_stretch_is_left_out_and_slow_ones_are_diagnosed_by_their_force(pair):
     good, other = pair
     bad = replace(other, name="all holes", rotor_speed=np.full_like(other.rotor_speed, np.nan))
     found = ready([bad, good], VEHICLE)
@@ -145,9 +137,6 @@ def test_a_log_without_a_stretch_is_left_out_and_an_error_only_where_it_is_the_o
     assert found.notes == ("all holes: no stretch of 0.2 s in flight without a hole",)
     with pytest.raises(ValueError, match="all holes: no stretch"):
         ready([bad], VEHICLE)
-
-
-def test_logs_too_slow_for_the_torque_are_diagnosed_by_their_force(pair):
     found = ready([rows(log, slice(None, None, 4)) for log in pair], VEHICLE)
     assert found.views == (FORCE,) and set(found.smoothed) == {FORCE.name}
     assert found.notes[0].startswith("torque: not examined, as") and "log faster" in found.notes[0]

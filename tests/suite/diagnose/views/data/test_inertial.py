@@ -84,16 +84,13 @@ def test_thrust_and_drag_are_identified_without_a_pose():
     assert any("heading" in line for line in found.not_identified)
 
 
-def test_a_drag_of_slow_flights_is_identified_where_the_gyro_drifts():
+def test_a_drag_of_slow_flights_is_identified_where_the_gyro_drifts_and_of_a_hover_not():
     """As in logs whose gyro was sampled too rarely: the tilt drifts by 0.03 rad a second."""
     slow = {"end_s": 30.0, "speed": 0.3, "gyro_walk": 0.1, "acc_noise": 0.05}
     found = identify([flown(seed, **slow)[0] for seed in range(3)], VEHICLE)
     drag = next(n for n in found.numbers if n.key == "effects.linear_drag.coefficient")
     spans = [span for span in drag.ci95[:2] if span is not None]
     assert spans and all(low < DRAG < high for low, high in spans)
-
-
-def test_a_drag_of_a_hover_is_not_identified():
     still = {"end_s": 10.0, "speed": 0.003, "gyro_walk": 0.1}
     found = identify([flown(seed, **still)[0] for seed in range(3)], VEHICLE)
     drag = [span for n in found.numbers if "linear_drag" in n.key for span in n.ci95[:2]]

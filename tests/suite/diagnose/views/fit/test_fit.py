@@ -54,7 +54,7 @@ def test_slopes_are_those_of_finite_differences():
         assert np.allclose(change / 1e-5, first.slope[..., index], atol=1e-4, rtol=1e-3)
 
 
-def test_trims_of_flights_are_separated_from_scatter_within_them():
+def test_trims_of_flights_are_separated_from_scatter_and_weighed_moments_are_independent_units():
     weights = weights_of(made(np.random.default_rng(1), count=60))
     assert weights.scatter == pytest.approx([0.3, 0.3, 0.3], rel=0.05)
     assert weights.trim == pytest.approx([0.5, 0.0, 2.0], abs=0.35)
@@ -62,9 +62,6 @@ def test_trims_of_flights_are_separated_from_scatter_within_them():
     # A single flight is validated by thirds, others by flights.
     assert validation_groups(np.array([2, 2, 5])).tolist() == [2, 2, 5]
     assert validation_groups(np.zeros(6)).tolist() == [0, 0, 1, 1, 2, 2]
-
-
-def test_weighed_moments_of_flights_with_trims_are_independent_units():
     rng = np.random.default_rng(2)
     weights = Weights(np.full(3, 0.3), np.ones(3), np.array([0.5, 0.0, 2.0]))
     means, within = [], []
