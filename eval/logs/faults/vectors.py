@@ -304,13 +304,13 @@ def check_accelerometer(rows: Rows, body_is_frd: bool = False) -> list[Finding]:
     text = f"{figures}, but by {100 * residual[best]:.0f} % if it is {' and '.join(reasons)}"
     fault = "accelerometer_unit" if scale != 1.0 else "accelerometer_axes"
     fault = "accelerometer_gravity" if steps == "plus-gravity" else fault
-    parts = [f"{1.0 / scale:.10g}"] if scale != 1.0 else []
-    fix = option(("acc", "+".join([*parts, *([steps] if steps else [])])))
+    to_si = f"{1.0 / scale:.10g}+" if scale != 1.0 else ""
+    fix = option(("acc", (to_si + steps).rstrip("+")))
     size_ = scale if scale != 1.0 else None
     others = [] if body_is_frd and steps == first else _same_fit(steps, readings[best], force)
     if others:
         text = f"{text}; {' or '.join(words[other] for other in others)} fits as well"
-        fix = f"{fix} if it is {words[steps]}, or {', or '.join(others)}"
+        fix = f"{fix} if it is {words[steps]}, or {', or '.join(to_si + other for other in others)}"
         return [Finding("doubt", "accelerometer", text, fault, size_, 0.95, fix)]
     return [Finding("corrected", "accelerometer", text, fault, size_, 0.98, fix)]
 

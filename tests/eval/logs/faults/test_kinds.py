@@ -88,6 +88,11 @@ def test_an_axis_without_force_does_not_show_its_sign(wrong, end):
     assert named(findings) == {"accelerometer_axes"} and not readings
     (finding,) = (f for f in findings if f.is_open)
     assert {"-x,-y,-z", "x,-y,-z"} <= set(re.split("[ =]", finding.fix))
+    # In g as well: each of the readings converts the unit.
+    findings, _ = checked(read_rows(right, parse_readings((f"{wrong}+0.1019367992",))))
+    (finding,) = (f for f in findings if f.is_open)
+    assert finding.fault == "accelerometer_unit"
+    assert {"9.81+-x,-y,-z", "9.81+x,-y,-z"} <= set(re.split("[ =]", finding.fix))
     # In a body that is pitched by 10 degrees, thrust has a part along x, which shows its sign.
     pitch = Rotation.from_euler("y", 10.0, degrees=True)
     flown = Rotation.from_quat(right["quat"], scalar_first=True)
