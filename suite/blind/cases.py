@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from eval.effects import EFFECTS, nameable_effects
+from eval.flights.simulate import SENSORS
 from eval.worlds.rotorpy_vehicle import ROTORPY_EFFECTS
 from suite.blind.oracle.strength import vehicle_names
 from suite.blind.outside import KINDS
@@ -32,8 +33,6 @@ EXCLUDED = "hysteresis"
 most flights close to the ground crash."""
 MUJOCO, ROTORPY, CONTINUOUS = "mujoco", "rotorpy", "continuous"
 """Names of the simulators of cases."""
-_SENSOR_NAMES = ("capture", "estimator", "full")
-"""Sets of sensors that a case may have."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +106,7 @@ def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
         kind, hidden, multiple = drawn[index]
         if remaining[kind]:
             remaining[kind] -= 1
-            sensors, case_seed = str(rng.choice(_SENSOR_NAMES)), (seed, 50_000 + int(index))
+            sensors, case_seed = str(rng.choice(list(SENSORS))), (seed, 50_000 + int(index))
             cases.append(Case(kind, hidden, multiple, "bare", sensors, case_seed))
     return _by_name([replace(case, simulator=ROTORPY) for case in cases])
 
@@ -197,7 +196,7 @@ def _draw_case(rng: np.random.Generator, kind: str, index: int, case_seed: tuple
 def _draw_equipment(rng: np.random.Generator, names: tuple[str, ...]) -> tuple[str, str]:
     """Return the vehicle and the sensors for a case in which the effects `names` can act."""
     vehicle = str(rng.choice(vehicle_names()))
-    sensors = str(rng.choice(_SENSOR_NAMES))
+    sensors = str(rng.choice(list(SENSORS)))
     if any(EFFECTS[name].wind for name in names):
         vehicle = "dragged"  # wind has no effect on a vehicle without drag
     if sensors == "capture" and any("acc_b" in EFFECTS[name].needs for name in names):

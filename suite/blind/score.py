@@ -162,12 +162,10 @@ def score_set(out: Path) -> list[Verdict]:
         if in_rotorpy:
             vehicle = load_vehicle(str(out / "cases" / name / "vehicle.toml"))
             hubs = hub_damping(answer["effects"], vehicle)
-        diagnosis, seconds = _read_if_valid(folder / "diagnosis.json"), None
         timing = _read_if_valid(folder / TIMED)
-        if timing:
-            seconds = timing["seconds"]
-        else:
-            diagnosis = None  # a diagnosis without its time did not end normally
+        # A diagnosis without its time did not end normally.
+        diagnosis = _read_if_valid(folder / "diagnosis.json") if timing else None
+        seconds = timing["seconds"] if timing else None
         verdicts.append(score_case(name, answer, diagnosis, seconds, hubs))
     if not verdicts:
         raise ValueError(
