@@ -196,6 +196,16 @@ def test_a_push_is_an_acceleration_in_body_axes():
     assert given.motion.vel_w[-1, 0] > 0.09
 
 
+def test_rate_loop_cancels_the_gyroscopic_torque():
+    plant = make_plant(PLAIN, 0.002)
+    rate = np.array([2.0, -1.0, 1.5])
+    motion = Motion(np.zeros(3), np.eye(3), np.zeros(3), rate)
+    inputs = Inputs(Command(np.asarray(12.0), rate))
+    _, wrench = plant_step(plant, hover_state(plant, ()), motion, inputs, 0.0)
+    _, turn = accelerations(plant, motion, wrench)
+    np.testing.assert_allclose(turn, 0.0, atol=1e-9)
+
+
 def reference_flight(vehicle, command_of, duration, start):
     """Integrate contracts of the nominal quadrotor in continuous time; shares no code with ours.
 

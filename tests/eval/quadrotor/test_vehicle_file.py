@@ -155,7 +155,10 @@ def test_motors_come_back_from_a_file_and_wrong_ones_are_refused():
     assert vehicle_file.parse_vehicle(table) == crazyflie
     for motors, reason in (
         ({"thrust": [0.1, 0.1]}, r"\[motors\] has no 'voltage'"),
-        ({**table["motors"], "thrust": [0.0, 0.05]}, "too weak to hover; .* gives 0.05"),
+        (
+            {**table["motors"], "thrust": [0.0, 0.05]},
+            r"motors.thrust = .*too weak to hover; .* gives 0.05",
+        ),
         ({"thrust": [0.1, -0.1], "voltage": 4.0}, "must grow"),
         ({"thrust": [0.1, 0.1], "voltage": 4.0, "volts": 1.0}, "Did you mean 'voltage'"),
     ):

@@ -23,6 +23,11 @@ def lift(factor, vehicle=PLAIN):
     return finding
 
 
+def test_speeds_that_carry_the_weight_or_what_an_effect_can_do_are_no_fault():
+    assert lift(0.98).status == lift(1.03).status == "ok"
+    assert (lift(1.1).status, lift(1.1).fault) == ("note", "thrust_scale")
+
+
 def test_a_factor_with_a_name_is_put_right():
     rpm = 60 / (2 * np.pi)
     for factor, words, scale in ((6.0, "6 pole", 6.0), (rpm, "rpm", rpm), (7.1, "7 pole", 7.0)):
@@ -38,9 +43,7 @@ def test_a_factor_between_two_names_is_left_to_its_owner(factor):
     assert finding.is_open and " or " in finding.evidence
 
 
-def test_a_factor_without_a_name_is_a_doubt_and_what_an_effect_can_do_is_no_fault():
-    assert lift(0.98).status == lift(1.03).status == "ok"
-    assert (lift(1.1).status, lift(1.1).fault) == ("note", "thrust_scale")
+def test_a_factor_without_a_name_is_a_doubt():
     assert lift(2.5).is_open
     assert lift(1.0, None).status == "note"
     assert lift(14 / 12).fault == "motor_poles" and "14" in lift(14 / 12).fix
@@ -62,26 +65,32 @@ def thrust(factor, vehicle=PLAIN):
     return check_thrust_command(rows, vehicle)
 
 
-@pytest.mark.parametrize(
-    ("factor", "mass", "status", "is_open", "said"),
-    [
-        *((near, 0.75, "ok", False, "") for near in (1.0, 0.88, 1.3)),
-        (1 / 9.81, 0.75, "corrected", False, "--read cmd_thrust=9.81"),
-        (0.92 / 9.81, 0.75, "corrected", False, "--read cmd_thrust=9.81"),
-        (-1.0, 0.75, "corrected", False, "--read cmd_thrust=-1"),
-        (-1 / 9.81, 0.75, "corrected", False, "--read cmd_thrust=-9.81"),
-        *((4.0, 4.0, "corrected", False, said) for said in ("newtons", "--read cmd_thrust=0.25")),
-        # Newtons, or thrust is lower.
-        *((mass, 0.78, "doubt", False, "thrust_command_unit") for mass in (0.78, 0.84)),
-        *((4.0, None, "doubt", True, said) for said in ("thrust_command_unit", "another unit")),
-        (0.67, 0.75, "note", False, "thrust_scale"),  # the mass may be 0.5 kg
-        (0.03, 0.75, "doubt", True, "share of full thrust"),
-    ],
-)
-def test_a_thrust_command_in_another_unit_is_found(factor, mass, status, is_open, said):
-    (finding,) = thrust(factor, mass and replace(PLAIN, mass=mass))
-    assert (finding.status, finding.is_open) == (status, is_open)
-    assert said in (finding.fix, finding.fault) or said in finding.evidence
+def test_a_command_near_the_force_is_fine():
+    for factor in (1.0, 0.88, 1.3):
+        (finding,) = thrust(factor)
+        assert finding.status == "ok", factor
+
+
+def test_a_unit_or_a_sign_of_the_thrust_is_corrected():
+    for factor, fix in ((1 / 9.81, 9.81), (0.92 / 9.81, 9.81), (-1.0, -1), (-1 / 9.81, -9.81)):
+        (finding,) = thrust(factor)
+        assert (finding.status, finding.fix) == ("corrected", f"--read cmd_thrust={fix}")
+
+
+def test_newtons_need_the_mass_and_a_share_of_full_thrust_has_no_unit():
+    heavy = replace(PLAIN, mass=4.0)
+    (finding,) = thrust(4.0, heavy)
+    assert "newtons" in finding.evidence and finding.fix == "--read cmd_thrust=0.25"
+    light = replace(PLAIN, mass=0.78)
+    for factor in (0.78, 0.84):
+        (finding,) = thrust(factor, light)
+        assert finding.fault == "thrust_command_unit" and not finding.is_open, "or thrust is lower"
+    (finding,) = thrust(4.0, None)
+    assert finding.is_open and finding.fault == "thrust_command_unit"
+    (finding,) = thrust(0.67)
+    assert (finding.status, finding.fault) == ("note", "thrust_scale"), "the mass may be 0.5 kg"
+    (finding,) = thrust(0.03)
+    assert finding.is_open and "share of full thrust" in finding.evidence
 
 
 def findings(vel_of, seed=0):
@@ -98,13 +107,19 @@ def findings(vel_of, seed=0):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_on_a_straight_line_no_axis_is_taken_for_another(seed):
-    """There x and y are proportional, which is no evidence of their order, and y over x no unit."""
-    found = findings(lambda vel: vel, seed)
-    assert "velocity_unit" not in found
+    """There x and y are proportional, and y over x is no unit."""
+    assert "velocity_unit" not in findings(lambda vel: vel, seed)
+
+
+def test_another_unit_on_a_straight_line_is_found():
+    found = findings(lambda vel: 100.0 * vel)["velocity_unit"]
+    assert found.status == "corrected" and "cm/s" in found.evidence
+
+
+def test_axes_that_move_in_proportion_are_no_evidence_of_their_order():
+    found = findings(lambda vel: vel)
     assert found["velocity_frame"].status == "not identifiable"
     assert "y,x,z" in found["velocity_frame"].evidence
-    found = findings(lambda vel: 100.0 * vel, seed)["velocity_unit"]
-    assert found.status == "corrected" and "cm/s" in found.evidence
 
 
 def test_swapped_axes_are_found_though_they_resemble_each_other():
