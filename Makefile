@@ -2,7 +2,7 @@
 # make race   fly a policy where the dynamics hide an effect, name it, train for it, fly again
 # make gpu    speed, a short training and the CPU's outcomes on this machine's GPU: docs/results/gpu.md
 # make test   lint, types and tests
-# make lint   ruff, pyright, and docs/reference against the code
+# make lint   ruff, pyrefly, and docs/reference against the code
 # make docs   the pages of docs/ as a site in site/, links checked
 # make lock   requirements.lock from what is installed in .venv
 # make clean  remove caches and build products (runs/ and .venv stay)
@@ -49,7 +49,7 @@ style: $(STAMP)
 	$(PY) tools/words.py
 
 types: $(STAMP)
-	$(PY) -m pyright --pythonpath $(PY) --warnings --level warning
+	$(PY) -m pyrefly check --python-interpreter-path $(PY) --output-format min-text
 
 # Tests start dozens of programs, each of which would compile the modules anew.
 tests: export PYTHONDONTWRITEBYTECODE =

@@ -112,7 +112,7 @@ def main(out: Path, minutes: float, envs: int = 128, steps: int = 24) -> Path:
         if time.monotonic() > end:
             break
     out.mkdir(parents=True, exist_ok=True)
-    return export_module(agent, out / "policy.onnx", race.contract)  # pyright: ignore
+    return export_module(agent, out / "policy.onnx", race.contract)  # pyrefly: ignore[missing-attribute]
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from tracks.families import make_track
 def main(folder: Path) -> None:
     """Fly one trial and write a picture, a GIF and a recording of it to `folder`."""
     trial = TrialSpec(track="zigzag", difficulty=0, seed=1)
-    flights = []
+    flights: list[Any] = []
     (result,) = fly(
         load_policy("race"),
         [trial],

@@ -4,7 +4,6 @@ Run: pip install 'diffracing-suite[sb3]'; python examples/sb3_race.py runs/sb3 [
 suite eval --policy runs/sb3/policy.onnx --track random --vehicle racer5 --trials 100
 """
 
-# pyright: reportMissingImports=false
 from __future__ import annotations
 
 import sys

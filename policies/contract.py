@@ -174,7 +174,9 @@ def spec_of(contract: Contract, where: str) -> PolicySpec:
     names = [entry.name for entry in contract.state]
     motors = "speed" if "speed" in "".join(action.unit) and action.kind == "motors" else "thrust"
     memory = contract.memory or ()
-    hidden_size: dict[str, Any] = {"hidden_size": memory[0]} if len(memory) == 1 else {}
+    extras: dict[str, Any] = {key: key in names for key in EXTRAS}
+    if len(memory) == 1:
+        extras["hidden_size"] = memory[0]
     spec = PolicySpec(
         rate_hz=contract.rate_hz,
         camera=Camera(
@@ -189,8 +191,7 @@ def spec_of(contract: Contract, where: str) -> PolicySpec:
             action.kind, _shortened(action.scale), _shortened(action.offset), motors, action.clip
         ),
         speed=contract.speed,
-        **{key: key in names for key in EXTRAS},
-        **hidden_size,
+        **extras,
     )  # fmt: skip
     try:
         check_spec(spec, "")

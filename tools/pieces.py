@@ -147,14 +147,14 @@ def sweep(count: int, args: argparse.Namespace) -> None:
     from suite.experiments.study import judging
     from suite.experiments.study.cache import Workspace
 
-    def piece(
-        loaders: judging.Loaders, shares: Sequence[judging.Share]
+    def fly_piece(
+        loaders: judging.Loaders, piece: Sequence[judging.Share]
     ) -> Iterator[tuple[int, TrialResult]]:
-        for share in shares:
+        for share in piece:
             yield share.number, some_trial(0)
 
     # Flights are replaced by invented results, so that only the driver works.
-    judging._fly_piece = piece
+    judging._fly_piece = fly_piece
     vehicle, trial, clock = load_vehicle("reference"), TrialSpec("zigzag", 0, 0), Clock()
     setups = (
         judging.Setup("race", replace(vehicle, mass=vehicle.mass + 1e-6 * k)) for k in range(count)

@@ -1,8 +1,5 @@
 """The race as an environment of dm_control (`dm_control.rl.control.Environment`)."""
 
-# pyright: reportIncompatibleMethodOverride=false
-# The abstract methods of dm_control are annotated as returning None.
-
 from __future__ import annotations
 
 from typing import Any

@@ -123,7 +123,7 @@ class RaceEnv(gymnasium.Env):
     def _observation(self) -> Observation:
         return {key: part[0] for key, part in self._races.observation().items()}
 
-    def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def render(self) -> np.ndarray | None:
         """Return an image (360, 640, 3) uint8 from behind the drone; None without a render mode.
 
         Raises:

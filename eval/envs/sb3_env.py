@@ -4,7 +4,6 @@ The library refuses images with two axes. So the pixels of an image are one vect
 an image with `channel_axis=True` is unchanged.
 """
 
-# pyright: reportMissingImports=false, reportMissingModuleSource=false
 from __future__ import annotations
 
 from functools import partial

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -173,7 +173,9 @@ def ordinary_flights(rng: np.random.Generator, duration_s: float = 10.0) -> list
     """
 
     def random_flight(kind: str, **ranges: tuple[float, float]) -> Trajectory:
-        values = {key: float(rng.uniform(*limits)) for key, limits in ranges.items()}
+        values: dict[str, Any] = {
+            key: float(rng.uniform(*limits)) for key, limits in ranges.items()
+        }
         direction = float(rng.uniform(0.0, 2.0 * np.pi))
         return replace(Trajectory(kind, duration_s), direction=direction, **values)
 

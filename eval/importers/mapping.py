@@ -77,8 +77,8 @@ def recording_of(
             parts.setdefault(quat, (time_s, from_euler(value)))
             used_columns.setdefault(quat, Column((), ()))
     parts = {
-        signal: _in_log_frame(signal, *part, used_columns[signal], mapping)
-        for signal, part in parts.items()
+        signal: _in_log_frame(signal, time_s, value, used_columns[signal], mapping)
+        for signal, (time_s, value) in parts.items()
     }
     parts |= _estimates(mapping, used_columns, find, name)
     for column in mapping.keep:

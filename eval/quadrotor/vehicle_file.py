@@ -156,7 +156,7 @@ def _effect_values(effect: Effect, table: Table, vehicle: Vehicle) -> Any:
         if not parameter.required:
             number = bound_value(parameter.neutral, vehicle)
             default = (number,) * parameter.size if parameter.size else number
-        kind = tuple[(float,) * parameter.size] if parameter.size else float
+        kind: Any = tuple[(float,) * parameter.size] if parameter.size else float  # pyrefly: ignore[not-a-type]
         values.append(table.value(parameter.name, kind, default))
     return effect.values(*values)
 

@@ -98,12 +98,15 @@ def scale_model(name: str, values: Any, magnitude: Any) -> Any:
     sensor, changed = SENSORS.find(name), {}
     for parameter in sensor.parameters:
         if parameter.name in sensor.grows:
-            neutral, value = float(parameter.neutral), getattr(values, parameter.name)  # pyright: ignore[reportArgumentType]
+            neutral: Any = parameter.neutral
+            low: Any = parameter.low
+            high: Any = parameter.high
+            value = getattr(values, parameter.name)
             scaled = neutral + magnitude * (value - neutral)
             if hasattr(scaled, "__array_namespace__"):
-                scaled = scaled.clip(parameter.low, parameter.high)
+                scaled = scaled.clip(low, high)
             else:
-                scaled = min(max(scaled, parameter.low), parameter.high)
+                scaled = min(max(scaled, low), high)
             changed[parameter.name] = scaled
     return values._replace(**changed)
 

@@ -55,7 +55,7 @@ def _keys(axis: str) -> tuple[str, ...]:
 
 _FIELDS = [*(name for axis in AXES for name in _keys(axis)), "velocity_scale", "position_drift"]
 """Names of all parameters: five of each axis, and two more."""
-MeasuredState: Any = NamedTuple("MeasuredState", [(name, Array) for name in _FIELDS])  # pyright: ignore
+MeasuredState: Any = NamedTuple("MeasuredState", [(name, Array) for name in _FIELDS])  # pyrefly: ignore[bad-class-definition]
 MeasuredState.__doc__ = "Parameters of `measured_state`: `Axis` for each axis, and two more."
 
 

@@ -146,7 +146,7 @@ def _values(sensor: Sensor, table: Table) -> Any:
     table.expect(("kind", *(parameter.name for parameter in sensor.parameters)))
     return sensor.values(
         *(
-            table.number(p.name, p.neutral, least=p.low, most=p.high)  # pyright: ignore[reportArgumentType]
+            table.number(p.name, p.neutral, least=p.low, most=p.high)  # pyrefly: ignore[bad-argument-type]
             for p in sensor.parameters
         )
     )

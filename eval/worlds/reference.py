@@ -128,10 +128,10 @@ def fly_trial(
                 view = sensors.see(view, np.array([decisions == 0]), np.array([True]))
             state, image = observe(spec, view, action_b)
             is_first = np.full(rows, decisions == 0)
-            inputs = (_padded(x, rows) for x in (state, image))
+            padded_state, padded_image = _padded(state, rows), _padded(image, rows)
             last_b = np.repeat(action_b, rows, 0)
             guarded, policy_memory = call_policy(
-                limits, policy, policy_memory, *inputs, is_first, last_b
+                limits, policy, policy_memory, padded_state, padded_image, is_first, last_b
             )
             action_b = guarded.action_b[:1]
             outputs.add(Guarded(*(part[:1] for part in guarded)), state.astype(np.float32))

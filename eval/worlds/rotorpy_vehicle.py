@@ -52,7 +52,7 @@ def rotorpy_parameters(vehicle: Vehicle, shortest_lag_s: float = 0.0) -> dict[st
     values = all_values(modelled)
     constants = make_plant(modelled, 1.0 / modelled.controller.frequency).constants
     mass, thrust = float(constants.mass), float(constants.thrust_coefficient[0])
-    parameters = {
+    parameters: dict[str, Any] = {
         "mass": mass,
         **dict(zip(("Ixx", "Iyy", "Izz"), map(float, constants.inertia), strict=True)),
         **dict.fromkeys(("Ixy", "Ixz", "Iyz"), 0.0),

@@ -123,7 +123,7 @@ class _Pilot:
         assert self._extra is not None
         wrench, time_s = Wrench(force_b, np.zeros_like(force_b)), states.time_s[:, None]
         # The time has one number per flight; other simulators give one number for all.
-        return self._extra.wrench(_motion(states), wrench, time_s, length_s).force_b  # pyright: ignore[reportArgumentType]
+        return self._extra.wrench(_motion(states), wrench, time_s, length_s).force_b  # pyrefly: ignore[bad-argument-type]
 
 
 def _motion(states: Rows) -> Motion:

@@ -54,7 +54,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     load = load_warnings()
     bench = importlib.import_module(f"suite.experiments.bench.{config.name}")
     result = bench.run() if config.policy is None else bench.run(config.policy)
-    answer = {**plain(result), "ratio": result.ratio, "warnings": [*load, *result.warnings]}
+    answer: dict[str, Any] = plain(result)
+    answer |= {"ratio": result.ratio, "warnings": [*load, *result.warnings]}
     del answer["grid"]
     for side, figure in (("ours", result.ours), ("baseline", result.baseline)):
         console.say(f"{side:<9} {figure.value:.4g} {figure.unit}")

@@ -185,7 +185,7 @@ def _command_rule(
             field = dataclasses.field(default=spec.default, metadata={"help": spec.helptext})
             members.append((spec.name, spec.type, field))
         group = dataclasses.make_dataclass(GROUP, members, namespace={"__doc__": "Seldom needed."})
-        kind = tyro.conf.OmitArgPrefixes[group]
+        kind: Any = tyro.conf.OmitArgPrefixes[group]
         fields.append(tyro.constructors.StructFieldSpec(GROUP, kind, group()))
 
     def build(**values: Any) -> Any:

@@ -160,7 +160,7 @@ def fit_delta(
     steps *= fit_windows.action_b.shape[1]
     announce(console, title, fitting_estimate(config, steps, description["model"] == QUAD))
     with console.progress("fitting", config.iterations) as show:
-        result = run_fit(fit_windows, held_out, show)
+        result = run_fit(fit_windows, held_out, show)  # pyrefly: ignore[bad-argument-type]
     # Write the record, the checkpoint and the tables.
     summary = {
         "model": description["model"],

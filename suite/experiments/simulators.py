@@ -151,7 +151,7 @@ def _success_grid(results: Sequence[ConditionResult]) -> Grid:
     """
     headers = ["policy", "simulator", "success", "minus mujoco", "p", "same ending"]
     headers += ["lap time difference [s]", "mean speed difference [m/s]"]
-    rows = []
+    rows: list[Any] = []
     for name in results[0].results:
         for entry in results:
             numbers = _numbers(entry, results[0], name)

@@ -106,7 +106,7 @@ def evaluate(
     # Write the tables; then the journals are no longer needed.
     laps = _laps_over_plan(results, trial_set)
     actions = {entry.label: _actions(entry, results, console) for entry in entries}
-    summary = {
+    summary: dict[str, Any] = {
         **summarise(results),
         "over_plan": laps,
         "actions": actions,

@@ -60,7 +60,8 @@ def read_evaluation(folder: Path) -> Evaluation:
     speeds = config.get("speed", [])
     if not isinstance(speeds, list) or not all(isinstance(s, (int, float)) for s in speeds):
         raise ValueError(f"{path}: speed is {shown(speeds)}, allowed is a list of numbers")
-    evaluation = Evaluation(**{**config, "policies": tuple(policies), "speed": tuple(speeds)})
+    config |= {"policies": tuple(policies), "speed": tuple(speeds)}
+    evaluation = Evaluation(**config)
     for name, value in vars(evaluation).items():
         default = getattr(Evaluation, name)
         # Fields with default None are numbers; JSON may have a whole number for a float.

@@ -216,9 +216,7 @@ def _compare_cell(
         track,
         level,
         trials=len(rows[BEFORE]),
-        success=measure(
-            "success", success_rate, lambda *pair: Interval(*paired_success(*pair)[:3])
-        ),
+        success=measure("success", success_rate, lambda a, b: Interval(*paired_success(a, b)[:3])),
         p_value=paired_success(with_delta, without).p_value,
         gates=measure("gates_passed", mean, lambda a, b: mean(a - b)),
         v_mean=measure("v_mean", median, median_difference),

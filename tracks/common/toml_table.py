@@ -116,7 +116,7 @@ class Table:
             also: further allowed keys.
             fixed: values of fields that are not in the table.
         """
-        fields = {field.name: field for field in dataclasses.fields(cls) if field.name not in fixed}  # pyright: ignore[reportArgumentType]
+        fields = {field.name: field for field in dataclasses.fields(cls) if field.name not in fixed}  # pyrefly: ignore[bad-argument-type]
         self.expect([*fields, *also])
         hints = get_type_hints(cls)
         for name, field in fields.items():

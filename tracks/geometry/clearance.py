@@ -6,6 +6,8 @@ repulsive gradient always points to free space. The training's collision loss us
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 
 from tracks.geometry.cull import nearest_solids
@@ -117,7 +119,7 @@ def distances(scene: Scene, point_w: Array) -> tuple[Array, Array]:
         distance (..., N + 1) [m] in the order boxes, cylinders, capsules, spheres, triangles,
         ground; away (..., N + 1, 3) unit vectors along which the distance grows.
     """
-    kinds = [
+    kinds: list[tuple[Any, Any, Array]] = [
         (_box, scene.boxes, scene.boxes.center_w),
         (to_cylinders, scene.cylinders, scene.cylinders.center_w),
         (_capsule, scene.capsules, scene.capsules.center_w),

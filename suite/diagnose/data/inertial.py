@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -190,7 +191,7 @@ def _whole(log: FlightLog, pieces: Sequence[_Piece], drag: np.ndarray) -> Inerti
     pos_w[1:] = np.cumsum(vel_w[1:] * np.diff(log.time_s)[:, None], axis=0)
     pos_w[:, 2] += HIGH_M
     quat = np.asarray(rot_to_quat(rot_w))
-    fields = {**vars(log), "pos_w": pos_w, "quat_wxyz": quat, "vel_w": vel_w}
+    fields: dict[str, Any] = {**vars(log), "pos_w": pos_w, "quat_wxyz": quat, "vel_w": vel_w}
     fields["velocity_derived"] = False
     return InertialLog(**fields, pose_slope_b=pose_slope_b, vel_noise_b=vel_noise_b)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
@@ -33,7 +34,7 @@ def on_every_row(log: FlightLog, limits: Thresholds = THRESHOLDS) -> FlightLog:
     Each signal is interpolated or held, see `MEASURED` and `HELD`. A log whose signals have values
     in all rows is returned unchanged.
     """
-    filled = {}
+    filled: dict[str, Any] = {}
     for name in (*MEASURED, *HELD):
         values = getattr(log, name)
         if values is None or np.isfinite(values).all() or not np.isfinite(values).any():

@@ -61,8 +61,8 @@ class RolloutEvidence(Evidence):
     """The same windows, each shortened to the time in which the linearisation holds."""
     noise: Noise
     whitening: Whitening
-    limits: Thresholds = THRESHOLDS
-    misfit_is_noise: bool = False
+    limits: Thresholds = THRESHOLDS  # pyrefly: ignore[bad-override]
+    misfit_is_noise: bool = False  # pyrefly: ignore[bad-override]
 
     @property
     def space(self) -> ParameterSpace:

@@ -52,7 +52,7 @@ class ViewEvidence(Evidence):
     view: View
     model: ForceModel
     flights: Sequence[SmoothedFlight]
-    limits: Thresholds = THRESHOLDS
+    limits: Thresholds = THRESHOLDS  # pyrefly: ignore[bad-override]
     carried: np.ndarray | None = None
     """(M, 3) residual that follows from reference flights (is carried over from them); it is
     subtracted."""

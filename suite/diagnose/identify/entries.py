@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -151,7 +152,7 @@ def _clipped(vehicle: Vehicle, entry: Number) -> Number:
 def with_entry(vehicle: Vehicle, entry: Number) -> Vehicle:
     """Return the vehicle with the values of `entry`, if these flights determine them."""
     table, _, key = entry.key.rpartition(".")
-    value = tuple(entry.value) if len(entry.value) > 1 else entry.value[0]
+    value: Any = tuple(entry.value) if len(entry.value) > 1 else entry.value[0]
     if not table:  # the inertia, of which one component follows from the others
         return replace(vehicle, **{key: value})
     if not entry.is_entered:

@@ -89,7 +89,11 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
     sources = []
     for name, one in evidence.items():
         to_fit, held_out = (replace(one, flights=part[name]) for part in (fitted, held))
-        shared = {**_descriptions(one.view), "limits": limits, "floor": flights.floor[name]}
+        shared: dict[str, Any] = {
+            **_descriptions(one.view),
+            "limits": limits,
+            "floor": flights.floor[name],
+        }
         if spread is not None:
             # Of logs that lack a required signal only the means of flights are compared.
             partial = any(log.partial for log in [*logs, *references])

@@ -89,7 +89,7 @@ def _draw_effects(nominal: Vehicle, rng: np.random.Generator) -> dict[str, Any]:
     """Draw the values of the effects: every parameter differs by its usual size, up or down."""
     neutral, values = all_values(nominal), dict[str, Any]()
     for name in REFITTED:
-        fields = {}
+        fields: dict[str, Any] = {}
         for parameter in EFFECTS[name].parameters:
             size = max(parameter.size, 1)
             shift = rng.uniform(*parameter.typical, size) * rng.choice((-1.0, 1.0), size)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -173,7 +174,7 @@ def _map_of(vehicle: Vehicle) -> MotorMap:
     return vehicle.motors
 
 
-def _motors(vehicle: Vehicle, **changes: object) -> Vehicle:
+def _motors(vehicle: Vehicle, **changes: Any) -> Vehicle:
     return replace(vehicle, motors=replace(_map_of(vehicle), **changes))
 
 
@@ -186,7 +187,13 @@ def _other_curve(vehicle: Vehicle) -> Vehicle:
     )
 
 
-def _with_rotors(vehicle: Vehicle, **changes: object) -> Vehicle:
+def _inertia_in_grams(vehicle: Vehicle) -> Vehicle:
+    """Return `vehicle` with an inertia in g m^2 instead of kg m^2."""
+    x, y, z = vehicle.inertia
+    return replace(vehicle, inertia=(1000.0 * x, 1000.0 * y, 1000.0 * z))
+
+
+def _with_rotors(vehicle: Vehicle, **changes: Any) -> Vehicle:
     """Return `vehicle` with other values for fields of its rotors."""
     return replace(vehicle, rotors=replace(vehicle.rotors, **changes))
 
@@ -317,7 +324,7 @@ KINDS: dict[str, Kind] = {
     ),
     "inertia x 1000": Kind(
         ("vehicle_inertia",),
-        vehicle=lambda v: replace(v, inertia=tuple(1000.0 * j for j in v.inertia)),
+        vehicle=_inertia_in_grams,
     ),
     "barometer falls on spin-up": Kind(
         ("barometer_spin_up",),

@@ -86,7 +86,7 @@ def onnx_steps(checkpoint: PolicyCheckpoint) -> tuple[Step, Step]:
     session = onnxruntime.InferenceSession(onnx_file(checkpoint, {}), options, providers=providers)
     state, image = _inputs(checkpoint.spec)
     hidden = np.zeros((1, checkpoint.spec.hidden_size), np.float32)
-    feed = {"state": state, "image": image, "hidden": hidden}
+    feed: dict[str, Any] = {"state": state, "image": image, "hidden": hidden}
     binding = session.io_binding()
     for name, value in feed.items():
         binding.bind_ortvalue_input(name, onnxruntime.OrtValue.ortvalue_from_numpy(value))

@@ -310,14 +310,14 @@ def test_a_picture_shows_the_track_from_behind_the_drone_and_what_it_sees():
     env.reset(options={"track_seed": 2})
     fresh = RaceEnv(track="circular", track_seed=2, render_mode="rgb_array")
     fresh.reset(seed=0)
-    assert np.array_equal(env.render(), fresh.render())  # pyright: ignore[reportArgumentType]
+    assert np.array_equal(env.render(), fresh.render())
     assert RaceEnv().render() is None and env.metadata["render_fps"] == 30
 
 
 @sb3
 @pytest.mark.parametrize("how", ["vector", "pixels"])
 def test_the_checker_of_stable_baselines3_finds_nothing(how):
-    from stable_baselines3.common.env_checker import check_env  # pyright: ignore
+    from stable_baselines3.common.env_checker import check_env
 
     from eval.envs.sb3_env import race_env
 

@@ -122,9 +122,9 @@ def loop_gain(
     settled = slice(min(round(0.5 / step), len(grid) // 4), None)
     for hz, ratio, late_s in product(LOOP_HZ, DAMPING, LOOP_LATE_S):
         omega, count = 2.0 * np.pi * hz, round(late_s / step)
-        filters = bilinear([omega**2], [1.0, 2.0 * ratio * omega, omega**2], 1.0 / step)
+        top, bottom = bilinear([omega**2], [1.0, 2.0 * ratio * omega, omega**2], 1.0 / step)
         late = np.concatenate([np.repeat(command[:1], count, axis=0), command])[: len(grid)]
-        wanted = np.asarray(lfilter(*filters, late - command[0], axis=0))[settled]
+        wanted = np.asarray(lfilter(top, bottom, late - command[0], axis=0))[settled]
         wanted = wanted - wanted.mean(axis=0)
         gain = np.sum(wanted * rate[settled], axis=0) / np.sum(wanted**2, axis=0)
         residual = np.sum((rate[settled] - gain * wanted) ** 2, axis=0)

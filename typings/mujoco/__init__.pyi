@@ -1,4 +1,0 @@
-# MuJoCo's names come from compiled modules that pyright cannot look into.
-from typing import Any
-
-def __getattr__(name: str) -> Any: ...
