@@ -65,8 +65,6 @@ class _Shape(NamedTuple):
 
 Linear = Callable[[np.ndarray], np.ndarray]
 """Maps vectors (3, P) to their dot products (T, T, P) with the rays of P tiles."""
-Cast = Callable[[_Shape, Linear, np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Maps (solids, dot products, squared ray lengths) to the depths (T, T, P) of entry and exit."""
 
 
 def make_tiles(camera: Camera) -> Tiles:
