@@ -54,6 +54,7 @@ def test_identified_numbers_are_near_the_truth(drive, least):
     assert np.max(np.abs(list(off.values()))) < 2.5
 
 
+@pytest.mark.slow
 def test_noise_of_the_rotor_speeds_makes_no_body_heavier_to_turn():
     """Without a chirp the flights hardly identify the inertia, or not at all."""
     fleet = Fleet(known.truth(), known.WAYS[:3])
@@ -120,6 +121,7 @@ def test_a_hover_identifies_thrust_and_reports_what_it_does_not(missing, lines):
     assert found.vehicle.inertia == known.start().inertia
 
 
+@pytest.mark.slow
 def test_what_turns_is_identified_by_the_attitude_without_rates_and_without_positions():
     fleet, rng = Fleet(known.truth(), known.WAYS), np.random.default_rng(0)
     sensors = replace(known.SENSORS, attitude=0.002)

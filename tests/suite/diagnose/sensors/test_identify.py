@@ -109,6 +109,7 @@ def test_the_true_parameters_are_within_the_intervals():
     assert noise.high / noise.low < 1.5
 
 
+@pytest.mark.slow
 def test_the_noise_fits_held_out_flights_unless_theirs_has_another_colour():
     assert all(one.fits for one in held_out(flights()).values())
     others = flown(range(9, 12), velocity_z_lasts=2.0)

@@ -27,6 +27,7 @@ def pushed(extra, seed, duration_s=6.0):
     )
 
 
+@pytest.mark.slow
 def test_a_battery_that_sags_with_its_voltage_is_named_with_its_size():
     logs = [
         replace(log, voltage=16.8 - FALL * (log.time_s - log.time_s[0]))
@@ -46,6 +47,7 @@ def test_a_drag_to_one_side_is_no_wind():
     assert label in ("partly", "unknown") and "constant_wind" not in names
 
 
+@pytest.mark.slow
 def test_a_hysteresis_outside_the_catalogue_is_no_thrust_alone():
     def stuck(motion, t):
         return (2.0 if motion.vel_w[2] > 0.0 else -1.0) * motion.rot_w[:, 2]
@@ -69,6 +71,7 @@ def test_a_force_that_nothing_explains_is_not_no_gap():
     assert shown.label.partition("body ")[2][0] in "xy", "the picture shows where the error is"
 
 
+@pytest.mark.slow
 def test_one_effect_is_named_without_a_second_small_one_but_with_what_looks_alike():
     label, names, _ = found_in(flights(4, seed=11, speed=4.0, blade_flapping=(2e-6,)))
     assert label == "named" and len(names) == 1

@@ -40,6 +40,7 @@ def test_a_thrust_that_the_force_view_excludes_is_contradicted(by_views, scale, 
     assert [name for name, _ in contradicted(force, torque)] == [one] * count
 
 
+@pytest.mark.slow
 def test_a_drag_of_the_file_makes_way_for_what_rotors_do_and_none_stands_for_another():
     hidden = {"rotor_drag": 7.8e-5, "translational_lift": 0.027, "inflow": 1.5e-4}
     logs = flights(4, speed=4.0, hidden={name: (value,) for name, value in hidden.items()})

@@ -93,6 +93,7 @@ def test_effects_that_are_part_of_a_number_are_merged_and_the_vehicle_flies_as_b
     assert "thrust_scale" in drive.with_merged_effects(before, False).effects
 
 
+@pytest.mark.slow
 def test_the_result_does_not_depend_on_how_the_start_gives_a_number():
     plain = known.start()
     same = with_effects(plain, inertia_scale=((0.9, 1.1, 1.0),))

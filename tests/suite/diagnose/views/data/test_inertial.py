@@ -84,6 +84,7 @@ def test_thrust_and_drag_are_identified_without_a_pose():
     assert any("heading" in line for line in found.not_identified)
 
 
+@pytest.mark.slow
 def test_a_drag_of_slow_flights_is_identified_where_the_gyro_drifts_and_of_a_hover_not():
     """As in logs whose gyro was sampled too rarely: the tilt drifts by 0.03 rad a second."""
     slow = {"end_s": 30.0, "speed": 0.3, "gyro_walk": 0.1, "acc_noise": 0.05}
