@@ -35,16 +35,15 @@ def main(steps: int) -> None:
         plant = fit_plant(vehicle, {"mass_offset": MassOffset(mass)}, DT)
         return rollout(plant, rest, inputs).motion.pos_w[-1]
 
+    end_w, jacobian = jax.jit(last_pos_w), jax.jit(jax.jacfwd(last_pos_w))
     true_mass = 0.06
-    goal_w = last_pos_w(jnp.asarray(true_mass))
-    residual = jax.jit(lambda mass: last_pos_w(mass) - goal_w)
-    jacobian = jax.jit(jax.jacfwd(residual))
+    goal_w = end_w(jnp.asarray(true_mass))
     mass = jnp.asarray(0.0)
     for step in range(steps):
-        error, slope = residual(mass), jacobian(mass)
+        error, slope = end_w(mass) - goal_w, jacobian(mass)
         print(f"{step}: {float(mass):.5f} kg, {float(jnp.linalg.norm(error)):.2e} m off")
         mass = mass - slope @ error / (slope @ slope)
-    differences = (residual(mass + 1e-2) - residual(mass - 1e-2)) / 2e-2
+    differences = (end_w(mass + 1e-2) - end_w(mass - 1e-2)) / 2e-2
     exact, approximate = float(jacobian(mass)[2]), float(differences[2])
     print(f"{float(mass):.5f} kg; the truth is {true_mass} kg")
     print(f"d z / d mass: {exact:.3f} m/kg, by differences {approximate:.3f}")
