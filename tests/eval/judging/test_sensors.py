@@ -1,5 +1,7 @@
 """Sensor models and the estimator in the judge: errors and outcomes are the trial's own."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -84,9 +86,12 @@ def test_slots_that_do_not_fly_draw_nothing_and_a_fresh_one_begins_anew():
     assert np.array_equal(late.pos_w[0], view(2).pos_w[0])
 
 
+pilot = cache(RandomNetwork)
+
+
 def results(trials, sensors, slots=64, world="mujoco"):
     options = JudgeOptions(slots=slots, rules=RULES, sensors=sensors, workers=1)
-    return fly(RandomNetwork(), trials, VEHICLE, world, options)
+    return fly(pilot(), trials, VEHICLE, world, options)
 
 
 @pytest.fixture(scope="module")
