@@ -125,9 +125,10 @@ def test_the_network_remembers_the_flight_before_a_window(logs):
 
 
 def test_a_fit_cuts_the_error_and_says_what_it_corrects(logs, tmp_path):
+    """As many flights are held out as are fitted: the errors of both are one program."""
     for log in logs:
         write_flight(tmp_path / "logs" / log.name.replace(" ", "-"), log)
-    config = FitConfig(horizon_s=0.5, iterations=30, batch=32, rate=1e-2, held_out=0.3)
+    config = FitConfig(horizon_s=0.5, iterations=30, batch=32, rate=1e-2, held_out=0.5)
     quad = QuadrotorConfig(BARE)
     result = fit_delta(config, quad, [tmp_path / "logs"], tmp_path / "out", Console())
     assert result.without.position_m > 0.05
