@@ -47,8 +47,8 @@ delta_step = jax.jit(delta_network.step)
 
 @jax.jit
 def learn(params, optimizer, key):
-    states = jax.random.normal(key, (4, 16, SPEC.state_size))
-    images = jax.random.uniform(key, (4, 16, SPEC.camera.height, SPEC.camera.width))
+    states = jax.random.normal(key, (4, 4, SPEC.state_size))
+    images = jax.random.uniform(key, (4, 4, SPEC.camera.height, SPEC.camera.width))
     (loss, hidden), gradient = jax.value_and_grad(error, has_aux=True)(params, states, images)
     change, optimizer = ADAMW.update(gradient, optimizer, params)
     return optax.apply_updates(params, change), optimizer, loss, hidden
