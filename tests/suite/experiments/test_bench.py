@@ -27,7 +27,7 @@ from tracks.geometry.scene import PARKED_Z
 
 def test_both_sides_compute_the_same_loss_and_gradient():
     """Ours leaves far solids out of images, so not to the last digit."""
-    base = train.bench_config(6, 12)
+    base = train.bench_config(2, 4)
     config = replace(base, physics=replace(base.physics, depth_noise=0.0))
     worlds, params = train.bench_worlds(config), fresh_params(config.spec)
     kinds = (worlds.scene.boxes, *worlds.scene[2:5])
