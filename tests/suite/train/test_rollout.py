@@ -24,6 +24,7 @@ from tests.support.training import (
     KEY,
     SPEC,
     assert_gradient,
+    blind,
     boxes_worlds,
     doubled,
     fresh_params,
@@ -88,42 +89,44 @@ def pull_at(worlds, pos_w, vel_w):
     return attractive_field(field, vel_w, 0.3) / (2e-5 * UNIT_FIELD) ** 0.7
 
 
-def test_the_fields_strength_depends_on_neither_horizon_nor_batch(float64, steps=8, batch=6):
+AIR = {"drag": (0.0, 0.0), "drag_up": (0.0, 0.0), "wind_std": (0.0, 0.0, 0.0)}
+STILL = small_config(batch=6, steps=8, physics=AIR, rest_share=1.0)
+
+
+@jax.jit
+def start_gradient(params, worlds, field_gain, free, held):
+    """Return the loss's gradient by where the worlds of STILL start.
+
+    The policy sees how bright an image is, `free` times with and `held` times without gradient.
+    """
+
+    def encode(_, image):
+        bright = image.mean((1, 2))[:, None] * jnp.ones(SPEC.hidden_size)
+        return free * bright + held * jax.lax.stop_gradient(bright)
+
+    loss = loss_of(STILL, encode)
+    move = lambda pos: loss(params, worlds._replace(pos_w=pos), None, field_gain)  # noqa: E731
+    return jax.grad(move)(worlds.pos_w)
+
+
+def test_the_fields_strength_depends_on_neither_horizon_nor_batch(float64):
     """A world that hangs still: every step pulls alike, so the mean is one step's pull."""
-    still = {"drag": (0.0, 0.0), "drag_up": (0.0, 0.0), "wind_std": (0.0, 0.0, 0.0)}
-    config = small_config(batch, steps, physics=still, rest_share=1.0)
+    config, steps, batch = STILL, STILL.episode.steps, STILL.episode.batch
     worlds, params = doubled(boxes_worlds(config)), doubled(fresh_params(lively=0.0))
-    loss = loss_of(config)
-
-    @jax.jit
-    def start_gradient(gain):
-        move = lambda pos: loss(params, worlds._replace(pos_w=pos), None, gain)  # noqa: E731
-        return jax.grad(move)(worlds.pos_w)
-
     # Decay fades what comes back through the steps: step k's pull by its k-th power.
     fade = np.exp(-config.loss.gradient_decay * np.array(worlds.constants.time_step))
     share = np.mean([fade ** (k + 1) for k in range(steps)], axis=0)
     pull = 0.42 * np.array(pull_at(worlds, worlds.pos_w, worlds.vel_w)) * share[:, None]
-    change = np.array(start_gradient(0.0) - start_gradient(0.42))
+    pulled, free = (start_gradient(params, worlds, gain, 0.0, 0.0) for gain in (0.42, 0.0))
+    change = np.array(free - pulled)
     np.testing.assert_allclose(change * batch, pull, rtol=1e-6, atol=1e-9)
 
 
 def test_images_carry_no_gradient_to_the_state(float64):
-    config = small_config(batch=3, steps=4)
-    worlds, params = doubled(boxes_worlds(config)), doubled(fresh_params())
-
-    @jax.jit
-    def start_gradient(free, held):
-        def encode(params, image):
-            bright = image.mean((1, 2))[:, None] * jnp.ones(SPEC.hidden_size)
-            return free * bright + held * jax.lax.stop_gradient(bright)
-
-        loss = loss_of(config, encode)
-        return jax.grad(lambda p: loss(params, worlds._replace(pos_w=p)))(worlds.pos_w)
-
-    seen = start_gradient(1.0, 0.0)
-    np.testing.assert_allclose(seen, start_gradient(0.0, 1.0), atol=1e-12)
-    assert np.abs(np.array(seen - start_gradient(0.0, 0.0))).max() > 1e-6
+    slopes = partial(start_gradient, doubled(fresh_params()), doubled(boxes_worlds(STILL)))
+    seen = slopes(0.0, 1.0, 0.0)
+    np.testing.assert_allclose(seen, slopes(0.0, 0.0, 1.0), atol=1e-12)
+    assert np.abs(np.array(seen - slopes(0.0, 0.0, 0.0))).max() > 1e-6
 
 
 def test_a_world_that_crashed_deep_leaves_the_loss(two_pass):
@@ -148,8 +151,8 @@ def test_the_policy_is_shown_the_gate_after_the_next():
     """The second gate's centre, the last one's where none comes after, and both directions."""
     worlds = boxes_worlds(small_config(3))
     target = jnp.asarray([0, 3, 7])
-    body = point_mass.start(worlds.pos_w, worlds.vel_w, worlds.heading_w)
-    seen, gates, rows = view_in(worlds, body, target), worlds.scene.gates, range(3)
+    body = jax.jit(point_mass.start)(worlds.pos_w, worlds.vel_w, worlds.heading_w)
+    seen, gates, rows = jax.jit(view_in)(worlds, body, target), worlds.scene.gates, range(3)
     np.testing.assert_array_equal(seen.second_w, gates.center_w[rows, [1, 4, 7]])
     np.testing.assert_array_equal(seen.axis_w, gates.rot_w[rows, target, :, 0])
     np.testing.assert_array_equal(seen.second_axis_w, gates.rot_w[rows, [1, 4, 7], :, 0])
@@ -167,7 +170,7 @@ def test_what_is_delayed_is_shown_so_many_steps_later_and_before_them_the_start(
     config = replace(config, spec=replace(config.spec, speed_input=True))
     worlds = sample_worlds(config, 0)
     worlds = worlds._replace(vel_w=3.0 * worlds.heading_w)
-    state = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
+    state = jax.jit(make_dynamics(config).start)(worlds.constants, *worlds[1:4])
     found = jax.jit(lambda *start: rollout.observed_at_start(*start, config))(worlds, state)
     assert found.shape == (2, 2, config.spec.state_size)
     np.testing.assert_array_equal(found[:, 0], found[:, 1])
@@ -205,12 +208,18 @@ def test_a_world_that_has_passed_its_last_gate_leaves_the_loss_where_that_is_the
         heading_w=ahead,
         target=np.array([last, last, last, last - 1]),
     )
-    records = gradient_of(config)(fresh_params(lively=0.0), worlds, KEY, None)[2]
-    passed = np.asarray(records.passed)
+    shift, fly = jnp.zeros((6, 4, SPEC.hidden_size)), rollout.make_rollout(config)
+
+    @jax.jit
+    def flown(params):
+        records = fly(params, shift, worlds, KEY, blind)[1]
+        return records.passed, records.alive
+
+    passed, alive = map(np.asarray, flown(fresh_params(lively=0.0)))
     assert (passed.sum(0) == [1, 1, 1, 0]).all()
     after = np.cumsum(passed, 0) - passed > 0
     assert after.any()
-    assert np.array_equal(np.asarray(records.alive) == 0, after & finish)
+    assert np.array_equal(alive == 0, after & finish)
 
 
 def test_images_outside_the_loop_give_the_gradient_of_the_plain_loop(two_pass):
