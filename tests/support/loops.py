@@ -13,6 +13,9 @@ from eval.worlds.trial import Rules
 class Small:
     """Makes a loop cheap, counts what it does, and stops it after a number of flights."""
 
+    recorded_s = 1.4
+    """Length of a flight that is recorded, a little more than a window of a fit [s]."""
+
     def __init__(self, monkeypatch):
         self.flown, self.trained = [], []
         self.stop_after: int | None = None
@@ -21,8 +24,8 @@ class Small:
         monkeypatch.setattr(suite.train.run, "make_update", self.make_update)
 
     def fly(self, policy, trials, vehicle, world, options, on_result, *rest, **more):
-        # Flights that are recorded are measured and fitted, which takes longer ones.
-        seconds = 2.0 if rest or more.get("record") else 0.3
+        # Flights that are recorded are fitted, which takes longer ones.
+        seconds = self.recorded_s if rest or more.get("record") else 0.3
         options = replace(options, slots=4, rules=Rules(time_limit_s=seconds))
 
         def keep(result, flight):

@@ -1,8 +1,8 @@
 """suite loop: from training or a hidden effect to the report, interrupted anywhere.
 
-The gradient step is a stand-in, since compiling the real one three times takes minutes; trials are
-cut short. With a hidden effect the diagnosis and the fits are stand-ins as well. All of them have
-tests of their own; all else is what a person runs.
+The gradient step and the fits are stand-ins, since compiling the real ones takes minutes; trials
+are cut short. With a hidden effect the diagnosis is a stand-in as well. All of them have tests of
+their own; all else is what a person runs.
 """
 
 import json
@@ -23,6 +23,8 @@ from policies.formats.policy_file import load_policy_checkpoint, save_delta
 from policies.networks import delta_network
 from suite import cli
 from suite.common.console import Quiet
+from suite.delta.fit import PointMassFit, ReplayErrors
+from suite.delta.replay import nominal_model
 from suite.delta.run import flight_files
 from suite.loop import hidden_effect, work
 from suite.loop.compare import policy_results
@@ -43,12 +45,22 @@ HIDDEN = [*SIZES.split(), "--hidden-vehicle", EXAMPLE]
 TUNED = [variant.name for variant in LOOP.variants if variant.tuned]
 
 
+def fitted(config, physics, fit_windows, held_out, show):
+    """Stand in for the fit of a Delta Action Model and of a point mass."""
+    assert len(fit_windows.pos_w) > 0 < len(held_out.pos_w)
+    params = {k: np.asarray(v) + 0.01 for k, v in delta_network.init(jax.random.key(0)).items()}
+    curve = [{"iteration": k, "fit_m": 0.2, "held_out_m": 0.2} for k in range(config.iterations)]
+    errors = [ReplayErrors(error, error) for error in (0.2, 0.1, 0.15)]
+    return PointMassFit(params, *errors[:2], curve, nominal_model(physics), errors[2])
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """Return a finished loop's folder and what it did."""
     out = tmp_path_factory.mktemp("loop") / "whole"
     with pytest.MonkeyPatch.context() as patch:
         small = Small(patch)
+        patch.setattr("suite.delta.run.fit_point_mass", fitted)
         assert cli.main([*TRAIN, "--out", str(out)]) == 0
     return out, small
 
@@ -150,6 +162,8 @@ FOUND = ComOffset((0.011, 0.0, 0.0))
 
 class Stub(Small):
     """Also in place of the diagnosis and the fits."""
+
+    recorded_s = 2.0  # what is measured ends before a contact
 
     def __init__(self, monkeypatch, effects=(NAMED,)):
         super().__init__(monkeypatch)
