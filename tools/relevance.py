@@ -1,0 +1,186 @@
+"""Measure whether the diagnosis finds nothing on clean flights, and effects that just matter.
+
+    python tools/relevance.py [SETS [SEED [FIRST]]]
+
+A set has four flights of `suite collect` with their own simulator, vehicle, track family, level,
+row rate and noise, and commands or measured rotor speeds alone. It is diagnosed twice against the
+vehicle that flew. First nothing is hidden: the verdict must be `no_gap`. Then one effect is hidden,
+as large as the threshold of practical relevance (`Thresholds.relevance`): it must be named.
+
+The tool prints a line for each set. Then it prints both shares, with their 95 % intervals (Clopper
+and Pearson). 60 sets take about 30 minutes on one core.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from poseless import IDENTIFIABLE, hidden_values, share_line
+from scipy.spatial.transform import Rotation
+
+from eval.flights.simulate import SENSORS
+from eval.logs.flight_log import FlightLog, read_flights
+from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
+from eval.vehicles.vehicle import Vehicle, with_effects
+from suite.common.startup import keep_compiled
+from suite.common.work import Silent
+from suite.diagnose.data.windows import cut
+from suite.diagnose.diagnose import diagnose
+from suite.diagnose.estimate.parameters import FittedNumber, make_space
+from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
+from suite.diagnose.report.diagnosis_json import diagnosis_json
+from suite.diagnose.thresholds import THRESHOLDS
+from suite.diagnose.verdict.gap import rollout_size
+from suite.judging.collect import collect
+from suite.judging.requests import Collection
+from tracks.families import FAMILIES
+
+SIMULATORS = ("mujoco", "rotorpy", "mjx")
+"""Simulators that record flights."""
+VEHICLES = ("reference", "racer5")
+"""Vehicle files without random effects."""
+FLIGHTS = 4
+"""Number of flights of a set."""
+NOISE = SENSORS["full"]
+"""Measurement noise of the noisy sets."""
+
+
+class Setting(NamedTuple):
+    """How the flights of a set are made."""
+
+    collection: Collection
+    """Policy, track, level, simulator and seed."""
+    every: int
+    """The log keeps one of so many rows; all rows are 100 a second."""
+    noisy: bool
+    """Whether the signals have measurement noise."""
+    commands: bool
+    """Whether the log has the commands."""
+
+
+def draw(number: int, rng: np.random.Generator, seed: int) -> Setting:
+    """Return the setting of set `number`."""
+    collection = Collection(
+        vehicle=str(rng.choice(VEHICLES)),
+        simulator=SIMULATORS[number % len(SIMULATORS)],
+        track=str(rng.choice(list(FAMILIES))),
+        difficulty=str(rng.integers(0, 10)),
+        trials=FLIGHTS,
+        seed=seed + FLIGHTS * number,
+    )
+    return Setting(collection, int(rng.integers(1, 3)), *(bool(rng.integers(2)) for _ in range(2)))
+
+
+def fly_logs(setting: Setting, vehicle: Vehicle, rng: np.random.Generator) -> list[FlightLog]:
+    """Return the logs of the flights of `vehicle`; flights under one second have none."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        save_vehicle(vehicle, folder / "vehicle.toml")
+        flown = replace(setting.collection, vehicle=str(folder / "vehicle.toml"))
+        listing = collect(flown, folder / "flights", Silent())
+        files = [folder / "flights" / row["file"] for row in listing["flights"] if row["file"]]
+        return [as_logged(log, setting, rng) for log in read_flights(files)[0]]
+
+
+def as_logged(log: FlightLog, setting: Setting, rng: np.random.Generator) -> FlightLog:
+    """Return `log` with the rows, the noise and the commands of the setting."""
+
+    def noisy(values: np.ndarray, sigma: float) -> np.ndarray:
+        kept = values[:: setting.every]
+        return kept + setting.noisy * sigma * rng.standard_normal(kept.shape)
+
+    def kept(values: np.ndarray | None) -> np.ndarray | None:
+        return None if values is None or not setting.commands else values[:: setting.every]
+
+    error = Rotation.from_rotvec(noisy(np.zeros((len(log.time_s), 3)), NOISE.attitude))
+    attitude = Rotation.from_quat(log.quat_wxyz[:: setting.every], scalar_first=True)
+    assert log.rotor_speed is not None
+    return replace(
+        log,
+        time_s=log.time_s[:: setting.every],
+        pos_w=noisy(log.pos_w, NOISE.pos),
+        quat_wxyz=(attitude * error).as_quat(scalar_first=True),
+        vel_w=noisy(log.vel_w, NOISE.vel),
+        rate_b=noisy(log.rate_b, NOISE.gyro),
+        rotor_speed=noisy(log.rotor_speed, NOISE.rotor),
+        thrust_cmd=kept(log.thrust_cmd),
+        rate_cmd_b=kept(log.rate_cmd_b),
+        extra={},
+    )
+
+
+def at_threshold(name: str, values: Any, vehicle: Vehicle, logs: Sequence[FlightLog]) -> Any:
+    """Return the effect's `values`, scaled to the threshold of relevance on these flights.
+
+    The size follows from the model's slopes along the flights. Force, torque and drift are divided
+    by their thresholds, and the largest ratio becomes one.
+    """
+    by_rotors = logs[0].thrust_cmd is None
+    windows, _ = cut(logs, vehicle, rotor_input=by_rotors)
+    assert windows is not None
+    space = make_space(vehicle)
+    indices = [k for k, entry in enumerate(space.entries) if entry.effect == name]
+    model = RolloutModel(vehicle, space, rotor_input=by_rotors, voltage=False)
+    start = start_estimate(model, windows)
+    slope = model.linearise(start.theta, start.free, windows, indices).slope
+    change = np.array([_number(values, space.entries[k]) for k in indices]) - start.theta[indices]
+    size = rollout_size(slope @ change, windows)
+    shares = [(s or 0.0) / limit for s, limit in zip(size, THRESHOLDS.relevance, strict=True)]
+    theta = start.theta.copy()
+    theta[indices] += change / max(shares)
+    return space.effects(theta)[name]
+
+
+def _number(values: Any, entry: FittedNumber) -> float:
+    """Return the number of an effect's `values` at the place of `entry`."""
+    return float(np.ravel(getattr(values, entry.parameter))[entry.component or 0])
+
+
+def main() -> None:
+    """Run the sets, and print a line for each and the shares."""
+    words = sys.argv[1:]
+    sets, seed, first = (int(v) for v in (*words, *("60", "6100000", "0")[len(words) :]))
+    keep_compiled()
+    clean, named = 0, 0
+    for number in range(first, first + sets):
+        rng = np.random.default_rng([seed, number])
+        setting = draw(number, rng, seed)
+        vehicle = load_vehicle(setting.collection.vehicle)
+        effect = str(rng.choice(IDENTIFIABLE))
+        values = hidden_values(effect, vehicle, rng)
+        logs = fly_logs(setting, vehicle, rng)
+        null = diagnosis_json(diagnose(logs, vehicle, seed=number))
+        hidden = at_threshold(effect, values, vehicle, logs)
+        logs = fly_logs(setting, with_effects(vehicle, {effect: hidden}), rng)
+        found = diagnosis_json(diagnose(logs, vehicle, seed=number))
+        names = [" or ".join([e["name"], *e["alternatives"]]) for e in found["effects"]]
+        is_clean = null["verdict"] == "no_gap"
+        is_named = any(effect in text.split(" or ") for text in names)
+        clean, named = clean + is_clean, named + is_named
+        small = " ".join(entry["name"] for entry in found["negligible"])
+        print(f"{number:3d} {_words(setting)}: {null['verdict']} "
+              f"{' '.join(e['name'] for e in null['effects'])} | {effect}: "
+              f"{'named' if is_named else 'missed'}, {found['verdict']} {'; '.join(names)}"
+              f"{small and f' (too small: {small})'}", flush=True)  # fmt: skip
+    print(share_line("clean sets with the verdict no_gap", clean, sets))
+    print(share_line("effects at the threshold that are named", named, sets))
+
+
+def _words(setting: Setting) -> str:
+    """Return the setting as text."""
+    flown = setting.collection
+    noise, drive = "noise" if setting.noisy else "exact", "cmd" if setting.commands else "rotors"
+    where = f"{flown.simulator} {flown.vehicle} {flown.track} {flown.difficulty}"
+    return f"{where} {100 // setting.every} Hz {noise} {drive}"
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(KeyboardInterrupt):
+        main()
