@@ -22,18 +22,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from poseless import IDENTIFIABLE, hidden_values, share_line
+from poseless import IDENTIFIABLE, hidden_values, outcome_of, share_line
 from scipy.spatial.transform import Rotation
 
 from eval.flights.simulate import SENSORS
 from eval.logs.flight_log import FlightLog, read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import Vehicle, with_effects
+from suite.blind.oracle.information import Column
 from suite.common.startup import keep_compiled
 from suite.common.work import Silent
 from suite.diagnose.data.windows import cut
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.estimate.parameters import FittedNumber, make_space
+from suite.diagnose.estimate.parameters import make_space
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.thresholds import THRESHOLDS
@@ -130,17 +131,14 @@ def at_threshold(name: str, values: Any, vehicle: Vehicle, logs: Sequence[Flight
     model = RolloutModel(vehicle, space, rotor_input=by_rotors, voltage=False)
     start = start_estimate(model, windows)
     slope = model.linearise(start.theta, start.free, windows, indices).slope
-    change = np.array([_number(values, space.entries[k]) for k in indices]) - start.theta[indices]
+    entries = [space.entries[k] for k in indices]
+    target = [Column(name, e.parameter, e.component or 0).value(values) for e in entries]
+    change = np.array(target) - start.theta[indices]
     size = rollout_size(slope @ change, windows)
     shares = [(s or 0.0) / limit for s, limit in zip(size, THRESHOLDS.relevance, strict=True)]
     theta = start.theta.copy()
     theta[indices] += change / max(shares)
     return space.effects(theta)[name]
-
-
-def _number(values: Any, entry: FittedNumber) -> float:
-    """Return the number of an effect's `values` at the place of `entry`."""
-    return float(np.ravel(getattr(values, entry.parameter))[entry.component or 0])
 
 
 def main() -> None:
@@ -162,12 +160,12 @@ def main() -> None:
         found = diagnosis_json(diagnose(logs, vehicle, seed=number))
         names = [" or ".join([e["name"], *e["alternatives"]]) for e in found["effects"]]
         is_clean = null["verdict"] == "no_gap"
-        is_named = any(effect in text.split(" or ") for text in names)
-        clean, named = clean + is_clean, named + is_named
+        outcome = outcome_of(effect, found["effects"])
+        clean, named = clean + is_clean, named + outcome.startswith("named")
         small = " ".join(entry["name"] for entry in found["negligible"])
         print(f"{number:3d} {_words(setting)}: {null['verdict']} "
               f"{' '.join(e['name'] for e in null['effects'])} | {effect}: "
-              f"{'named' if is_named else 'missed'}, {found['verdict']} {'; '.join(names)}"
+              f"{outcome}, {found['verdict']} {'; '.join(names)}"
               f"{small and f' (too small: {small})'}", flush=True)  # fmt: skip
     print(share_line("clean sets with the verdict no_gap", clean, sets))
     print(share_line("effects at the threshold that are named", named, sets))

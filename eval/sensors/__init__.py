@@ -98,9 +98,8 @@ def scale_model(name: str, values: Any, magnitude: Any) -> Any:
     sensor, changed = SENSORS.find(name), {}
     for parameter in sensor.parameters:
         if parameter.name in sensor.grows:
-            neutral: Any = parameter.neutral
-            low: Any = parameter.low
-            high: Any = parameter.high
+            bounds = (parameter.neutral, parameter.low, parameter.high)
+            neutral, low, high = map(float, bounds)  # pyrefly: ignore[bad-argument-type]
             value = getattr(values, parameter.name)
             scaled = neutral + magnitude * (value - neutral)
             if hasattr(scaled, "__array_namespace__"):

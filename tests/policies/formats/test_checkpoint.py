@@ -87,9 +87,7 @@ def test_a_changed_byte_of_the_weights_is_refused(tmp_path_factory, at, flip):
 @settings(max_examples=25)
 @given(
     key=st.sampled_from(["schema", "kind", "weights", "weights.sha256", "weights.bytes"]),
-    value=st.one_of(
-        st.none(), st.booleans(), st.floats(allow_nan=False), st.text("ab1"), st.just([])
-    ),
+    value=st.one_of(st.none(), st.booleans(), st.floats(allow_nan=False), st.text(), st.just([])),
 )
 def test_a_damaged_config_is_refused_by_key(tmp_path_factory, key, value):
     folder = save(tmp_path_factory.mktemp("key") / "c")

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from eval.envs.races import RaceConfig, Races
+from eval.quadrotor.vehicle_file import load_vehicle
 from suite.train.config import QuadrotorConfig
 from suite.train.ppo.environment import JaxRace
 from suite.train.rollout import world_keys
 from tests.support.training import boxes_only, small_config
-from tests.support.vehicles import PLAIN
 
-QUAD = QuadrotorConfig(PLAIN, attitude_hz=30.0, physics_hz=30.0)
+QUAD = QuadrotorConfig(load_vehicle("racer5"), attitude_hz=30.0, physics_hz=60.0)
 ENV = JaxRace(replace(small_config(), quadrotor=QUAD), time_limit_s=0.1)
 KEYS = jax.random.split(jax.random.key(1), 3)
 reset = jax.jit(jax.vmap(ENV.reset, (0, None)))
