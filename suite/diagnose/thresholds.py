@@ -78,6 +78,12 @@ class Thresholds:
     least_noise: tuple[float, ...] = (1e-5, 1e-5, 1e-4, 1e-4, 1e-3, 1e-2)
     """Lower limit of the noise of position [m], attitude [rad], velocity [m/s], rates [rad/s],
     accelerometer [m/s^2] and rotor speed [rad/s]. Rounding and the model's steps cause as much."""
+    command_spacing_s: float = 0.012
+    """Rows of commands further apart than this may lack commands in between [s]. Controllers give
+    commands at 100 Hz or more."""
+    held_share: float = 0.3
+    """Least residual of body rates and rotor speeds for commands to be lacking, as a share of the
+    difference that leaving out every second command makes."""
 
     relevance: tuple[float, float, float] = (0.05, 0.5, 0.025)
     """Sizes below which an effect is not reported: force per mass [m/s^2] (0.5 % of the weight),

@@ -146,6 +146,7 @@ def cut(
     integrator: str = "continuous",
     coarser: FlightWindows | None = None,
     only: Collection[int] | None = None,
+    fewer_commands: FlightWindows | None = None,
 ) -> tuple[FlightWindows | None, list[str]]:
     """Return the windows of `logs` (None if no flight has one) and warnings.
 
@@ -161,6 +162,7 @@ def cut(
         coarser: the windows that an earlier call returned. If given, the same ones are cut with
             steps of twice the length, from every second rotor speed and `with_hidden_torque`.
         only: numbers of the flights that are cut; all if not given.
+        fewer_commands: the same, with usual steps, but from every second command.
     """
     starts, warnings = list[tuple[int, int]](), list[str]()  # (flight, row) each
     states = [on_every_row(log, limits) for log in logs]
@@ -181,11 +183,12 @@ def cut(
     longest_s = 1.0 / vehicle.controller.frequency if integrator == "euler" else LONGEST_S
     if coarser is not None and integrator != "euler":
         longest_s *= 2.0
-    inputs = [_input_of(logs[number], row, vehicle, longest_s) for number, row in starts]
-    stride = 1 if coarser is None else 2
+    held = 1 if fewer_commands is None else 2
+    inputs = [_input_of(logs[number], row, vehicle, longest_s, held) for number, row in starts]
+    like, stride = coarser or fewer_commands, 1 if coarser is None else 2
     windows = [
         _window(logs[number], states[number], number, row, vehicle, rotor_input, one, stride)
-        for (number, row), one in zip(starts, _of_one_shape(inputs, coarser), strict=True)
+        for (number, row), one in zip(starts, _of_one_shape(inputs, like), strict=True)
     ]
     return FlightWindows(*(np.stack(field) for field in zip(*windows, strict=True))), warnings
 
@@ -245,8 +248,11 @@ class _Input(NamedTuple):
     command: np.ndarray
 
 
-def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float) -> _Input:
-    """Return the inputs of the window at `row`; if there are no commands, those of a hover."""
+def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, stride: int) -> _Input:
+    """Return the inputs of the window at `row`; if there are no commands, those of a hover.
+
+    Every `stride`-th command is used, and held until the next one that is.
+    """
     begin_s, period_s = log.time_s[row], 1.0 / vehicle.controller.frequency
     length_s = log.time_s[_rows(log, begin_s)[-1]] - begin_s
     time_s, command = log.time_s, np.tile([GRAVITY, 0.0, 0.0, 0.0], (len(log.time_s), 1))
@@ -260,6 +266,7 @@ def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float) -> _
         np.searchsorted(time_s, begin_s + length_s + 1e-9) + 1,
     )
     time_s, command = with_lost_rows(time_s[used] - begin_s, command[used])
+    command = command[np.arange(len(command)) // stride * stride]
 
     def grid(since_s: float, until_s: float) -> StepGrid:
         inside_s = time_s[(time_s > since_s + 1e-6) & (time_s < until_s - 1e-6)]

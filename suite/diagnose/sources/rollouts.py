@@ -36,13 +36,22 @@ from suite.diagnose.verdict.actuators import (
     integrator_of,
     rotors_are_input,
 )
-from suite.diagnose.verdict.gap import with_model_error
+from suite.diagnose.verdict.model_error import (
+    commands_are_slow,
+    with_held_commands,
+    with_model_error,
+)
 
 BASE_S, STRETCH_S = 5.0, 0.25
 """Estimated duration on two cores: fixed part, and for each stretch [s]."""
 MEASURE = (
     "RMS of slow errors of 1 s rollouts on held-out data, start free within its noise, over "
     "position, attitude, velocity and rates, in units of what measurement noise gives"
+)
+
+LACKING = (
+    "the drone received commands between the rows of the log, so differences that wrong times of "
+    "commands may cause count as noise: log every command, to find smaller effects"
 )
 
 
@@ -98,9 +107,15 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
     # Flights that a simulator flew with Euler steps, driven by commands, have no such error.
     has_error = integrator != "euler" or rotor_input
     coarser = take(windows_of(coarser=windows)[0], is_finite) if has_error else None
-    windows, linear = take(windows, is_finite), take(linear, is_finite)
+    all_windows, windows, linear = windows, take(windows, is_finite), take(linear, is_finite)
     if coarser is not None:
         limits = with_model_error(model, start.theta, windows, linear, coarser, limits)
+    if not rotor_input and commands_are_slow(logs, limits):
+        fewer = take(windows_of(fewer_commands=all_windows)[0], is_finite)
+        held = with_held_commands(model, start.theta, windows, linear, fewer, limits)
+        if held is not None:
+            limits = held
+            warnings.append(LACKING)
     if not given.chosen and is_hopeless(model, windows, linear, limits):
         given.say("no effect brings rollouts of 1 s near these flights: using force and torque")
         return None

@@ -10,11 +10,6 @@ noise. The plain errors from the measured start states are reported as well, in 
 Their noise floor is the noise of the start states, carried through the rollout by the model's
 Jacobian.
 
-The model's own numerical error is estimated by step doubling (Hairer, Norsett & Wanner 1993, Sec.
-II.4). A rollout with time steps of twice the length, and with every second rotor speed, differs
-from the usual rollout by several times the error of the usual one. The part of this difference that
-no change of the start state explains is a lower limit of the noise.
-
 The size of an effect is how much it changes these flights. With little noise every difference is
 significant, even the model's numerical errors. So an effect is not named, however small its
 p-value, if the upper end of the 95 % interval of its size is below all thresholds of relevance
@@ -24,13 +19,12 @@ p-value, if the upper end of the 95 % interval of its size is below all threshol
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from eval.effects.log_faults import pose_delay
-from suite.diagnose.data.colour import Noise, measured_noise
+from suite.diagnose.data.colour import Noise
 from suite.diagnose.data.whitening import (
     Linearisation,
     block_of,
@@ -225,45 +219,6 @@ def noise_floor(slope: np.ndarray, noise: np.ndarray) -> np.ndarray:
     entries of `noise` serve for both causes.
     """
     return np.sqrt(noise[:STATE] ** 2 + ((slope * noise) ** 2).sum(axis=-1))
-
-
-def with_model_error(
-    model: RolloutModel,
-    theta: np.ndarray,
-    windows: FlightWindows,
-    linear: Linearisation,
-    coarser: FlightWindows,
-    limits: Thresholds,
-) -> Thresholds:
-    """Return `limits` with the lower limits of the noise raised to the numerical error.
-
-    Args:
-        model: the model that simulates the windows.
-        theta: (P,) parameters at which `linear` was computed.
-        windows: W stretches.
-        linear: residuals and slopes of `windows` along all parameters and start numbers.
-        coarser: the same stretches with longer steps and fewer rotor speeds.
-        limits: thresholds of the diagnosis.
-    """
-    noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
-    whitening = make_whitening(linear, noise, windows, limits)
-    # Difference by longer steps, in units of noise, without changes of the start state.
-    difference = model.residual(theta, linear.offset, coarser) - linear.residual
-    finite = np.isfinite(difference).all(axis=(1, 2), keepdims=True)
-    difference = np.where(finite, difference, 0.0)
-    unexplained = block_of(whitening, linear._replace(residual=difference), (), windows).residual
-    _, rows, channels = difference.shape
-    over_noise = unexplained[:, : rows * channels].reshape(difference.shape)
-    sigma = np.where(np.isfinite(noise.sigma), noise.sigma, 0.0)
-    valid = np.asarray(windows.valid) & finite
-    energy = (np.where(valid, over_noise * sigma, 0.0) ** 2).sum(axis=(0, 1))
-    # Mean of each channel, and then of each group of channels (three or four of one sensor).
-    power = energy / np.maximum(valid.sum(axis=(0, 1)), 1)
-    least = [
-        max(floor, float(np.sqrt(power[channel].mean())))
-        for floor, channel in zip(limits.least_noise, SLICES.values(), strict=True)
-    ]
-    return replace(limits, least_noise=tuple(least))
 
 
 FORCE_S, TORQUE_S = 0.5, 0.1

@@ -1,0 +1,137 @@
+"""Estimates the model's own error in rollouts, and raises the noise floor to it.
+
+The numerical error is estimated by step doubling (Hairer, Norsett & Wanner 1993, Sec. II.4). A
+rollout with time steps of twice the length, and with every second rotor speed, differs from the
+usual rollout by several times the error of the usual one. The part of this difference that no
+change of the start state explains is a lower limit of the noise.
+
+Commands are held from one row of the log to the next. If the drone received commands between the
+rows, their times are wrong by up to the spacing of the rows. The error is estimated in the same
+way, with every second command. If one command was left out after each row, the true error is half
+of that. The share is estimated from the body rates and rotor speeds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from eval.logs.flight_log import FlightLog
+from suite.diagnose.data.colour import Noise, measured_noise
+from suite.diagnose.data.noise import at_least
+from suite.diagnose.data.sampling import own_spacing_s
+from suite.diagnose.data.whitening import Linearisation, block_of, make_whitening, slow_energy
+from suite.diagnose.data.windows import SLICES, FlightWindows
+from suite.diagnose.evidence.rollouts import RolloutModel
+from suite.diagnose.thresholds import Thresholds
+
+FAST = ("rates", "rotor speed")
+"""Groups of channels that follow a command within a few hundredths of a second."""
+
+
+def with_model_error(
+    model: RolloutModel,
+    theta: np.ndarray,
+    windows: FlightWindows,
+    linear: Linearisation,
+    coarser: FlightWindows,
+    limits: Thresholds,
+) -> Thresholds:
+    """Return `limits` with the lower limits of the noise raised to the model's error.
+
+    Args:
+        model: the model that simulates the windows.
+        theta: (P,) parameters at which `linear` was computed.
+        windows: W stretches.
+        linear: residuals and slopes of `windows` along all parameters and start numbers.
+        coarser: the same stretches with longer steps and fewer rotor speeds, or fewer commands.
+        limits: thresholds of the diagnosis.
+    """
+    noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
+    difference = _difference(model, theta, linear, coarser)
+    return _raised(_rms(difference, linear, noise, windows, limits), limits)
+
+
+def with_held_commands(
+    model: RolloutModel,
+    theta: np.ndarray,
+    windows: FlightWindows,
+    linear: Linearisation,
+    fewer: FlightWindows,
+    limits: Thresholds,
+) -> Thresholds | None:
+    """Return `limits` with the noise raised to the error of held commands; None without the error.
+
+    Body rates and rotor speeds follow a command at once. So their residuals, relative to their
+    change with `fewer`, limit the error's share of that change. With a small share, the log has
+    every command.
+
+    Args: see `with_model_error`; `fewer` are the same stretches with every second command.
+    """
+    noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
+    difference = _difference(model, theta, linear, fewer)
+    rms = _rms(difference, linear, noise, windows, limits)
+    shares = _rms(linear.residual, linear, noise, windows, limits) / np.maximum(rms, 1e-12)
+    fast = (s for name, s in zip(SLICES, shares, strict=True) if name in FAST and s > 0.0)
+    share = min(fast, default=0.0)
+    if share < limits.held_share:
+        return None
+    # The error accumulates along a window, so its slow part exceeds that of white noise.
+    rms, difference = min(share, 1.0) * rms, min(share, 1.0) * difference
+    raised = _raised(rms, limits)
+    noise = Noise(at_least(noise.sigma, raised), {})
+    whitening = make_whitening(linear, noise, windows, raised)
+    block = block_of(whitening, linear._replace(residual=difference), (), windows)
+    slow = slow_energy(whitening, block.residual).sum(axis=0)
+    expected = np.maximum(whitening.slow_freedom.sum(axis=0), 1e-9)
+    factor = [np.sqrt(max(slow[c].sum() / expected[c].sum(), 1.0)) for c in SLICES.values()]
+    return _raised(rms * np.array(factor), limits)
+
+
+def commands_are_slow(logs: Sequence[FlightLog], limits: Thresholds) -> bool:
+    """Return whether some log has commands in fewer rows than a drone usually receives them."""
+    return any(
+        own_spacing_s(log.time_s, log.rate_cmd_b) > limits.command_spacing_s
+        for log in logs
+        if log.rate_cmd_b is not None
+    )
+
+
+def _difference(
+    model: RolloutModel, theta: np.ndarray, linear: Linearisation, other: FlightWindows
+) -> np.ndarray:
+    """Return by how much the residuals (W, N, 19) of `other` differ; 0 where one diverges."""
+    difference = model.residual(theta, linear.offset, other) - linear.residual
+    finite = np.isfinite(difference).all(axis=(1, 2), keepdims=True)
+    return np.where(finite, difference, 0.0)
+
+
+def _rms(
+    difference: np.ndarray,
+    linear: Linearisation,
+    noise: Noise,
+    windows: FlightWindows,
+    limits: Thresholds,
+) -> np.ndarray:
+    """Return the RMS (6,) of the unexplained part of `difference` (W, N, 19), by sensor.
+
+    Unexplained is what no change of the start state gives. The entries are those of `SLICES`, in
+    units of the channels; 0 where nothing was measured.
+    """
+    whitening = make_whitening(linear, noise, windows, limits)
+    unexplained = block_of(whitening, linear._replace(residual=difference), (), windows).residual
+    _, rows, channels = difference.shape
+    over_noise = unexplained[:, : rows * channels].reshape(difference.shape)
+    sigma = np.where(np.isfinite(noise.sigma), noise.sigma, 0.0)
+    valid = np.asarray(windows.valid) & difference.any(axis=(1, 2), keepdims=True)
+    energy = (np.where(valid, over_noise * sigma, 0.0) ** 2).sum(axis=(0, 1))
+    # Mean of each channel, and then of each group of channels (three or four of one sensor).
+    power = energy / np.maximum(valid.sum(axis=(0, 1)), 1)
+    return np.array([np.sqrt(power[channel].mean()) for channel in SLICES.values()])
+
+
+def _raised(error: np.ndarray, limits: Thresholds) -> Thresholds:
+    """Return `limits` with lower limits of the noise of at least `error` (6,)."""
+    return replace(limits, least_noise=tuple(np.maximum(limits.least_noise, error).tolist()))
