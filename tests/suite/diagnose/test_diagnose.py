@@ -18,11 +18,14 @@ from eval.flights.simulate import fly as fly_ways
 from eval.flights.trajectory import ordinary_flights
 from eval.quadrotor.loops import KINDS
 from suite.common.report import html
+from suite.diagnose.data.sampling import HELD, MEASURED
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.page import page
+from suite.diagnose.sources.rollouts import LACKING
 from suite.diagnose.thresholds import Thresholds
+from tests.support import diagnosis_flights
 from tests.support.broken_logs import BREAKAGES
 from tests.support.diagnosis_flights import fly, fly_all
 from tests.support.real_flights import Pendulum
@@ -269,6 +272,24 @@ def test_without_noise_the_models_own_error_is_no_finding(vehicle, drive):
     found = diagnosis_json(diagnose(logs, vehicle, drive=drive))
     assert (found["verdict"], found["effects"]) == ("no_gap", [])
     assert all(not one["relevant"] for one in found["negligible"])
+
+
+def test_commands_between_the_rows_of_a_log_are_no_effect(monkeypatch):
+    """If the log has every command, its slow rows limit nothing."""
+    logs = flights(LAGGED, duration_s=5.0, noise=0.1)
+    found = diagnose([every_second_row(log) for log in logs], LAGGED, drive="commands")
+    assert (found.verdict.label, found.named) == ("no_gap", [])
+    assert LACKING in found.warnings
+
+    monkeypatch.setattr(diagnosis_flights, "EVERY", 10)
+    found = diagnose(flights(LAGGED, duration_s=5.0, noise=0.1), LAGGED, drive="commands")
+    assert (found.verdict.label, found.named) == ("no_gap", [])
+    assert LACKING not in found.warnings
+
+
+def every_second_row(log):
+    rows = {name: getattr(log, name) for name in ("time_s", *MEASURED, *HELD)}
+    return replace(log, **{name: v[::2] for name, v in rows.items() if v is not None})
 
 
 @pytest.mark.slow
