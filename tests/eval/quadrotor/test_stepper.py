@@ -84,14 +84,14 @@ FAST = Motion(np.array([0.0, 0.0, 2.0]), np.eye(3), np.array([6.0, 1.0, 0.0]), n
 
 
 @pytest.mark.parametrize("name", ["reference", "racer5"])
-def test_a_second_of_aggressive_flight_is_mujocos(name):
+def test_half_a_second_of_aggressive_flight_is_mujocos(name):
     """Also: the model that holds the whole catalogue, unused, is the vehicle's own."""
     vehicle = load_vehicle(name)
-    commands = aggressive_commands(500)
+    commands = aggressive_commands(250)
     rows, state = fly_mujoco(vehicle, FAST, commands)
     assert np.linalg.norm(rows[:, 10:], axis=1).max() > 5.0
     flight, last = fly(fit_plant(vehicle, {}), FAST, commands)
-    # Rounding only, grown over 500 steps: both step the same equations in double precision.
+    # Rounding only, grown over 250 steps: both step the same equations in double precision.
     assert_same_flight(rows, flight, 1e-10)
     np.testing.assert_allclose(last.rotor_speed, state.rotor_speed, rtol=1e-9)
 
