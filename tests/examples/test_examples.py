@@ -48,7 +48,7 @@ IN_SHORT = {
     "own_track": r"\d gates, \w+",
     "own_effect": r"0\.0 N/m: \d gates, timeout\n(.*\n)*0\.4 N/m: \d gates",
 }
-"""What these say where trials end after a second."""
+"""What these say where trials end after 0.6 s."""
 
 
 def source(name):
@@ -82,8 +82,8 @@ def test_the_example_runs(name, short, tmp_path, monkeypatch, capsys):
     """In this process, where jax and what is compiled are there already; warnings are errors."""
     args, said, written = EXAMPLES[name]
     if short:
-        cut_short(monkeypatch, 1.0)
-        made = partial(suite.make_env, rules=Rules(time_limit_s=1.0))
+        cut_short(monkeypatch, 0.6)
+        made = partial(suite.make_env, rules=Rules(time_limit_s=0.6))
         monkeypatch.setattr(suite, "make_env", made)
         said = IN_SHORT.get(name, said).replace("[1-8] gates", r"\d gates")
     program = str(ROOT / "examples" / f"{name}.py")

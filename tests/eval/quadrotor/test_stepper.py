@@ -291,17 +291,24 @@ MOVING = Motion(0.0 * ONES, np.eye(3)[None], ONES, 0.0 * ONES)
 by_jax = jax.jit(continuous.fly, static_argnums=6)
 
 
-def flown(length_s, integrator="continuous", duration_s=0.6):
-    """Fly a turn with commands that change every 0.02 s, the loop looking as often."""
+FINEST_S = 0.00025
+
+
+def flown(length_s, duration_s=0.3):
+    """Fly a turn with commands that change every 0.02 s, the loop looking as often.
+
+    Steps of no length fill up what is flown, so that all lengths are one program.
+    """
     plant, count = make_plant(TRUTH, DT), round(duration_s / length_s)
-    time = np.arange(count) * length_s
+    time = np.minimum(np.arange(round(duration_s / FINEST_S)), count) * length_s
     held = np.floor(time / 0.02 + 1e-9) * 0.02
     rate_b = np.stack([3 * np.sin(9 * held), 2 * np.cos(7 * held), 0.5 + 0 * held], axis=-1)
     command = Command((11 + 3 * np.sin(5 * held))[:, None], rate_b[:, None])
     looks = np.abs(time / 0.02 - np.rint(time / 0.02)) < 1e-9
-    steps = Steps(*(x[:, None] for x in (0 * time + length_s, looks, 0 * time)))
+    length = np.diff(time, append=duration_s)
+    steps = Steps(*(x[:, None] for x in (length, looks & (length > 0.0), 0 * time)))
     speed = hover_state(plant, (1,)).rotor_speed
-    return by_jax(plant, MOVING, steps, Inputs(command), speed, np.zeros(1), integrator)
+    return by_jax(plant, MOVING, steps, Inputs(command), speed, np.zeros(1), "continuous")
 
 
 def end_of(flight):
@@ -309,9 +316,9 @@ def end_of(flight):
 
 
 def test_half_the_step_is_a_quarter_of_the_error():
-    fine = end_of(flown(0.000125))
+    fine = end_of(flown(FINEST_S))
     coarse, half = (np.abs(end_of(flown(h)) - fine).max() for h in (0.004, 0.002))
-    assert coarse < 2e-3 and 3.0 < coarse / half < 5.0
+    assert coarse < 1e-4 and 3.0 < coarse / half < 5.0
 
 
 def test_euler_steps_are_the_steppers():
