@@ -8,6 +8,7 @@ import numpy as np
 import eval.judging.judge
 import suite.train.run
 from eval.worlds.trial import Rules
+from suite.loop.config import RECORDED_FROM
 
 
 class Small:
@@ -24,8 +25,8 @@ class Small:
         monkeypatch.setattr(suite.train.run, "make_update", self.make_update)
 
     def fly(self, policy, trials, vehicle, world, options, on_result, *rest, **more):
-        # Flights that are recorded are fitted, which takes longer ones.
-        seconds = self.recorded_s if rest or more.get("record") else 0.3
+        # Only flights for the fits have such seeds, and have to be longer.
+        seconds = self.recorded_s if trials[0].seed >= RECORDED_FROM else 0.2
         options = replace(options, slots=4, rules=Rules(time_limit_s=seconds))
 
         def keep(result, flight):
