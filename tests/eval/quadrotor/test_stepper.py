@@ -288,10 +288,8 @@ TRUTH = with_effects(with_lag(PLAIN, 0.03), linear_drag=((0.4, 0.5, 0.2),),
 DT = 0.002
 ONES = np.ones((1, 3))
 MOVING = Motion(0.0 * ONES, np.eye(3)[None], ONES, 0.0 * ONES)
-by_jax = jax.jit(continuous.fly, static_argnums=6)
-
-
 FINEST_S = 0.00025
+by_jax = jax.jit(continuous.fly, static_argnums=6)
 
 
 def flown(length_s, duration_s=0.3):

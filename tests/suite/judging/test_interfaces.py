@@ -53,9 +53,7 @@ def test_modules_in_the_working_folder_do_not_stand_for_ours_or_pythons(tmp_path
     assert done.returncode == 0 and "mine" not in done.stderr, done.stderr
 
 
-def test_check_reports_the_contract_and_a_file_that_says_nothing_and_is_unscaled(
-    tmp_path, monkeypatch
-):
+def test_check_reports_the_contract_and_an_unscaled_file_that_says_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(checking, "TIME_LIMIT_S", 1.5)
     answer = check.run(check.Config(policy="race-small", trials=1), Quiet())
     assert answer["findings"] == [] and answer["contract"]["digest"]
