@@ -35,16 +35,22 @@ def main(steps: int) -> None:
         plant = fit_plant(vehicle, {"mass_offset": MassOffset(mass)}, DT)
         return rollout(plant, rest, inputs).motion.pos_w[-1]
 
-    end_w, jacobian = jax.jit(last_pos_w), jax.jit(jax.jacfwd(last_pos_w))
+    @jax.jit
+    def end_and_slope_w(mass: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return `last_pos_w` and its derivative with respect to the mass, (3,) [m/kg]."""
+        return jax.jvp(last_pos_w, (mass,), (jnp.ones_like(mass),))
+
     true_mass = 0.06
-    goal_w = end_w(jnp.asarray(true_mass))
-    mass = jnp.asarray(0.0)
+    goal_w, _ = end_and_slope_w(jnp.float32(true_mass))
+    mass = jnp.float32(0.0)
     for step in range(steps):
-        error, slope = end_w(mass) - goal_w, jacobian(mass)
+        end_w, slope = end_and_slope_w(mass)
+        error = end_w - goal_w
         print(f"{step}: {float(mass):.5f} kg, {float(jnp.linalg.norm(error)):.2e} m off")
         mass = mass - slope @ error / (slope @ slope)
-    differences = (end_w(mass + 1e-2) - end_w(mass - 1e-2)) / 2e-2
-    exact, approximate = float(jacobian(mass)[2]), float(differences[2])
+    ahead_w, behind_w = end_and_slope_w(mass + 1e-2)[0], end_and_slope_w(mass - 1e-2)[0]
+    differences = (ahead_w - behind_w) / 2e-2
+    exact, approximate = float(end_and_slope_w(mass)[1][2]), float(differences[2])
     print(f"{float(mass):.5f} kg; the truth is {true_mass} kg")
     print(f"d z / d mass: {exact:.3f} m/kg, by differences {approximate:.3f}")
 

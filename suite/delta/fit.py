@@ -158,7 +158,9 @@ def _descend(
 
     rng = np.random.default_rng(config.seed)
     count = len(windows.pos_w)
-    variables, state = start, optimizer.init(start)
+    # Without weak types, which an update would change, so that `update` is compiled once.
+    variables = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), start)
+    state = optimizer.init(variables)
     for iteration in range(iterations):
         chosen = rng.choice(count, min(config.batch, count), replace=False)
         batch = jax.tree.map(itemgetter(chosen), windows)

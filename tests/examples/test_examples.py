@@ -21,8 +21,10 @@ from policies.formats import torch_file
 from suite.commands import train as train_command
 from suite.delta.run import flight_files
 from suite.diagnose import run as diagnose_run
+from suite.train import run as train_run
 from suite.train.overrides import override
 from tests.support.judged_cells import cut_short
+from tests.support.loops import made_update
 from tests.support.policy_files import InProcess
 
 RECIPE = train_command.named_recipe
@@ -48,7 +50,7 @@ IN_SHORT = {
     "own_track": r"\d gates, \w+",
     "own_effect": r"0\.0 N/m: \d gates, timeout\n(.*\n)*0\.4 N/m: \d gates",
 }
-"""What these say where trials end after a second."""
+"""What these say where trials end after 0.6 s."""
 
 
 def source(name):
@@ -82,9 +84,11 @@ def test_the_example_runs(name, short, tmp_path, monkeypatch, capsys):
     """In this process, where jax and what is compiled are there already; warnings are errors."""
     args, said, written = EXAMPLES[name]
     if short:
-        cut_short(monkeypatch, 1.0)
-        made = partial(suite.make_env, rules=Rules(time_limit_s=1.0))
+        cut_short(monkeypatch, 0.6)
+        made = partial(suite.make_env, rules=Rules(time_limit_s=0.6))
         monkeypatch.setattr(suite, "make_env", made)
+        # In full it is compiled for seconds, as in tests/suite/train/test_run.py.
+        monkeypatch.setattr(train_run, "make_update", partial(made_update, trained := []))
         said = IN_SHORT.get(name, said).replace("[1-8] gates", r"\d gates")
     program = str(ROOT / "examples" / f"{name}.py")
     monkeypatch.setattr(sys, "argv", [program, *args])
@@ -98,6 +102,7 @@ def test_the_example_runs(name, short, tmp_path, monkeypatch, capsys):
     assert "arning" not in err, err
     for file in written:
         assert (tmp_path / file).stat().st_size > 0
+    assert not short or len(trained) == (name == "train_and_judge")
 
 
 def diagnosed(config, console):

@@ -18,7 +18,7 @@ import sys
 import pytest
 from suite.cli import main
 from tests.support.judged_cells import cut_short
-cut_short(pytest.MonkeyPatch(), 1.0)
+cut_short(pytest.MonkeyPatch(), 0.4)
 for line in sys.stdin.read().splitlines():
     code = main([*line.split(), "--json"])
     if code:

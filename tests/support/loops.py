@@ -1,6 +1,7 @@
 """Loops made cheap: trials cut short, a stand-in for the gradient step, stops where asked for."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import numpy as np
@@ -8,6 +9,23 @@ import numpy as np
 import eval.judging.judge
 import suite.train.run
 from eval.worlds.trial import Rules
+from suite.loop.config import RECORDED_FROM
+
+
+def made_update(trained, config, delta=None, begin=0):
+    """Return a stand-in for the trainer's update, which appends what it got to `trained`."""
+    numbers = {"loss": 1.0, "gates": 2.0, "collided": 0.5, "speed": 3.0}
+
+    def update(state, worlds):
+        # A lean that depends on the tracks and, with a correction, on that.
+        push = 1e-3 * float(np.asarray(worlds.pos_w)[0, 0])
+        if delta is not None:
+            push += 1e-2 + float(np.ravel(delta[min(delta)])[0])
+        params = jax.tree.map(lambda leaf: leaf + 1e-2 * push, state.params)
+        trained.append((config, delta is not None, np.asarray(worlds.pos_w)))
+        return state._replace(params=params, iteration=state.iteration + 1), numbers
+
+    return update
 
 
 class Small:
@@ -21,11 +39,11 @@ class Small:
         self.stop_after: int | None = None
         self._fly = eval.judging.judge.fly
         monkeypatch.setattr(eval.judging.judge, "fly", self.fly)
-        monkeypatch.setattr(suite.train.run, "make_update", self.make_update)
+        monkeypatch.setattr(suite.train.run, "make_update", partial(made_update, self.trained))
 
     def fly(self, policy, trials, vehicle, world, options, on_result, *rest, **more):
-        # Flights that are recorded are fitted, which takes longer ones.
-        seconds = self.recorded_s if rest or more.get("record") else 0.3
+        # Only flights for the fits have such seeds, and have to be longer.
+        seconds = self.recorded_s if trials[0].seed >= RECORDED_FROM else 0.2
         options = replace(options, slots=4, rules=Rules(time_limit_s=seconds))
 
         def keep(result, flight):
@@ -35,17 +53,3 @@ class Small:
                 raise KeyboardInterrupt
 
         return self._fly(policy, trials, vehicle, world, options, keep, *rest, **more)
-
-    def make_update(self, config, delta=None, begin=0):
-        numbers = {"loss": 1.0, "gates": 2.0, "collided": 0.5, "speed": 3.0}
-
-        def update(state, worlds):
-            # A lean that depends on the tracks and, with a correction, on that.
-            push = 1e-3 * float(np.asarray(worlds.pos_w)[0, 0])
-            if delta is not None:
-                push += 1e-2 + float(np.ravel(delta[min(delta)])[0])
-            params = jax.tree.map(lambda leaf: leaf + 1e-2 * push, state.params)
-            self.trained.append((config, delta is not None, np.asarray(worlds.pos_w)))
-            return state._replace(params=params, iteration=state.iteration + 1), numbers
-
-        return update

@@ -88,7 +88,7 @@ def pursue(policy, observation):
     ],
 )
 def test_environments_fly_what_the_judge_flies(trial, spec):
-    rules, policy = Rules(time_limit_s=1.6), Pursuit(spec=spec)
+    rules, policy = Rules(time_limit_s=1.0), Pursuit(spec=spec)
     options = JudgeOptions(slots=1, rules=rules)
     (expected,) = fly(policy, [trial], load_vehicle("reference"), options=options)
     env = RaceEnv(

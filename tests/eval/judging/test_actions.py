@@ -18,7 +18,7 @@ from tests.support.courses import end_of, fly_on, straight
 from tests.support.pilots import Pursuit, Steady
 
 VEHICLE = load_vehicle("reference")
-RULES = Rules(time_limit_s=1.5)
+RULES = Rules(time_limit_s=0.8)
 
 
 def flown(policy, world="mujoco", track=None, rules=RULES, vehicle=VEHICLE):
@@ -37,12 +37,11 @@ def test_the_first_action_of_every_kind_carries_the_weight_and_turns_nothing():
         np.testing.assert_allclose(first_action(action, VEHICLE), wanted)
 
 
-@pytest.mark.parametrize("world", ["mujoco", "reference"])
 @pytest.mark.parametrize("kind", ["ctbr", "motors"])
-def test_hovering_by_any_kind_of_action_stays_where_it_is(kind, world):
+def test_hovering_by_any_kind_of_action_stays_where_it_is(kind):
     action = ActionSpec(kind, motors="speed")
     hover = Steady(tuple(first_action(action, VEHICLE)), PolicySpec(action=action))
-    result = flown(hover, world)
+    result = flown(hover)
     assert result.ended_by == "timeout" and result.v_max < 0.1 and result.limited_actions == 0
 
 
@@ -55,13 +54,13 @@ def climbing(kind):
 
 @pytest.mark.parametrize("kind", ["ctbr", "motors"])
 def test_worlds_fly_commands_and_motors_alike(kind):
-    policy, rules = climbing(kind), Rules(time_limit_s=0.6)
+    policy, rules = climbing(kind), Rules(time_limit_s=0.4)
     ours = flown(policy, "mujoco", straight(height=30.0), rules)
-    assert ours.v_max > 0.5
-    for world, off in (("reference", 0.0), ("rotorpy", 0.05)):
+    assert ours.v_max > 0.2
+    for world, off in (("reference", 0.0), ("rotorpy", 0.01)):
         theirs = flown(policy, world, straight(height=30.0), rules)
         np.testing.assert_allclose(end_of(theirs), end_of(ours), rtol=0, atol=off, err_msg=world)
-        assert theirs.v_max == pytest.approx(ours.v_max, abs=off)
+        assert theirs.v_max == pytest.approx(ours.v_max, abs=2 * off)
 
 
 @pytest.mark.slow
@@ -141,9 +140,11 @@ def test_mistakes_of_unit_are_reported_from_the_flights(change, action, fault):
 
 
 def test_a_scaled_policy_flies_as_the_plain_one():
-    plain = flown(Changed(lambda a: a))
-    scaled = flown(Changed(lambda a: a / 20, PolicySpec(action=ActionSpec(scale=(20.0,)))))
-    assert scaled.gates_passed == plain.gates_passed
+    track = straight((0.5, 4.0))
+    plain = flown(Changed(lambda a: a), track=track)
+    spec = PolicySpec(action=ActionSpec(scale=(20.0,)))
+    scaled = flown(Changed(lambda a: a / 20, spec), track=track)
+    assert scaled.gates_passed == plain.gates_passed == 1
     assert scaled.pos_x == pytest.approx(plain.pos_x, abs=1e-4)
 
 

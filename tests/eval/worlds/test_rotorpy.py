@@ -94,7 +94,7 @@ def test_what_the_vehicle_loses_is_said(stand_in):
 
 
 def test_one_trial_is_finished_and_another_ends_at_a_wall():
-    clear, walled = straight((1.0, 2.0), name="clear"), straight((4.0, 5.0), 1.2, name="walled")
+    clear, walled = straight((0.6, 1.2), name="clear"), straight((4.0, 5.0), 0.8, name="walled")
     record = Record(depth=True)
     (result, hit), (flight, _) = flown(Pursuit(3.0), clear, walled, rules=RULES, record=record)
     assert (hit.ended_by, hit.collided_with) == ("collision", "the wall")

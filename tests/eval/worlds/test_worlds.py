@@ -61,7 +61,7 @@ def test_contact_with_the_wall_or_the_ground_is_a_collision(world):
 def test_a_load_on_a_line_is_the_trials_own():
     """It begins hanging in each slot's trial, whatever flew there before and flies beside it."""
     loaded = replace(VEHICLE, effects={**VEHICLE.effects, "slung_load": SlungLoad(0.1, 0.5)})
-    how = {"seeds": (0, 1, 2), "workers": 1, "rules": Rules(time_limit_s=0.8)}
+    how = {"seeds": (0, 1, 2), "workers": 1, "rules": Rules(time_limit_s=0.6)}
 
     def flown(vehicle, world, slots):
         track, how["slots"] = straight(height=3.0), slots
@@ -69,7 +69,7 @@ def test_a_load_on_a_line_is_the_trials_own():
         return [(r.pos_x, r.pos_y, r.pos_z, r.v_max, r.gates_passed) for r in found]
 
     ours = flown(loaded, "mujoco", 2)
-    assert ours == flown(loaded, "mujoco", 1) == flown(loaded, "reference", 3)
+    assert ours == flown(loaded, "reference", 3)
     assert ours[0] == ours[1] == ours[2], "the same flight in a slot that is used again"
     without = flown(VEHICLE, "mujoco", 3)
     assert ours[0][2] < without[0][2] - 0.1, "nothing makes up for its weight"
@@ -206,9 +206,9 @@ MOTIONS = {
 }
 """Actions [m/s^2], and where the gate is that the heading follows [m]."""
 STEP_S = 0.002
-EULER_M, EULER_SPEED, EULER_QUAT = 0.010, 0.015, 0.012
-"""MuJoCo's Euler steps are of order 1: after a second of up to 1 g they are up to dt/2 g 1 s =
-9.8 mm from continuous motion; speed and attitude go by the same step, through the loops. RotorPy's
+EULER_M, EULER_SPEED, EULER_QUAT = 0.005, 0.0075, 0.006
+"""MuJoCo's Euler steps are of order 1: after 0.5 s of up to 1 g they are up to dt/2 g 0.5 s =
+4.9 mm from continuous motion; speed and attitude go by the same step, through the loops. RotorPy's
 steps are of order 4, and nowhere near that."""
 
 
@@ -253,10 +253,12 @@ def test_mjx_steps_as_mujoco_does(motion):
 
 @each_motion
 def test_rotorpy_steps_as_mujoco_does_but_for_the_length_of_mujocos_steps(motion):
-    (_, ours), (_, theirs) = by_mujoco(motion), moved("rotorpy", motion)
-    assert np.abs(ours.pos_w - theirs.pos_w).max() < EULER_M
-    assert np.abs(ours.vel_w - theirs.vel_w).max() < EULER_SPEED
-    assert np.abs(ours.quat_wxyz - theirs.quat_wxyz).max() < EULER_QUAT
+    (_, ours), (_, theirs) = by_mujoco(motion), moved("rotorpy", motion, seconds=0.5)
+    rows = len(theirs.time_s)
+    np.testing.assert_allclose(theirs.time_s, ours.time_s[:rows], atol=1e-9)
+    assert rows == 51 and np.abs(ours.pos_w[:rows] - theirs.pos_w).max() < EULER_M
+    assert np.abs(ours.vel_w[:rows] - theirs.vel_w).max() < EULER_SPEED
+    assert np.abs(ours.quat_wxyz[:rows] - theirs.quat_wxyz).max() < EULER_QUAT
 
 
 @pytest.mark.slow
@@ -280,7 +282,7 @@ def test_what_differs_from_rotorpy_halves_with_the_step(motion):
 
 def test_rotorpy_falls_as_continuous_equations_say():
     """Rotors that run down from a hover with lag tau push with g exp(-2 t / tau)."""
-    tau, end = 0.03, 0.5
+    tau, end = 0.03, 0.3
     _, flight = moved("rotorpy", "fall", vehicle=with_lag(PLAIN, tau), seconds=end)
     gone = tau / 2 * (1 - math.exp(-2 * end / tau))
     assert flight.vel_w[-1, 2] == pytest.approx(9.81 * (gone - end), abs=1e-4)

@@ -123,7 +123,7 @@ def test_what_does_not_exist_is_found():
 @pytest.mark.parametrize("where", [where for where, (marked, _) in BLOCKS.items() if marked])
 def test_marked_commands_run(where, tmp_path, monkeypatch, capfd):
     """One after the other in this process, where what the first compiles the next one has."""
-    cut_short(monkeypatch, 1.0)
+    cut_short(monkeypatch, 0.6)
     monkeypatch.chdir(tmp_path)
     for program, *words in _commands(BLOCKS[where][1]):
         assert program == "suite" and cli.main(words) == 0, (words, capfd.readouterr().err)

@@ -54,7 +54,7 @@ def push(vel_b, action_b):
 def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass():
     """As many flights are held out as are fitted: the errors of both are one program."""
     logs = fly(nominal_model(PHYSICS), 8, extra_b=push)
-    known, held_out = (cut_windows(part, 0.6, 0.15) for part in (logs[:4], logs[4:]))
+    known, held_out = (cut_windows(part, 0.6, 0.3) for part in (logs[:4], logs[4:]))
     shown = []
     result = fit_point_mass(CONFIG, PHYSICS, known, held_out, lambda *words: shown.append(words))
     assert result.without.position_m > 0.1

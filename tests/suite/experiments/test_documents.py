@@ -1,4 +1,4 @@
-"""Documents at a small size: flights are a fifth of a second long, a few at a time."""
+"""Documents at a small size: flights are a tenth of a second long, a few at a time."""
 
 import json
 from dataclasses import replace
@@ -26,7 +26,7 @@ class Sky:
         monkeypatch.setattr(judging, "usable_cores", lambda: 1)
 
     def fly(self, task, share):
-        options = replace(task.options, slots=8, rules=Rules(time_limit_s=0.2))
+        options = replace(task.options, slots=8, rules=Rules(time_limit_s=0.1))
         for index, result, flight in self._fly(replace(task, options=options), share):
             self.flown.append((task.policy.name, task.vehicle, options.sensors, result.trial))
             yield index, result, flight

@@ -16,6 +16,7 @@ from policies.formats.export import export_module
 from policies.spec import PolicySpec
 from suite.commands import check
 from suite.common.console import Quiet
+from suite.judging import checking
 from suite.judging.trials import _in_millimetres
 from tests.support.courses import straight
 
@@ -52,7 +53,8 @@ def test_modules_in_the_working_folder_do_not_stand_for_ours_or_pythons(tmp_path
     assert done.returncode == 0 and "mine" not in done.stderr, done.stderr
 
 
-def test_check_reports_the_contract_and_a_file_that_says_nothing_and_is_unscaled(tmp_path):
+def test_check_reports_the_contract_and_an_unscaled_file_that_says_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(checking, "TIME_LIMIT_S", 1.5)
     answer = check.run(check.Config(policy="race-small", trials=1), Quiet())
     assert answer["findings"] == [] and answer["contract"]["digest"]
     with pytest.raises(ValueError, match="nothing to check"):

@@ -95,15 +95,15 @@ def test_a_run_does_not_say_itself_that_it_is_to_be_trusted(pilots, tmp_path, ca
 
 def test_a_trial_ends_at_the_time_that_is_given_and_is_seen_so_again(pilots, tmp_path, capfd):
     out, logs = tmp_path / "out", tmp_path / "logs"
-    asked = ("--time-limit-s 1.2", *ONE.split(), pilots["pursuit"])
+    asked = ("--time-limit-s 0.6", *ONE.split(), pilots["pursuit"])
     assert evaluate(out, *asked) == 0
     (row,) = read_trials(out / "trials.parquet")
-    assert (row.ended_by, row.time_s) == ("timeout", 1.2)
+    assert (row.ended_by, row.time_s) == ("timeout", 0.6)
     assert run("view --out", tmp_path / "seen", out) == 0
-    assert "timeout after 1.2 s" in capfd.readouterr().out
+    assert "timeout after 0.6 s" in capfd.readouterr().out
     assert run("collect --difficulty 0 --out", logs, *asked[0].split(), *asked[1:]) == 0
     listed = json.loads((logs / "flights.json").read_text())
-    assert [flight["time_s"] for flight in listed["flights"]] == [1.2]
+    assert [flight["time_s"] for flight in listed["flights"]] == [0.6]
     words = refused(capfd, "eval --time-limit-s 0 --out", out, *asked[1:])
     assert "--time-limit-s is 0.0, allowed is" in words
 

@@ -144,9 +144,9 @@ def test_a_policy_is_trained_under_a_delta_action_that_is_no_part_of_its_state(w
 
 
 def test_thirty_iterations_on_an_easy_course_reduce_the_loss(tmp_path, monkeypatch):
-    """Eight worlds without obstacles, the same every time: there is nothing to gain but speed."""
+    """Four worlds without obstacles, the same every time: there is nothing to gain but speed."""
     optimizer = {"iterations": 30, "rate": 1e-2, "warmup": 3}
-    config = small_config(8, 24, optimizer=optimizer, difficulty=(0.0, 0.0), rest_share=1.0)
+    config = small_config(4, 24, optimizer=optimizer, difficulty=(0.0, 0.0), rest_share=1.0)
     worlds = boxes_worlds(config)
     boxes = worlds.scene.boxes
     gone = boxes._replace(center_w=boxes.center_w - np.array([0, 0, 1000], np.float32))

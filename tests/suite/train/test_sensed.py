@@ -25,7 +25,7 @@ def sensed(**changes):
     return replace(SMALL, sensors=replace(ALL, **changes))
 
 
-def seen(config, steps=2):
+def seen(config, steps=3):
     """Return a function (worlds, start) of what is seen of a drone that moves on, and both."""
     observer = make_observer(config)
     worlds = boxes_worlds(config)
@@ -46,28 +46,34 @@ def seen(config, steps=2):
     return of, worlds, start
 
 
-def test_at_magnitude_nothing_the_truth_is_seen():
-    of, perfect, state = seen(sensed(perfect_share=1.0, magnitude=(1.0, 1.0)))
-    of = jax.jit(of)
+@pytest.fixture(scope="module")
+def shown():
+    """Return a function (worlds, start) of what is seen, and slopes by pos_w of its sums."""
+    of = seen(sensed())[0]
+
+    def sums(pos_w, worlds, state):
+        found = of(worlds, state._replace(pos_w=pos_w))
+        return (found.state.sum(), found.image.sum()), found
+
+    both = jax.jit(jax.jacrev(sums, has_aux=True))
+    return lambda worlds, state: both(state.pos_w, worlds, state)[::-1]
+
+
+def test_at_magnitude_nothing_the_truth_is_seen(shown):
+    _, perfect, state = seen(sensed(perfect_share=1.0, magnitude=(1.0, 1.0)))
     noisy = seen(sensed(perfect_share=0.0, magnitude=(1.0, 1.0)))[1]
     without, worlds, _ = seen(SMALL)
-    one, none, last = of(perfect, state), jax.jit(without)(worlds, state), of(noisy, state)
+    one, last = (shown(each, state)[0] for each in (perfect, noisy))
+    none = jax.jit(without)(worlds, state)
     np.testing.assert_allclose(one.state, none.state, atol=2e-5)
     np.testing.assert_allclose(one.image, none.image, atol=2e-5)
     assert np.ptp(last.state[-1] - none.state[-1]) > 1e-2
     assert np.ptp(last.image[-1] - none.image[-1]) > 1e-2
 
 
-def test_the_state_carries_a_finite_gradient_and_the_image_none():
-    of, worlds, state = seen(sensed(perfect_share=0.0, magnitude=(2.0, 2.0)), steps=3)
-
-    @jax.jit
-    @jax.jacrev
-    def slopes(pos_w):
-        shown = of(worlds, state._replace(pos_w=pos_w))
-        return shown.state.sum(), shown.image.sum()
-
-    of_state, of_image = map(np.array, slopes(state.pos_w))
+def test_the_state_carries_a_finite_gradient_and_the_image_none(shown):
+    _, worlds, state = seen(sensed(perfect_share=0.0, magnitude=(2.0, 2.0)))
+    of_state, of_image = map(np.array, shown(worlds, state)[1])
     assert np.isfinite(of_state).all() and np.abs(of_state).max() > 0.1
     assert not of_image.any()
 

@@ -119,8 +119,7 @@ def test_a_mesh_has_its_solids_name_lies_on_it_and_fills_it():
     assert [name for name, _ in meshes] == list(track.names)
     corners = np.concatenate([mesh.vertices for _, mesh in meshes])
     solid = np.repeat(np.arange(len(meshes)), [len(mesh.vertices) for _, mesh in meshes])
-    scene = jax.tree.map(np.float32, track.scene)
-    gap = np.asarray(distances(scene, jax.numpy.asarray(corners))[0])
+    gap = np.asarray(jax.jit(distances)(jax.tree.map(np.float32, track.scene), corners)[0])
     assert np.abs(gap[np.arange(len(corners)), solid]).max() < 1e-4
     centers = [kind.center_w for kind in track.scene[1:5]]
     for (name, mesh), center_w in zip(meshes, np.concatenate(centers), strict=True):

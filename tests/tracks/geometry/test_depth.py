@@ -1,5 +1,7 @@
 """Depth images against MuJoCo's rays; culling leaves out only what cannot be seen."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -83,13 +85,16 @@ def test_culling_that_keeps_enough_changes_nothing():
 def test_culling_keeps_what_only_reaches_into_view():
     """A long box whose middle is out of view is kept before a far one in the middle of it."""
     boxes = Boxes(
-        jnp.array([[[3.0, 5.0, 50.0], [6.0, 0.0, 51.0], [8.0, -1.0, 52.0]]]),
-        jnp.tile(jnp.eye(3), (1, 3, 1, 1)),
-        jnp.array([[[0.1, 4.5, 0.3], [0.2, 0.2, 0.2], [0.2, 0.2, 0.2]]]),
+        np.array([[3.0, 5.0, 50.0], [6.0, 0.0, 51.0], [8.0, -1.0, 52.0]]),
+        np.tile(np.eye(3), (3, 1, 1)),
+        np.array([[0.1, 4.5, 0.3], [0.2, 0.2, 0.2], [0.2, 0.2, 0.2]]),
     )
-    scene = batch(make_track("zigzag", 0, 0), 1)._replace(boxes=boxes)
-    pose = np.array([[0.0, 0.0, 50.0]]), np.eye(3)[None]
-    whole, culled = seen(scene, *pose), seen(scene, *pose, limits=MAX_COUNTS._replace(boxes=2))
+    track = make_track("zigzag", 0, 0)
+    track = replace(track, scene=track.scene._replace(boxes=boxes))
+    scene = batch(track, 2 * POSES, MAX_COUNTS)
+    pose = np.tile([0.0, 0.0, 50.0], (2 * POSES, 1)), np.tile(np.eye(3), (2 * POSES, 1, 1))
+    limits = MAX_COUNTS._replace(boxes=2)
+    whole, culled = seen(scene, *pose)[0], seen(scene, *pose, limits=limits)[0]
     near = whole < 7
     assert 20 < near.sum() < 400 and np.any((whole > 7) & (whole < 9))
     assert np.allclose(culled[near], whole[near], atol=1e-5)
