@@ -13,7 +13,7 @@ from suite.cli import main
 from suite.diagnose import run
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.sources.rollout_source import rollouts_of
-from tests.support.diagnosis_flights import fly_all
+from tests.support.diagnosis_flights import fly, fly_all
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -35,6 +35,12 @@ def pytest_runtest_teardown():
 def compiled_quickly():
     """Optimise nothing: for programs that run once or twice."""
     jax.config.update("jax_disable_most_optimizations", True)
+
+
+@pytest.fixture(scope="session")
+def log():
+    """Return one flight of the plain vehicle."""
+    return fly(PLAIN, 0, duration_s=4.0, motors=True)
 
 
 LAGGED = with_lag(PLAIN, 0.03)

@@ -93,8 +93,7 @@ def test_what_is_read_is_not_written_over_and_flights_too_short_or_missing_are_r
     assert "1.3 s" in capsys.readouterr().err
 
 
-def test_logs_without_what_a_rollout_needs_are_diagnosed_by_views():
-    log = fly(PLAIN, 0, duration_s=2.0, motors=True)
+def test_logs_without_what_a_rollout_needs_are_diagnosed_by_views(log):
     assert can_fly([log], PLAIN)
     assert not can_fly([replace(log, about={"partial": ["quat"]})], PLAIN)
     no_commands = replace(log, rotor_speed=None, thrust_cmd=None, rate_cmd_b=None)
