@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, settings
 ROOT = Path(__file__).resolve().parent.parent
 TOGETHER = (
     "suite/diagnose",
+    "suite/blind",
     "suite/train",
     "suite/diagnose/identify",
     "examples",
@@ -22,6 +23,8 @@ TOGETHER = (
     "suite/experiments",
 )
 """Folders whose tests share fixtures and compiled code, those that take longest first."""
+AFTER = {"suite/blind": "suite/diagnose"}
+"""Folders that run in the process of another one, after it, as they use its compiled code."""
 
 # Before jax is imported anywhere. Compiled code in .cache/jax makes a second run much faster.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -62,8 +65,8 @@ def float64():
         yield
 
 
-def run_with(path: Path) -> str:
-    """Return what a test file is run with: a folder of `TOGETHER`, or the file alone."""
+def folder_of(path: Path) -> str:
+    """Return the folder of `TOGETHER` that has a test file, or the file."""
     name = path.relative_to(ROOT / "tests").as_posix()
     return max((one for one in TOGETHER if name.startswith(f"{one}/")), key=len, default=name)
 
@@ -71,7 +74,7 @@ def run_with(path: Path) -> str:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the folders that take longest first, and single files last: they end at one time."""
     order = {name: number for number, name in enumerate(TOGETHER)}
-    items.sort(key=lambda item: order.get(run_with(item.path), len(order)))
+    items.sort(key=lambda item: order.get(folder_of(item.path), len(order)))
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -81,6 +84,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     class SharedScheduling(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return run_with(ROOT / nodeid.partition("::")[0])
+            folder = folder_of(ROOT / nodeid.partition("::")[0])
+            return AFTER.get(folder, folder)
 
     return SharedScheduling(config, log) if config.getvalue("dist") == "loadgroup" else None

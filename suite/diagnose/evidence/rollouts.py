@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -304,10 +304,10 @@ def compiled(
 
         def along(direction: Any) -> Any:
             tangent = jnp.broadcast_to(direction.reshape(KNOTS, 6), none.shape)
-            return jax.jvp(lambda p: fly(given, theta, offset, windows, p)[0], (none,), (tangent,))
+            pushed = partial(fly, given, theta, offset, windows)
+            return jax.jvp(pushed, (none,), (tangent,), has_aux=True)[1:]
 
-        slopes = jax.vmap(lambda d: along(d)[1], out_axes=-1)(jnp.eye(KNOTS * 6))
-        _, flown = fly(given, theta, offset, windows)
+        slopes, flown = jax.vmap(along, out_axes=(-1, None))(jnp.eye(KNOTS * 6))
         return KnotResponse(slopes, at_knots(flown, windows))
 
     linear = slopes_along(lambda *inputs: fly(*inputs)[0])

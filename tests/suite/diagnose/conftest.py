@@ -13,7 +13,7 @@ from suite.cli import main
 from suite.diagnose import run
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.sources.rollout_source import rollouts_of
-from tests.support.diagnosis_flights import fly_all
+from tests.support.diagnosis_flights import fly, fly_all
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -29,6 +29,18 @@ def pytest_runtest_setup():
 def pytest_runtest_teardown():
     """Compile for other tests as before."""
     jax.config.update("jax_disable_most_optimizations", UNOPTIMISED)
+
+
+@pytest.fixture
+def compiled_quickly():
+    """Optimise nothing: for programs that run once or twice."""
+    jax.config.update("jax_disable_most_optimizations", True)
+
+
+@pytest.fixture(scope="session")
+def log():
+    """Return one flight of the plain vehicle."""
+    return fly(PLAIN, 0, duration_s=4.0, motors=True)
 
 
 LAGGED = with_lag(PLAIN, 0.03)
@@ -81,4 +93,4 @@ def flown(drag):
 def by_views():
     """Return a diagnosis of two effects by views."""
     hidden = {"linear_drag": ((0.4, 0.3, 0.2),), "angular_damping": ((6.0, 6.0, 4.0),)}
-    return diagnose(flights(4, hidden=hidden), VEHICLE, by="views")
+    return diagnose(flights(4, 0, 6.0, hidden=hidden), VEHICLE, by="views")

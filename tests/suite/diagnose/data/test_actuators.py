@@ -31,7 +31,7 @@ def with_speeds(log, speed):
 @pytest.mark.parametrize(("lag", "delay"), [(0.03, 0.0), (0.05, 0.012)])
 def test_lag_and_delay_are_estimated_separately(lag, delay):
     truth = with_effects(with_lag(PLAIN, lag), command_delay=(delay,))
-    logs = fly_all([truth] * 2, range(2), duration_s=4.0, motors=True)
+    logs = fly_all([truth] * 2, range(2), duration_s=3.0, motors=True)
     (found,) = actuator_mismatches(logs, LAGGED)
     assert found.commanded_by == "nominal rate loop"
     accuracy = 2e-3 if delay else 1e-3
@@ -69,7 +69,7 @@ def test_logs_without_speeds_give_no_mismatch_and_speeds_of_another_controller_a
     assert flown_by_other_controller([other], LAGGED)
     assert not flown_by_other_controller([with_speeds(log, None)], LAGGED)
     moved = with_effects(LAGGED, com_offset=((0.006, -0.004, 0.0),))
-    assert not flown_by_other_controller([fly(moved, 0, duration_s=4.0, motors=True)], LAGGED)
+    assert not flown_by_other_controller([fly(moved, 0, duration_s=2.0, motors=True)], LAGGED)
 
 
 def test_columns_and_rate_loop_decide_what_can_be_the_input(log):
@@ -93,7 +93,7 @@ def test_columns_and_rate_loop_decide_what_can_be_the_input(log):
 @pytest.fixture(scope="module")
 def slow():
     truth = with_effects(LAGGED, motor_lag=(0.06,), linear_drag=((0.4, 0.4, 0.2),))
-    return fly_all([truth] * 3, range(3), duration_s=5.0, motors=True)
+    return fly_all([truth] * 3, range(3), duration_s=4.0, motors=True)
 
 
 def test_a_longer_rotor_lag_is_named_next_to_what_the_views_name(slow):
@@ -112,9 +112,9 @@ def test_a_longer_rotor_lag_is_named_next_to_what_the_views_name(slow):
 def test_a_lag_is_named_only_where_it_differs_and_flights_identify_it(slow):
     found = find_rotor_lag(slow, LAGGED)
     assert found is not None
-    calm = fly_all([LAGGED], [7], duration_s=3.0, speed=0.3, motors=True)
+    calm = fly_all([LAGGED], [7], duration_s=2.0, speed=0.3, motors=True)
     assert find_rotor_lag([*slow, *calm], LAGGED) == found, "its speeds hardly change"
-    own = fly_all([LAGGED] * 3, range(3), duration_s=5.0, motors=True)
+    own = fly_all([LAGGED] * 3, range(3), duration_s=3.0, motors=True)
     rng = np.random.default_rng(0)
     noisy = [
         with_speeds(log, log.rotor_speed + 60.0 * rng.standard_normal(log.rotor_speed.shape))

@@ -9,7 +9,7 @@ from suite.diagnose.data.noise import noise_of, rotor_noise
 from suite.diagnose.data.sampling import on_every_row, thinned, with_fewer_rows, without_slow_rotors
 from suite.diagnose.data.windows import SLICES, cut
 from suite.diagnose.thresholds import Thresholds
-from tests.support.diagnosis_flights import NOISE, fly
+from tests.support.diagnosis_flights import NOISE
 from tests.support.vehicles import PLAIN
 
 
@@ -18,11 +18,6 @@ def on_rows(values, chosen):
     values = np.array(values)
     values[~chosen] = np.nan
     return values
-
-
-@pytest.fixture(scope="module")
-def log():
-    return fly(PLAIN, 0, duration_s=3.0, motors=True)
 
 
 @pytest.fixture(scope="module")

@@ -10,13 +10,8 @@ from suite.diagnose.data.noise import noise_of, rotor_noise
 from suite.diagnose.data.windows import BURN_IN_S, LENGTH_S, SLICES, STEPS, cut, take
 from suite.diagnose.thresholds import Thresholds
 from tests.support.broken_logs import rows
-from tests.support.diagnosis_flights import NOISE, fly
+from tests.support.diagnosis_flights import NOISE
 from tests.support.vehicles import PLAIN
-
-
-@pytest.fixture(scope="module")
-def log():
-    return fly(PLAIN, 0, duration_s=4.0, motors=True)
 
 
 def test_windows_hold_the_rows_and_commands_of_their_time(log):

@@ -16,11 +16,13 @@ GIVEN = with_lag(PLAIN, 0.02)
 TURN = (0.01, -0.015, 0.02)
 
 
-def test_a_fault_from_a_package_is_a_candidate_and_in_the_simulated_log(monkeypatch):
+def test_a_fault_from_a_package_is_a_candidate_and_in_the_simulated_log(
+    monkeypatch, compiled_quickly
+):
     """Residuals of a flight without noise nearly vanish where the model has the true fault."""
     with_imu_fault(monkeypatch)
     truth = with_effects(GIVEN, imu_fault=(TURN, 1.04, 0.01))
-    way = Trajectory("figure_eight", duration_s=4.0, speed=4.0, size=2.0, turn="wobble")
+    way = Trajectory("figure_eight", duration_s=2.5, speed=4.0, size=2.0, turn="wobble")
     (flight,) = fly(GIVEN, truth, [way], SENSORS["estimator"].rate_hz)
     log = log_of(flight, truth, SENSORS["estimator"], None, "flight")
     windows, _ = cut([log], GIVEN, False, integrator="euler")

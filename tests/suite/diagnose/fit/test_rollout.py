@@ -1,31 +1,29 @@
 """The model of a window against flights integrated finely, at any spacing of rows and any loop."""
 
 from dataclasses import replace
+from functools import cache
 
 import jax
 import numpy as np
 import pytest
 
-from suite.diagnose.data.windows import SLICES, cut
+from suite.diagnose.data.windows import SLICES, STATE, cut
 from suite.diagnose.estimate.parameters import make_space
-from suite.diagnose.evidence.rollouts import RolloutModel
+from suite.diagnose.evidence.linearise import arrays_of
+from suite.diagnose.evidence.rollouts import compiled
 from tests.support.continuous_flights import fly_finely
 from tests.support.diagnosis_flights import NOISE
 from tests.support.vehicles import PLAIN, with_effects
 
 DRAG = (0.3, 0.35, 0.1)
-
-
-@pytest.fixture(autouse=True)
-def _compiled_quickly():
-    """Each program here runs once or twice, so that optimising it costs more than it saves."""
-    jax.config.update("jax_disable_most_optimizations", True)
+flown = cache(lambda layout: jax.jit(compiled(layout, False, False, "continuous")[0]))
 
 
 CHANNELS = {"position": "pos", "attitude": "att", "velocity": "vel", "rates": "rate",
             "accelerometer": "acc"}  # fmt: skip
 
 
+@pytest.mark.usefixtures("compiled_quickly")
 @pytest.mark.parametrize(
     ("frequency", "rate_hz", "lag", "delay"),
     [
@@ -41,14 +39,14 @@ CHANNELS = {"position": "pos", "attitude": "att", "velocity": "vel", "rates": "r
 )
 def test_a_second_of_flight_is_met_within_a_tenth_of_the_noise(frequency, rate_hz, lag, delay):
     vehicle = replace(PLAIN, controller=replace(PLAIN.controller, frequency=frequency))
-    log = fly_finely(vehicle, 1, 2.5, rate_hz, 0.3, lag_s=lag, delay_s=delay, drag=DRAG)
+    log = fly_finely(vehicle, 1, 2.5, rate_hz, 0.3, 3.0, lag, delay, DRAG, 1e-3)
     late = {"command_delay": (delay,)} if delay else {}
     truth = with_effects(vehicle, linear_drag=(DRAG,), motor_lag=(lag,), **late)
     windows, _ = cut([log], truth, False)
     assert windows is not None and len(windows.flight) == 2
-    model = RolloutModel(truth, make_space(truth), False, False)
-    start = np.zeros((len(windows.flight), model.free))
-    residual = model.residual(model.space.array("start"), start, windows)
+    space, start = make_space(truth), np.zeros((len(windows.flight), STATE + 4))
+    with jax.enable_x64(True):
+        off, _ = flown(space.layout)(arrays_of(truth, space), space.array("start"), start, windows)
     for name, short in CHANNELS.items():
-        error = float(np.sqrt((residual[..., SLICES[name]] ** 2).mean()))
+        error = float(np.sqrt((np.asarray(off)[..., SLICES[name]] ** 2).mean()))
         assert error < 0.1 * NOISE[short], name

@@ -82,7 +82,7 @@ TURNING = ("inertia", "lag")
 
 def test_parts_that_are_left_stay():
     begun = known.start()
-    found = identify(known.logs("rates", 0, known.HOVER), begun, leave=("drag", "loop"))
+    found = identify(known.logs("rates", 0, known.HOVER), begun, leave=(*TURNING, "drag", "loop"))
     assert "linear_drag" not in found.vehicle.effects
     assert found.vehicle.controller == begun.controller
 
@@ -223,7 +223,7 @@ def test_a_scale_of_the_thrust_that_is_left_alone_counts():
     rng = np.random.default_rng(0)
     logs = logs_of(fleet, known.recordings(), "thrust", rng, sensors=known.SENSORS)
     begun = with_effects(known.start(), thrust_scale=(0.8,))
-    found = identify(logs, begun, leave=("motors",))
+    found = identify(logs, begun, leave=("motors", *TURNING))
     assert found.vehicle.effects["thrust_scale"].scale == 0.8
     (drag,) = [n for n in found.numbers if n.key == "effects.linear_drag.coefficient"]
     for value, true, span in zip(drag.value, known.DRAG, drag.ci95, strict=True):

@@ -88,13 +88,11 @@ def flown(
     return logs
 
 
-@cache
-def flights() -> list[FlightLog]:
-    return flown(range(FLIGHTS))
+flights, fitted = cache(lambda: flown(range(FLIGHTS))), cache(lambda: fit_sensors(flights()))
 
 
 def test_the_true_parameters_are_within_the_intervals():
-    found = parameters_of(fit_sensors(flights()))
+    found = parameters_of(fitted())
     true = {f"measured_state.{name}": value for name, value in TRUE.items()}
     for axis in (f"{group}_{a}" for group in ("position", "attitude") for a in "xyz"):
         true.setdefault(f"measured_state.{axis}_lasts", 0.5)
@@ -119,11 +117,11 @@ def test_the_noise_fits_held_out_flights_unless_theirs_has_another_colour():
 
 def test_a_drift_and_a_tilt_by_neglected_drag_are_found_where_they_are():
     none = {"position_x": 0.0, "position_y": 0.0}
-    drifting = flown(range(20, 24), 0.0, position_drift=0.05, **none)
+    drifting = flown(range(20, 22), 0.0, position_drift=0.05, **none)
     drift = fit_sensors(drifting).axes["position_x"].drift
     assert drift.low <= 0.05 <= drift.high
     assert drift.value > 0.02
-    assert not fit_sensors(flights()).tilt.drag.value
+    assert not fitted().tilt.drag.value
     tilt = fit_sensors(flown(range(30, 36), drag=0.4)).tilt
     assert tilt.drag.value == pytest.approx(0.4, abs=0.01)
     assert tilt.lasts_s.value == pytest.approx(0.8, abs=0.04)

@@ -43,7 +43,7 @@ def test_a_drag_to_one_side_is_no_wind():
         ahead = motion.rot_w[:, 0]
         return -0.5 * max(float(motion.vel_w @ ahead), 0.0) * ahead
 
-    label, names, _ = found_in(pushed(forwards, 20))
+    label, names, _ = found_in(pushed(forwards, 20, 4.0))
     assert label in ("partly", "unknown") and "constant_wind" not in names
 
 

@@ -71,7 +71,7 @@ def test_a_slow_effect_is_no_noise_with_a_memory_however_long_the_flights():
 
 
 def test_an_attitude_alone_shows_the_torque_as_finely_as_a_gyro():
-    moved = flights(4, seed=5, com_offset=((0.006, -0.002, 0.0),))
+    moved = flights(4, 5, 5.0, com_offset=((0.006, -0.002, 0.0),))
     lost, about = np.full_like(moved[0].rate_b, np.nan), {"partial": ["rate"]}
     without_gyro = [replace(log, rate_b=lost, about=about) for log in moved]
     found = diagnose(without_gyro, VEHICLE, by="views")
@@ -132,5 +132,5 @@ def test_flights_that_hardly_move_leave_wind_and_drag_and_a_leaning_frame():
 
 def test_noise_of_the_rotor_speeds_is_no_inertia_and_no_thrust():
     """Noise in what drives makes every slope smaller, as more inertia would."""
-    found = diagnose(flights(4, seed=204, speed=1.5), VEHICLE, by="views")
+    found = diagnose(flights(4, 204, 5.0, 1.5), VEHICLE, by="views")
     assert (found.label, found.named) == ("no_gap", [])

@@ -31,14 +31,14 @@ def named(found):
 @pytest.fixture(scope="module")
 def before():
     """Return reference flights, by view, of a vehicle that the file describes wrongly."""
-    logs = flights(3, seed=5, speed=1.0, thrust_scale=(0.9,), linear_drag=(DRAG,))
+    logs = flights(3, 5, 5.0, 1.0, thrust_scale=(0.9,), linear_drag=(DRAG,))
     return {view.name: task_of(logs, view) for view in (FORCE, TORQUE)}
 
 
 @pytest.mark.parametrize("share", [0.8, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_a_change_stands_out_of_how_flights_differ_though_the_file_is_wrong(before, share):
     motor = {"weak_motor": ((1.0, 1.0, share, 1.0),)} if share < 1.0 else {}
-    logs = flights(3, seed=6, speed=1.0, thrust_scale=(0.9,), linear_drag=(DRAG,), **motor)
+    logs = flights(3, 6, 5.0, 1.0, thrust_scale=(0.9,), linear_drag=(DRAG,), **motor)
     after = {view.name: task_of(logs, view) for view in (FORCE, TORQUE)}
     spread = change.rotor_spread([*before.values(), *after.values()])
     found = {}
@@ -58,7 +58,7 @@ def test_a_change_stands_out_of_how_flights_differ_though_the_file_is_wrong(befo
 
 
 def test_an_axis_along_which_flights_are_alike_has_a_spread_of_its_own():
-    logs = flights(3, seed=5, trim=0.0)
+    logs = flights(3, 5, 3.0, trim=0.0)
     force, torque = task_of(logs), task_of(logs, TORQUE)
     apart = [
         flight._replace(measured=flight.measured + push * np.array([1.0, 1.0, 0.1]))
@@ -93,13 +93,13 @@ def test_sizes_are_drawn_as_the_spread_is_estimated():
 
 
 def test_more_drag_is_named_with_its_whole_size_and_other_speeds_are_no_change():
-    more, dragged = (0.6, 0.5, 0.2), task_of(flights(3, seed=5, linear_drag=(DRAG,)))
-    after = task_of(flights(3, seed=6, speed=2.5, linear_drag=(more,)))
+    more, dragged = (0.6, 0.5, 0.2), task_of(flights(3, 5, 5.0, linear_drag=(DRAG,)))
+    after = task_of(flights(3, 6, 5.0, 2.5, linear_drag=(more,)))
     found = change.search_motion_change(dragged, after, candidates(SPACE, False, ()))
     assert found is not None and named(found) == ["linear_drag"]
     np.testing.assert_allclose(found.estimate.theta[found.indices], more, atol=0.06)
     np.testing.assert_allclose(found.start.theta[found.indices], DRAG, atol=0.06)
-    after = task_of(flights(3, seed=7, speed=2.0, linear_drag=(DRAG,)))
+    after = task_of(flights(3, 7, 5.0, 2.0, linear_drag=(DRAG,)))
     assert change.search_motion_change(dragged, after, candidates(SPACE, False, ())) is None
 
 

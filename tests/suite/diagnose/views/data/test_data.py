@@ -89,7 +89,7 @@ def test_rows_on_the_ground_are_not_used():
 
 
 def test_a_missing_attitude_follows_from_the_path():
-    (log,) = flights(1, trim=0.0, duration_s=6.0)
+    (log,) = flights(1, trim=0.0, duration_s=4.0)
     lacks = replace(log, quat_wxyz=np.full_like(log.quat_wxyz, np.nan),
                     rate_b=np.full_like(log.rate_b, np.nan),
                     about={"partial": ["quat", "rate"]})  # fmt: skip
@@ -103,7 +103,7 @@ def test_a_missing_attitude_follows_from_the_path():
 
 @pytest.fixture(scope="module")
 def pair():
-    return flights(2)
+    return flights(2, 0, 5.0)
 
 
 def on_the_ground(log, before_s, after_s):

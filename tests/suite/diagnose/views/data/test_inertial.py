@@ -75,7 +75,7 @@ def test_a_flight_may_begin_on_its_side():
 
 
 def test_thrust_and_drag_are_identified_without_a_pose():
-    found = identify([flown(seed)[0] for seed in range(3)], VEHICLE)
+    found = identify([flown(seed, 6.0)[0] for seed in range(3)], VEHICLE)
     numbers = {number.key: number for number in found.numbers}
     thrust = numbers["rotors.thrust_coefficient"].value[0]
     assert thrust == pytest.approx(VEHICLE.rotors.thrust_coefficient, rel=0.01)
