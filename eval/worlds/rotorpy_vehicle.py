@@ -51,7 +51,7 @@ def rotorpy_parameters(vehicle: Vehicle, shortest_lag_s: float = 0.0) -> dict[st
     modelled = replace(vehicle, effects=effects)
     values = all_values(modelled)
     constants = make_plant(modelled, 1.0 / modelled.controller.frequency).constants
-    mass, thrust = float(constants.mass), float(constants.thrust_coefficient[0])
+    mass = float(constants.mass)
     parameters: dict[str, Any] = {
         "mass": mass,
         **dict(zip(("Ixx", "Iyy", "Izz"), map(float, constants.inertia), strict=True)),
@@ -62,7 +62,7 @@ def rotorpy_parameters(vehicle: Vehicle, shortest_lag_s: float = 0.0) -> dict[st
         "rotor_directions": -np.array(modelled.rotors.spin),
         "rotor_speed_min": 0.0,
         "rotor_speed_max": _max_rotor_speed(modelled),
-        "k_eta": thrust,
+        "k_eta": float(constants.thrust_coefficient[0]),
         "k_m": float(constants.torque_coefficient[0]),
         "tau_m": max(float(constants.time_constant), shortest_lag_s),
         "motor_noise_std": 0.0,
@@ -71,8 +71,7 @@ def rotorpy_parameters(vehicle: Vehicle, shortest_lag_s: float = 0.0) -> dict[st
         parameters |= convert(values[name], mass)
     if AT_HOVER in effects:
         # RotorPy's drag is a coefficient times the sum of the rotor speeds times the airspeed.
-        hover_speed_sum = 4.0 * np.sqrt(mass * GRAVITY / (4.0 * thrust))
-        drag = mass * values[AT_HOVER].coefficient / hover_speed_sum
+        drag = mass * values[AT_HOVER].coefficient / (4.0 * _hover_speed(parameters))
         drag_x, drag_y, drag_z = (float(c) for c in drag)
         parameters["k_d"] += 0.5 * (drag_x + drag_y)
         parameters["k_z"] += drag_z
@@ -90,15 +89,35 @@ def _max_rotor_speed(vehicle: Vehicle) -> float:
     return max(speed_max, float(motor_speed(vehicle, np.asarray(1.0))))
 
 
+def _hover_speed(parameters: Mapping[str, Any]) -> float:
+    """Return the speed of each rotor at hover [rad/s]."""
+    return float(np.sqrt(parameters["mass"] * GRAVITY / (4.0 * parameters["k_eta"])))
+
+
 def as_flown(vehicle: Vehicle) -> Vehicle:
     """Return the vehicle file that describes RotorPy's model of `vehicle` best."""
     supported = (*ROTORPY_EFFECTS, *OUTSIDE)
     effects = {name: value for name, value in vehicle.effects.items() if name in supported}
+    parameters = rotorpy_parameters(vehicle)
     if AT_HOVER in vehicle.effects:
-        parameters = rotorpy_parameters(vehicle)
         for name, key in (("rotor_drag", "k_d"), ("inflow", "k_z")):
             effects[name] = EFFECTS[name].values(parameters[key])
+    if parameters["k_d"] or parameters["k_z"]:
+        effects["angular_damping"] = EFFECTS["angular_damping"].values(_hub_damping(parameters))
     return replace(vehicle, name=f"{vehicle.name}, as RotorPy flies it", effects=effects)
+
+
+def _hub_damping(parameters: Mapping[str, Any]) -> np.ndarray:
+    """Return the damping (3,) of rotations by the rotors' drag at their hubs, at hover [1/s].
+
+    A rotor at r with the speed W has the force -W diag(k_d, k_d, k_z) (w x r) if the body turns at
+    w. Its torque about the body's axes is divided by the inertia.
+    """
+    x2, y2, z2 = (np.array(list(parameters["rotor_pos"].values())) ** 2).sum(axis=0)
+    drag, lift = parameters["k_d"], parameters["k_z"]
+    torque = np.array([lift * y2 + drag * z2, lift * x2 + drag * z2, drag * (x2 + y2)])
+    inertia = np.array([parameters[name] for name in ("Ixx", "Iyy", "Izz")])
+    return _hover_speed(parameters) * torque / inertia
 
 
 def differences(vehicle: Vehicle, shortest_lag_s: float) -> list[str]:

@@ -19,7 +19,7 @@ from eval.worlds import differences as differences_of
 from eval.worlds import rotorpy as rotorpy_world
 from eval.worlds import world_class
 from eval.worlds.rotorpy import Multirotor, StepInput
-from eval.worlds.rotorpy_vehicle import AIR, differences, rotorpy_parameters
+from eval.worlds.rotorpy_vehicle import AIR, as_flown, differences, rotorpy_parameters
 from eval.worlds.trial import Rules
 from suite.cli import main
 from tests.support.courses import fly_on, straight
@@ -190,3 +190,16 @@ def test_forces_and_torques_are_ours_where_the_body_does_not_turn(name):
             torque_b = theirs.compute_body_wrench(np.zeros(3), alike, vel_b)[1]
             ours = wrench_on(plant, steady(alike), flow._replace(rotor_speed=alike))
         np.testing.assert_allclose(torque_b, ours.torque_b, rtol=1e-9, atol=1e-9)
+
+
+def test_turning_at_hover_the_vehicle_as_flown_has_rotorpys_damping():
+    from rotorpy.vehicles import multirotor
+
+    moved = with_effects(VEHICLE, com_offset=((0.0, 0.0, 0.02),), command_delay=(0.0,))
+    plant, rate_b = make_plant(as_flown(moved), 0.002), np.array([3.0, -2.0, 1.0])
+    speed = np.full(4, np.sqrt(0.75 * 9.81 / (4 * 1.6e-6)))
+    motion = Motion(np.zeros(3), np.eye(3), np.zeros(3), rate_b)
+    _, flow = wind_and_flow(plant, {}, motion, steady(speed), 0.0)
+    theirs = multirotor.Multirotor(rotorpy_parameters(moved))
+    _, torque_b = theirs.compute_body_wrench(rate_b, speed, np.zeros(3))
+    np.testing.assert_allclose(torque_b, wrench_on(plant, steady(speed), flow).torque_b, rtol=1e-9)
