@@ -90,8 +90,8 @@ class RolloutSource(Source):
     since_s: float
     """Time in a flight at which its held-out part begins [s]; above 0 only for a single flight."""
     coarser: FlightWindows | None = None
-    """The fitted windows, but with every second rotor speed only; None if commands are the input.
-    The difference in the result shows how much the time between rotor speeds matters."""
+    """The fitted windows, but with every second rotor speed only, or with every second command if
+    the log lacks commands; None if neither matters. The difference in the result shows how much."""
     coarser_share: float = 0.5
     """Share of an effect's change under `coarser` that counts as the model's numerical error."""
 
@@ -150,7 +150,8 @@ class RolloutSource(Source):
         """Return the sizes of the named effects on the fitted flights, see `Source`.
 
         If measured rotor speeds are the input, the model has a numerical error, since the speeds
-        between two rows are unknown. This error is subtracted before the upper end is computed.
+        between two rows are unknown. This error is subtracted before the upper end is computed. The
+        same holds for commands that the log lacks; the whole change then counts as the error.
 
         To estimate it, the effect is fitted again with every second rotor speed only. Half of the
         change counts as the error; for an error of second order it would be a third (step doubling;

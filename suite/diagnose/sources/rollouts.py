@@ -110,11 +110,12 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
     all_windows, windows, linear = windows, take(windows, is_finite), take(linear, is_finite)
     if coarser is not None:
         limits = with_model_error(model, start.theta, windows, linear, coarser, limits)
+    coarser_share = 0.0 if coarser is None or not rotor_input else _coarser_share(logs, vehicle)
     if not rotor_input and commands_are_slow(logs, limits):
         fewer = take(windows_of(fewer_commands=all_windows)[0], is_finite)
         held = with_held_commands(model, start.theta, windows, linear, fewer, limits)
         if held is not None:
-            limits = held
+            limits, coarser, coarser_share = held, fewer, 1.0
             warnings.append(LACKING)
     if not given.chosen and is_hopeless(model, windows, linear, limits):
         given.say("no effect brings rollouts of 1 s near these flights: using force and torque")
@@ -143,11 +144,6 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
     # Effects on a signal that the logs lack, or that the model does not use, are not candidates.
     signals = {"acc_b"} if any(log.acc_b is not None for log in logs) else set()
     single = candidates(model.space, voltage, signals if rotor_input else signals | {"command"})
-    rows_are_dense = all(
-        log.rotor_speed is None
-        or rows_show_torque(vehicle, own_spacing_s(log.time_s, log.rotor_speed))
-        for log in logs
-    )
     source = RolloutSource(
         name="whole",
         about="whole flights, in rollouts of a second",
@@ -167,8 +163,8 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
         held=take(held, held.start_s >= since_s - ROUNDING_S),
         # Of a lone flight the end is held out.
         since_s=since_s if np.isin(not_fitted.flight, fitted.flight).any() else 0.0,
-        coarser=take(coarser, is_fitted) if coarser is not None and rotor_input else None,
-        coarser_share=0.5 if rows_are_dense else 2.0,  # see `RolloutSource.sizes`
+        coarser=take(coarser, is_fitted) if coarser_share else None,
+        coarser_share=coarser_share,
     )
     driven_by = "measured rotor speeds" if rotor_input else "commands"
     return SourceSet((source,), names, driven_by, tuple(warnings))
@@ -185,6 +181,16 @@ def can_fly(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
         or (log.rotor_speed is None and (log.rate_cmd_b is None or has_firmware_loop(vehicle)))
         for log in logs
     )
+
+
+def _coarser_share(logs: Sequence[FlightLog], vehicle: Vehicle) -> float:
+    """Return `coarser_share` of a source driven by rotor speeds; see `RolloutSource.sizes`."""
+    rows_are_dense = all(
+        log.rotor_speed is None
+        or rows_show_torque(vehicle, own_spacing_s(log.time_s, log.rotor_speed))
+        for log in logs
+    )
+    return 0.5 if rows_are_dense else 2.0
 
 
 def _needs_rotor_input(logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds) -> bool:
