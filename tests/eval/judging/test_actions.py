@@ -37,11 +37,12 @@ def test_the_first_action_of_every_kind_carries_the_weight_and_turns_nothing():
         np.testing.assert_allclose(first_action(action, VEHICLE), wanted)
 
 
+@pytest.mark.parametrize("world", ["mujoco", "reference"])
 @pytest.mark.parametrize("kind", ["ctbr", "motors"])
-def test_hovering_by_any_kind_of_action_stays_where_it_is(kind):
+def test_hovering_by_any_kind_of_action_stays_where_it_is(kind, world):
     action = ActionSpec(kind, motors="speed")
     hover = Steady(tuple(first_action(action, VEHICLE)), PolicySpec(action=action))
-    result = flown(hover)
+    result = flown(hover, world)
     assert result.ended_by == "timeout" and result.v_max < 0.1 and result.limited_actions == 0
 
 
@@ -54,13 +55,13 @@ def climbing(kind):
 
 @pytest.mark.parametrize("kind", ["ctbr", "motors"])
 def test_worlds_fly_commands_and_motors_alike(kind):
-    policy, rules = climbing(kind), Rules(time_limit_s=0.4)
+    policy, rules = climbing(kind), Rules(time_limit_s=0.6)
     ours = flown(policy, "mujoco", straight(height=30.0), rules)
-    assert ours.v_max > 0.2
-    for world, off in (("reference", 0.0), ("rotorpy", 0.01)):
+    assert ours.v_max > 0.5
+    for world, off in (("reference", 0.0), ("rotorpy", 0.05)):
         theirs = flown(policy, world, straight(height=30.0), rules)
         np.testing.assert_allclose(end_of(theirs), end_of(ours), rtol=0, atol=off, err_msg=world)
-        assert theirs.v_max == pytest.approx(ours.v_max, abs=2 * off)
+        assert theirs.v_max == pytest.approx(ours.v_max, abs=off)
 
 
 @pytest.mark.slow

@@ -177,8 +177,10 @@ def test_the_next_trial_of_a_slot_begins_with_nothing():
 
 
 def test_recording_changes_nothing():
-    trials, policy = TRIALS[:4], network()
-    options, flights = JudgeOptions(slots=3, rules=RULES), {}
+    levels = ((track, level) for track in ("zigzag", "circular") for level in (1, 6))
+    trials = [TrialSpec(track, level, 0) for track, level in levels]
+    options, flights = JudgeOptions(slots=3, rules=Rules(time_limit_s=1.0)), {}
+    policy = RandomNetwork()
     found = fly(
         policy, trials, VEHICLE, "mujoco", options,
         on_result=lambda result, flight: flights.update({result.trial: flight}),

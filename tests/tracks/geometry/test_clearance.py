@@ -120,8 +120,9 @@ def test_padding_and_culling_do_not_change_the_nearest():
     gates = np.array([t.scene.gates.center_w for t in tracks], np.float32)
     distance, _ = nearest(scene, gates)
     limits = MAX_COUNTS._replace(boxes=24, cylinders=6, capsules=5, spheres=5)
-    alone, _ = all_distances(unbatched(tracks[0].scene), gates[0])
-    assert np.allclose(distance[0], alone.min(-1), atol=1e-5)
+    for i, track in enumerate(tracks):
+        alone, _ = all_distances(unbatched(track.scene), gates[i])
+        assert np.allclose(distance[i], alone.min(-1), atol=1e-5)
     for k in range(8):
         culled, _ = nearest(scene, gates[:, k : k + 1], limits)
         assert np.allclose(culled[:, 0], distance[:, k], atol=1e-5)

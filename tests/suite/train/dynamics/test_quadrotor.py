@@ -126,8 +126,7 @@ def test_the_rollouts_gradient_is_that_of_finite_differences(float64, monkeypatc
     monkeypatch.setattr(losses, "BARRIER_SLOPE", -4.0)  # smooth enough for differences
     free = {"gradient_decay": 0.0, "field_gain": 0.0, "collide": 0.0}
     config = small_config(batch=2, steps=5, loss=free)
-    late = with_effects(with_lag(PLAIN, 0.02), command_delay=(0.037,))
-    config = replace(config, quadrotor=QuadrotorConfig(late, 100.0, 100.0))
+    config = replace(config, quadrotor=QuadrotorConfig(HIDDEN, 100.0, 100.0))
     params, worlds = doubled(fresh_params()), doubled(boxes_worlds(config))
     worlds = worlds._replace(vel_w=4.0 * worlds.heading_w)
     delta = doubled(delta_network.init(jax.random.key(1)))
