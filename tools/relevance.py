@@ -31,7 +31,7 @@ from eval.flights.simulate import SENSORS
 from eval.logs.flight_log import FlightLog, read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import Vehicle, with_effects
-from eval.worlds import world_class
+from eval.worlds import nearest
 from suite.blind.oracle.information import Column
 from suite.common.startup import keep_compiled
 from suite.common.work import Silent
@@ -91,12 +91,6 @@ def fly_logs(setting: Setting, vehicle: Vehicle, rng: np.random.Generator) -> li
         listing = collect(flown, folder / "flights", Silent())
         files = [folder / "flights" / row["file"] for row in listing["flights"] if row["file"]]
         return [as_logged(log, setting, rng) for log in read_flights(files)[0]]
-
-
-def described(vehicle: Vehicle, simulator: str) -> Vehicle:
-    """Return the vehicle file that describes `vehicle` in the simulator best."""
-    world = world_class(simulator)
-    return world.nearest(vehicle) if hasattr(world, "nearest") else vehicle
 
 
 def as_logged(log: FlightLog, setting: Setting, rng: np.random.Generator) -> FlightLog:
@@ -163,7 +157,7 @@ def main() -> None:
         effect = str(rng.choice(IDENTIFIABLE))
         values = hidden_values(effect, flown, rng)
         logs = fly_logs(setting, flown, rng)
-        vehicle = described(flown, setting.collection.simulator)
+        vehicle = nearest(setting.collection.simulator, flown)
         null = diagnosis_json(diagnose(logs, vehicle, seed=number))
         clean += null["verdict"] == "no_gap"
         line = f"{number:3d} {_words(setting)}: {_found(null)}"

@@ -167,3 +167,15 @@ def differences(name: str, vehicle: Vehicle) -> list[str]:
     """
     world = world_class(name)
     return world.differences(vehicle) if hasattr(world, "differences") else []
+
+
+def nearest(name: str, vehicle: Vehicle) -> Vehicle:
+    """Return the vehicle file that describes `vehicle` in the simulator `name` best.
+
+    It is `vehicle` itself, unless the simulator has other aerodynamics.
+
+    Raises:
+        ValueError: for an unknown simulator, or a missing package.
+    """
+    world = world_class(name)
+    return world.nearest(vehicle) if hasattr(world, "nearest") else vehicle

@@ -16,7 +16,7 @@ import tyro
 from eval.judging.statistics import paired_success
 from eval.judging.tables import percent
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.worlds import REFERENCE, WORLDS, differences, world_class
+from eval.worlds import REFERENCE, WORLDS, differences, nearest
 from policies import shipped
 from suite.common.console import Console
 from suite.experiments.pages.document import PageContents
@@ -70,7 +70,6 @@ def conditions(config: Config) -> list[Condition]:
         raise ValueError(f"--simulator {repeated} is given twice; give each simulator once")
     entries = [Condition(BASE, 1.0, "", vehicle)]
     for name in config.simulator or (ROUNDING, "rotorpy"):
-        simulator = world_class(name)
         if name in (BASE, REFERENCE):
             others = ", ".join(known for known in WORLDS if known not in (BASE, REFERENCE))
             raise ValueError(
@@ -78,8 +77,9 @@ def conditions(config: Config) -> list[Condition]:
                 f"{REFERENCE}; give one of {others}"
             )
         # A simulator with other aerodynamics offers the vehicle that is nearest to them in mujoco.
-        if hasattr(simulator, "nearest"):
-            entries.append(Condition(control_label(name), 1.0, "", simulator.nearest(vehicle)))
+        described = nearest(name, vehicle)
+        if described is not vehicle:
+            entries.append(Condition(control_label(name), 1.0, "", described))
         entries.append(Condition(name, 1.0, "", vehicle, simulator=name))
     return entries
 

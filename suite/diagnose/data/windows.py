@@ -162,7 +162,7 @@ def cut(
         coarser: the windows that an earlier call returned. If given, the same ones are cut with
             steps of twice the length, from every second rotor speed and `with_hidden_torque`.
         only: numbers of the flights that are cut; all if not given.
-        fewer_commands: the same, with usual steps, but from every second command.
+        fewer_commands: as `coarser`, but with usual steps, and from every second command.
     """
     starts, warnings = list[tuple[int, int]](), list[str]()  # (flight, row) each
     states = [on_every_row(log, limits) for log in logs]

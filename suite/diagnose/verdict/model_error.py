@@ -22,7 +22,13 @@ from eval.logs.flight_log import FlightLog
 from suite.diagnose.data.colour import Noise, measured_noise
 from suite.diagnose.data.noise import at_least
 from suite.diagnose.data.sampling import own_spacing_s
-from suite.diagnose.data.whitening import Linearisation, block_of, make_whitening, slow_energy
+from suite.diagnose.data.whitening import (
+    Linearisation,
+    Whitening,
+    block_of,
+    make_whitening,
+    slow_energy,
+)
 from suite.diagnose.data.windows import SLICES, FlightWindows
 from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.thresholds import Thresholds
@@ -46,12 +52,13 @@ def with_model_error(
         theta: (P,) parameters at which `linear` was computed.
         windows: W stretches.
         linear: residuals and slopes of `windows` along all parameters and start numbers.
-        coarser: the same stretches with longer steps and fewer rotor speeds, or fewer commands.
+        coarser: the same stretches with longer steps and fewer rotor speeds.
         limits: thresholds of the diagnosis.
     """
     noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
+    whitening = make_whitening(linear, noise, windows, limits)
     difference = _difference(model, theta, linear, coarser)
-    return _raised(_rms(difference, linear, noise, windows, limits), limits)
+    return _raised(_rms(difference, linear, noise, whitening, windows), limits)
 
 
 def with_held_commands(
@@ -71,15 +78,19 @@ def with_held_commands(
     Args: see `with_model_error`; `fewer` are the same stretches with every second command.
     """
     noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
+    whitening = make_whitening(linear, noise, windows, limits)
     difference = _difference(model, theta, linear, fewer)
-    rms = _rms(difference, linear, noise, windows, limits)
-    shares = _rms(linear.residual, linear, noise, windows, limits) / np.maximum(rms, 1e-12)
+    rms, residual = (
+        _rms(errors, linear, noise, whitening, windows) for errors in (difference, linear.residual)
+    )
+    shares = residual / np.maximum(rms, 1e-12)
     fast = (s for name, s in zip(SLICES, shares, strict=True) if name in FAST and s > 0.0)
     share = min(fast, default=0.0)
     if share < limits.held_share:
         return None
     # The error accumulates along a window, so its slow part exceeds that of white noise.
-    rms, difference = min(share, 1.0) * rms, min(share, 1.0) * difference
+    share = min(share, 1.0)
+    rms, difference = share * rms, share * difference
     raised = _raised(rms, limits)
     noise = Noise(at_least(noise.sigma, raised), {})
     whitening = make_whitening(linear, noise, windows, raised)
@@ -109,23 +120,22 @@ def _difference(
 
 
 def _rms(
-    difference: np.ndarray,
+    errors: np.ndarray,
     linear: Linearisation,
     noise: Noise,
+    whitening: Whitening,
     windows: FlightWindows,
-    limits: Thresholds,
 ) -> np.ndarray:
-    """Return the RMS (6,) of the unexplained part of `difference` (W, N, 19), by sensor.
+    """Return the RMS (6,) of the unexplained part of `errors` (W, N, 19), by sensor.
 
     Unexplained is what no change of the start state gives. The entries are those of `SLICES`, in
-    units of the channels; 0 where nothing was measured.
+    units of the channels; 0 where nothing was measured. Windows without any error are left out.
     """
-    whitening = make_whitening(linear, noise, windows, limits)
-    unexplained = block_of(whitening, linear._replace(residual=difference), (), windows).residual
-    _, rows, channels = difference.shape
-    over_noise = unexplained[:, : rows * channels].reshape(difference.shape)
+    unexplained = block_of(whitening, linear._replace(residual=errors), (), windows).residual
+    _, rows, channels = errors.shape
+    over_noise = unexplained[:, : rows * channels].reshape(errors.shape)
     sigma = np.where(np.isfinite(noise.sigma), noise.sigma, 0.0)
-    valid = np.asarray(windows.valid) & difference.any(axis=(1, 2), keepdims=True)
+    valid = np.asarray(windows.valid) & errors.any(axis=(1, 2), keepdims=True)
     energy = (np.where(valid, over_noise * sigma, 0.0) ** 2).sum(axis=(0, 1))
     # Mean of each channel, and then of each group of channels (three or four of one sensor).
     power = energy / np.maximum(valid.sum(axis=(0, 1)), 1)
