@@ -86,12 +86,12 @@ class RotorpyWorld(SceneSlots):
     @staticmethod
     def differences(vehicle: Vehicle) -> list[str]:
         """Return a sentence for each deviation of the simulation from `vehicle`."""
-        return rotorpy_vehicle.differences(vehicle, MIN_LAG_STEPS / vehicle.controller.frequency)
+        return rotorpy_vehicle.differences(vehicle, _shortest_lag_s(vehicle))
 
     @staticmethod
     def nearest(vehicle: Vehicle) -> Vehicle:
         """Return the vehicle file that describes the simulation of `vehicle` best."""
-        return rotorpy_vehicle.as_flown(vehicle)
+        return rotorpy_vehicle.as_flown(vehicle, _shortest_lag_s(vehicle))
 
     def _control(
         self,
@@ -126,6 +126,11 @@ class RotorpyWorld(SceneSlots):
         self._loops = self._loops._replace(plant=plant)
         self._batch.forward(np.flatnonzero(moving).astype(np.int32), stage=TO_CONTACTS)
         return ~valid
+
+
+def _shortest_lag_s(vehicle: Vehicle) -> float:
+    """Return the least time constant of the rotors that RotorPy simulates for `vehicle` [s]."""
+    return MIN_LAG_STEPS / vehicle.controller.frequency
 
 
 class Multirotor:

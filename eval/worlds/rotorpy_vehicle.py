@@ -94,11 +94,19 @@ def _hover_speed(parameters: Mapping[str, Any]) -> float:
     return float(np.sqrt(parameters["mass"] * GRAVITY / (4.0 * parameters["k_eta"])))
 
 
-def as_flown(vehicle: Vehicle) -> Vehicle:
-    """Return the vehicle file that describes RotorPy's model of `vehicle` best."""
+def as_flown(vehicle: Vehicle, shortest_lag_s: float = 0.0) -> Vehicle:
+    """Return the vehicle file that describes RotorPy's model of `vehicle` best.
+
+    It is `vehicle` itself if there are no `differences`. The arguments are those of
+    `rotorpy_parameters`.
+    """
+    if not differences(vehicle, shortest_lag_s):
+        return vehicle
     supported = (*ROTORPY_EFFECTS, *OUTSIDE)
     effects = {name: value for name, value in vehicle.effects.items() if name in supported}
     parameters = rotorpy_parameters(vehicle)
+    if parameters["tau_m"] < shortest_lag_s:
+        effects["motor_lag"] = EFFECTS["motor_lag"].values(shortest_lag_s)
     if AT_HOVER in vehicle.effects:
         for name, key in (("rotor_drag", "k_d"), ("inflow", "k_z")):
             effects[name] = EFFECTS[name].values(parameters[key])

@@ -23,7 +23,8 @@ class Config(Command):
     flown: Collection = Collection()
     """The flights: policy, tracks, vehicle and simulator."""
     out: Path = Path("runs/flights")
-    """Folder for the flights, and for flights.json, which lists them."""
+    """Folder for the flights, and for flights.json, which lists them. If the simulator differs from
+    the vehicle file, vehicle_as_flown.toml describes the flights."""
     workers: WorkersOption = None
     """Share the flights among N processes of this machine, or on the cluster at HOST:PORT, whose
     owner can run code here. Without it as many cores are used as shorten the work."""

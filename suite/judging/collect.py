@@ -39,6 +39,7 @@ from tracks.input.reading import read_json
 if TYPE_CHECKING:
     from eval.judging.results import Journal
     from eval.logs.flight import Flight
+    from eval.vehicles.vehicle import Vehicle
     from eval.worlds.trial import TrialResult, TrialSpec
     from policies.policy import Policy
 
@@ -46,6 +47,9 @@ LIST = "flights.json"
 """Name of the list of flights in the output folder."""
 JOURNAL = "journal.jsonl"
 """Name of the file with a line for each finished flight; removed when the list is written."""
+AS_FLOWN = "vehicle_as_flown.toml"
+"""Name of the vehicle file that describes the flights, if the given one does not: the simulator
+then has other equations (`eval.worlds.nearest`)."""
 
 
 def collect(
@@ -57,7 +61,7 @@ def collect(
         The contents of flights.json: version and seed, the settings, and a row for each flight with
         its result and the name of its log, `file`. It is null for a flight without a log. Such a
         flight is shorter than one second, or its log breaks a rule of flight logs; then there is a
-        warning.
+        warning. `as_flown` is `AS_FLOWN` if that file is written, else null.
 
     Raises:
         ValueError: if a setting of `collection` cannot be used, or `out` holds the flights of
@@ -85,10 +89,12 @@ def collect(
     # Rows of flights that exist, then of the missing ones.
     rows = _existing_rows(out, identity)
     with Journal(out / JOURNAL, identity) as journal:
+        as_flown = _write_vehicle(collection, trial_set.vehicle, out)
         rows |= {t: row for t, r in journal.done.items() if (row := _row(out, r)) is not None}
         _fly_missing(collection, trial_set, policy, out, rows, journal, console, workers)
         flights = [rows[trial] for trial in trial_set.trials]
-        listing = {**stamp(1, collection.seed), **settings, "flights": flights}
+        listing = {**stamp(1, collection.seed), **settings, "as_flown": as_flown}
+        listing["flights"] = flights
         write_json(out / LIST, listing)
     (out / JOURNAL).unlink()
     write_run_record(out, collection, collection.seed)
@@ -100,7 +106,24 @@ def collect(
         console.say(
             f"{len(rows) - len(logs)} without a log, {short} of them under {DURATION_MIN:g} s"
         )
+    if as_flown:
+        console.say(
+            f"{out / as_flown} describes these flights: give it to suite diagnose (--vehicle), "
+            "which otherwise names the simulator's own effects"
+        )
     return {**listing, "out": str(out)}
+
+
+def _write_vehicle(collection: Collection, vehicle: Vehicle, out: Path) -> str | None:
+    """Write the vehicle file that describes the flights, if `vehicle` does not; return its name."""
+    from eval.quadrotor.vehicle_file import save_vehicle, vehicle_table
+    from eval.worlds import nearest
+
+    described = nearest(collection.simulator, vehicle)
+    if vehicle_table(described) == vehicle_table(vehicle):
+        return None
+    save_vehicle(described, out / AS_FLOWN, f"flights of the simulator {collection.simulator}")
+    return AS_FLOWN
 
 
 Row = dict[str, Any]

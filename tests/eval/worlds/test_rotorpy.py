@@ -155,8 +155,10 @@ def test_the_mass_is_the_true_one_and_rotors_lag_at_least_as_long_as_asked():
 
 
 def test_every_difference_is_said_and_nothing_else():
-    assert differences(with_lag(PLAIN, 0.03), 0.002) == []
+    alike = with_lag(PLAIN, 0.03)
+    assert differences(alike, 0.002) == [] and as_flown(alike, 0.002) is alike
     assert "flown with 0.002 s" in differences(PLAIN, 0.002)[0]
+    assert as_flown(PLAIN, 0.002).effects == {"motor_lag": (0.002,)}
     said = " ".join(differences(drawn_effects(np.random.default_rng(0), PLAIN), 0.002))
     without = [name for name in EFFECTS if f"{name}: RotorPy does not have it" in said]
     assert set(without) == {

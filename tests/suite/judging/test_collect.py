@@ -3,11 +3,16 @@
 import json
 import shutil
 
+import numpy as np
+
 import eval.judging.judge
 import eval.logs.flight_log
 import suite.judging.collect
 from eval.logs.flight_log import read_flight
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds import nearest
 from tests.support.commands import answer, refused, run
+from tests.support.engines import STAND_IN
 
 GATE = "[[gates]]\ncenter = [{x}, 0.0, 1.3]\nwidth = 1.0\nheight = 1.0\n"
 COURSE = GATE.format(x=0.0) + GATE.format(x=5.0)
@@ -68,6 +73,25 @@ def test_flights_are_the_same_where_policy_and_vehicle_were_moved(
     assert run(*args, moved) == 0, "nothing is flown again"
     moved.write_text(moved.read_text().replace("mass = 0.75", "mass = 0.76"))
     assert run(*args, moved) == 2
+
+
+def test_a_simulator_that_differs_from_the_vehicle_file_writes_the_file_that_describes_its_flights(
+    pilots, tmp_path, monkeypatch, capfd
+):
+    monkeypatch.setattr("eval.worlds.rotorpy.rotorpy", lambda: STAND_IN)
+    for simulator in ("rotorpy", "mujoco"):
+        out = tmp_path / simulator
+        line = "collect --track zigzag --difficulty 0 --trials 1 --simulator", simulator
+        assert run(*line, "--policy", pilots["diver"], "--out", out) == 0
+        listed = json.loads((out / "flights.json").read_text())["as_flown"]
+        path, said = out / "vehicle_as_flown.toml", capfd.readouterr().out
+        assert path.exists() == (f"{path} describes these flights" in said) == bool(listed)
+        assert listed == ("vehicle_as_flown.toml" if simulator == "rotorpy" else None)
+    described = load_vehicle(tmp_path / "rotorpy" / "vehicle_as_flown.toml")
+    flown = nearest("rotorpy", load_vehicle("reference"))
+    assert described.effects.keys() == flown.effects.keys() >= {"angular_damping"}
+    for name, values in described.effects.items():
+        np.testing.assert_array_equal(np.hstack(values), np.hstack(flown.effects[name]), name)
 
 
 def test_a_flight_whose_log_is_refused_does_not_stop_the_others(
