@@ -15,6 +15,7 @@ from suite.train.dynamics.interface import make_dynamics
 from suite.train.rollout import delayed_view, make_observer, view_in, world_keys
 from suite.train.worlds import sample_worlds
 from tests.support.training import KEY, boxes_worlds, small_config
+from tracks.geometry.rotation import exp_rot
 
 BATCH = 6
 SMALL = small_config(batch=BATCH)
@@ -26,17 +27,18 @@ def sensed(**changes):
 
 
 def seen(config, steps=3):
-    """Return a function (worlds, start) of what is seen of a drone that moves on, and both."""
+    """Return a function (worlds, start) of what a drone that moves and turns sees, and both."""
     observer = make_observer(config)
     worlds = boxes_worlds(config)
     start = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
-    target = jnp.asarray(worlds.target)
+    target, turn = jnp.asarray(worlds.target), exp_rot(jnp.array([0.0, 0.05, 0.1]))
 
     def of(worlds, state):
         def move(carry, step):
             state, memory = carry
             keys = world_keys(jax.random.fold_in(KEY, step), worlds)
-            state = state._replace(pos_w=state.pos_w + 0.05 * state.vel_w)
+            moved = {"pos_w": state.pos_w + 0.05 * state.vel_w, "rot_w": state.rot_w @ turn}
+            state = state._replace(**moved)
             one, memory = observer.observe(worlds, state, target, state.pos_w, keys, memory)
             return (state, memory), one
 
@@ -48,15 +50,20 @@ def seen(config, steps=3):
 
 @pytest.fixture(scope="module")
 def shown():
-    """Return a function (worlds, start) of what is seen, and slopes by pos_w of its sums."""
-    of = seen(sensed())[0]
+    """Return a function (worlds, start) of what is seen, and slopes by the pose of its sums.
 
-    def sums(pos_w, worlds, state):
-        found = of(worlds, state._replace(pos_w=pos_w))
+    The stereo camera does not round disparities: rounding would have no slope anyway.
+    """
+    unrounded = ALL.seen.models["stereo"]._replace(step=0.0)
+    of = seen(sensed(seen=replace(ALL.seen, models={**ALL.seen.models, "stereo": unrounded})))[0]
+
+    def sums(pose, worlds, state):
+        found = of(worlds, state._replace(**pose))
         return (found.state.sum(), found.image.sum()), found
 
     both = jax.jit(jax.jacrev(sums, has_aux=True))
-    return lambda worlds, state: both(state.pos_w, worlds, state)[::-1]
+    pose = ("pos_w", "rot_w")
+    return lambda worlds, state: both({k: getattr(state, k) for k in pose}, worlds, state)[::-1]
 
 
 def test_at_magnitude_nothing_the_truth_is_seen(shown):
@@ -73,9 +80,11 @@ def test_at_magnitude_nothing_the_truth_is_seen(shown):
 
 def test_the_state_carries_a_finite_gradient_and_the_image_none(shown):
     _, worlds, state = seen(sensed(perfect_share=0.0, magnitude=(2.0, 2.0)))
-    of_state, of_image = map(np.array, shown(worlds, state)[1])
-    assert np.isfinite(of_state).all() and np.abs(of_state).max() > 0.1
-    assert not of_image.any()
+    of_state, of_image = shown(worlds, state)[1]
+    for name in ("pos_w", "rot_w"):
+        slope = np.array(of_state[name])
+        assert np.isfinite(slope).all() and np.abs(slope).max() > 0.1
+        assert not np.array(of_image[name]).any(), name
 
 
 def test_magnitudes_are_drawn_per_world_and_model_from_the_range():
