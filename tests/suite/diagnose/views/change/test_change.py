@@ -92,11 +92,21 @@ def test_sizes_are_drawn_as_the_spread_is_estimated():
     assert sizes["torque"].var(axis=0) == pytest.approx(np.full(3, both / 36.0), rel=0.05)
 
 
-def test_more_drag_is_named_with_its_whole_size_and_other_speeds_are_no_change():
+def test_more_drag_is_named_with_its_whole_size_and_other_speeds_are_no_change(monkeypatch):
+    p_values, welch = list[float](), change.ttest_ind
+
+    def spy(*fits, **options):
+        result = welch(*fits, **options)
+        p_values.extend(result.pvalue)
+        return result
+
+    monkeypatch.setattr(change, "ttest_ind", spy)
     more, dragged = (0.6, 0.5, 0.2), task_of(flights(3, 5, 5.0, linear_drag=(DRAG,)))
     after = task_of(flights(3, 6, 5.0, 2.5, linear_drag=(more,)))
     found = change.search_motion_change(dragged, after, candidates(SPACE, False, ()))
     assert found is not None and named(found) == ["linear_drag"]
+    # Bonferroni: the least p-value, which is the drag's, times the number of all of them.
+    assert found.named[0].p_value == pytest.approx(len(p_values) * min(p_values))
     np.testing.assert_allclose(found.estimate.theta[found.indices], more, atol=0.06)
     np.testing.assert_allclose(found.start.theta[found.indices], DRAG, atol=0.06)
     after = task_of(flights(3, 7, 5.0, 2.0, linear_drag=(DRAG,)))
