@@ -98,8 +98,7 @@ def scale_model(name: str, values: Any, magnitude: Any) -> Any:
     sensor, changed = SENSORS.find(name), {}
     for parameter in sensor.parameters:
         if parameter.name in sensor.grows:
-            bounds = (parameter.neutral, parameter.low, parameter.high)
-            neutral, low, high = map(float, bounds)  # pyrefly: ignore[bad-argument-type]
+            neutral, low, high = parameter.neutral, parameter.low, parameter.high
             value = getattr(values, parameter.name)
             scaled = neutral + magnitude * (value - neutral)
             if hasattr(scaled, "__array_namespace__"):

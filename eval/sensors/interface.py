@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from eval.effects.interface import Parameter as Parameter
 from policies.observation import View
 from tracks.geometry.camera import Camera
 from tracks.geometry.scene import Array
@@ -23,6 +22,23 @@ Memory = Any
 """The state of a model between observations: arrays (..., K), or tuples and dicts of them."""
 STAGES = ("state", "gates", "depth", "imu")
 """Stages, named after what a model changes: estimated state, gates, depth image, inertial unit."""
+
+
+class Parameter(NamedTuple):
+    """One parameter of a model, a number; without it in a sensors file it has the neutral value."""
+
+    name: str
+    """Name in sensors files."""
+    unit: str
+    """SI unit."""
+    neutral: float
+    """Value that gives no errors, or the usual one where a model always needs one."""
+    low: float
+    """Smallest allowed value."""
+    high: float
+    """Largest allowed value."""
+    typical: tuple[float, float]
+    """Smallest and largest usual value."""
 
 
 class Needs(NamedTuple):

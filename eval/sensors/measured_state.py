@@ -119,9 +119,9 @@ def _parameters() -> tuple[Parameter, ...]:
             of_axes += [
                 Parameter(noise, unit, 0.0, 0.0, largest, usual),
                 Parameter(bias, unit, 0.0, 0.0, largest, usual),
-                Parameter(fast, "1", 0.0, 0.0, 1.0, (0.05, 0.5), required=False),
-                Parameter(fast_lasts, "s", 0.0, 0.0, 1000.0, (0.01, 0.1), required=False),
-                Parameter(lasts, "s", LASTS_S, 0.0, 1000.0, (0.1, 2.0), required=False),
+                Parameter(fast, "1", 0.0, 0.0, 1.0, (0.05, 0.5)),
+                Parameter(fast_lasts, "s", 0.0, 0.0, 1000.0, (0.01, 0.1)),
+                Parameter(lasts, "s", LASTS_S, 0.0, 1000.0, (0.1, 2.0)),
             ]
     return (
         *of_axes,

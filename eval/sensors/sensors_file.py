@@ -145,10 +145,7 @@ def _values(sensor: Sensor, table: Table) -> Any:
     """Return the parameters of a model from its table, checked against their bounds."""
     table.expect(("kind", *(parameter.name for parameter in sensor.parameters)))
     return sensor.values(
-        *(
-            table.number(p.name, p.neutral, least=p.low, most=p.high)  # pyrefly: ignore[bad-argument-type]
-            for p in sensor.parameters
-        )
+        *(table.number(p.name, p.neutral, least=p.low, most=p.high) for p in sensor.parameters)
     )
 
 

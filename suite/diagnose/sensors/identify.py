@@ -283,7 +283,7 @@ def _file_values(parameters: Mapping[str, tuple[Interval, str]]) -> dict[str, di
         noise = model == "measured_state" and name not in ("velocity_scale", "position_drift")
         value = interval.value if noise else significant(interval)
         limits = next(p for p in SENSORS.find(model).parameters if p.name == name)
-        value = min(max(value, float(limits.low)), float(limits.high))  # pyrefly: ignore[bad-argument-type]
+        value = min(max(value, limits.low), limits.high)
         if noise or value:
             models.setdefault(model, {})[name] = float(f"{value:.4g}")
     return models
