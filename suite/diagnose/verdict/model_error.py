@@ -90,7 +90,7 @@ def with_held_commands(
         return None
     # The error accumulates along a window, so its slow part exceeds that of white noise.
     share = min(share, 1.0)
-    rms, difference = share * rms, share * difference
+    rms, difference = share * rms, np.nan_to_num(share * difference)
     raised = _raised(rms, limits)
     noise = Noise(at_least(noise.sigma, raised), {})
     whitening = make_whitening(linear, noise, windows, raised)
@@ -113,10 +113,10 @@ def commands_are_slow(logs: Sequence[FlightLog], limits: Thresholds) -> bool:
 def _difference(
     model: RolloutModel, theta: np.ndarray, linear: Linearisation, other: FlightWindows
 ) -> np.ndarray:
-    """Return by how much the residuals (W, N, 19) of `other` differ; 0 where one diverges."""
+    """Return by how much the residuals (W, N, 19) of `other` differ; NaN where one diverges."""
     difference = model.residual(theta, linear.offset, other) - linear.residual
     finite = np.isfinite(difference).all(axis=(1, 2), keepdims=True)
-    return np.where(finite, difference, 0.0)
+    return np.where(finite, difference, np.nan)
 
 
 def _rms(
@@ -129,13 +129,15 @@ def _rms(
     """Return the RMS (6,) of the unexplained part of `errors` (W, N, 19), by sensor.
 
     Unexplained is what no change of the start state gives. The entries are those of `SLICES`, in
-    units of the channels; 0 where nothing was measured. Windows without any error are left out.
+    units of the channels; 0 where nothing was measured. Windows with NaN are left out.
     """
+    known = np.isfinite(errors).all(axis=(1, 2), keepdims=True)
+    errors = np.where(known, errors, 0.0)
     unexplained = block_of(whitening, linear._replace(residual=errors), (), windows).residual
     _, rows, channels = errors.shape
     over_noise = unexplained[:, : rows * channels].reshape(errors.shape)
     sigma = np.where(np.isfinite(noise.sigma), noise.sigma, 0.0)
-    valid = np.asarray(windows.valid) & errors.any(axis=(1, 2), keepdims=True)
+    valid = np.asarray(windows.valid) & known
     energy = (np.where(valid, over_noise * sigma, 0.0) ** 2).sum(axis=(0, 1))
     # Mean of each channel, and then of each group of channels (three or four of one sensor).
     power = energy / np.maximum(valid.sum(axis=(0, 1)), 1)
