@@ -29,10 +29,8 @@ from suite.blind.outside import Law, Push
 from suite.blind.simulators import simulator_for
 from suite.common.startup import keep_compiled
 from suite.diagnose.data.colour import Noise, measured_noise
-from suite.diagnose.data.windows import cut
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.estimate.parameters import make_space
-from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
+from suite.diagnose.evidence.rollouts import rollouts_along
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.verdict.gap import gap_of
 from tracks.common.work import run_pieces, usable_cores
@@ -81,10 +79,7 @@ def rollout_error(
 
     If `noise` is None, it is measured on these logs.
     """
-    windows, _ = cut(logs, vehicle, rotor_input=False)
-    assert windows is not None
-    model = RolloutModel(vehicle, make_space(vehicle), rotor_input=False, voltage=False)
-    start = start_estimate(model, windows)
+    model, windows, start = rollouts_along(logs, vehicle, rotor_input=False)
     linear = model.linearise(start.theta, start.free, windows, model.starts)
     noise = noise or measured_noise(linear.residual, linear.start_slope, windows)
     return gap_of(linear, windows, noise).rms, noise

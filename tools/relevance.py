@@ -35,10 +35,8 @@ from eval.worlds import nearest
 from suite.blind.oracle.information import Column
 from suite.common.startup import keep_compiled
 from suite.common.work import Silent
-from suite.diagnose.data.windows import cut
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.estimate.parameters import make_space
-from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
+from suite.diagnose.evidence.rollouts import rollouts_along
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict.gap import rollout_size
@@ -127,12 +125,9 @@ def at_threshold(name: str, values: Any, vehicle: Vehicle, logs: Sequence[Flight
     by their thresholds, and the largest ratio becomes one.
     """
     by_rotors = logs[0].thrust_cmd is None
-    windows, _ = cut(logs, vehicle, rotor_input=by_rotors)
-    assert windows is not None
-    space = make_space(vehicle)
+    model, windows, start = rollouts_along(logs, vehicle, rotor_input=by_rotors)
+    space = model.space
     indices = [k for k, entry in enumerate(space.entries) if entry.effect == name]
-    model = RolloutModel(vehicle, space, rotor_input=by_rotors, voltage=False)
-    start = start_estimate(model, windows)
     slope = model.linearise(start.theta, start.free, windows, indices).slope
     entries = [space.entries[k] for k in indices]
     target = [Column(name, e.parameter, e.component or 0).value(values) for e in entries]

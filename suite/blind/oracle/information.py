@@ -26,10 +26,9 @@ from eval.flights.trajectory import Trajectory
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.diagnose.data.colour import Noise
-from suite.diagnose.data.windows import LENGTH_S, cut
+from suite.diagnose.data.windows import LENGTH_S
 from suite.diagnose.estimate.block import Block
-from suite.diagnose.estimate.parameters import make_space
-from suite.diagnose.evidence.rollouts import RolloutModel, rollout_evidence, start_estimate
+from suite.diagnose.evidence.rollouts import rollout_evidence, rollouts_along
 from suite.diagnose.thresholds import THRESHOLDS
 
 SHORT_S, LONG_S = 0.5, LENGTH_S
@@ -154,18 +153,16 @@ def linearised(
         columns: parameter components, the columns of the Jacobian.
         horizon_s: length of a rollout, and time between the starts of two rollouts [s].
     """
-    space = make_space(nominal)
-    entries = [Column(e.effect, e.parameter, e.component or 0) for e in space.entries]
-    along = [entries.index(column) for column in columns]
     integrator = logs[0].integrator or "continuous"
     # Rollouts with logged commands as input (False: not with measured rotor speeds).
-    model = RolloutModel(nominal, space, False, bool(sensors.voltage), integrator)
-    windows, _ = cut(logs, nominal, False, horizon_s, LIMITS, integrator)
-    assert windows is not None, "flights of a case are longer than a second"
+    model, windows, start = rollouts_along(
+        logs, nominal, False, bool(sensors.voltage), integrator, horizon_s, LIMITS
+    )
+    entries = [Column(e.effect, e.parameter, e.component or 0) for e in model.space.entries]
+    along = [entries.index(column) for column in columns]
     row_s = np.asarray(windows.row_s)
     # Rows after the horizon do not count.
     windows = windows._replace(valid=windows.valid & (row_s < horizon_s + 1e-6)[..., None])
-    start = start_estimate(model, windows)
     linear = model.linearise(start.theta, start.free, windows, [*along, *model.starts])
     # Noise of the channels; scaled to the rate of the rows, NaN for a channel that is not logged.
     vector_sigmas = (sensors.pos, sensors.attitude, sensors.vel, sensors.gyro, sensors.acc)

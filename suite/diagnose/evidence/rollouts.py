@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import assemble
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.colour import Noise, measured_noise, residual_as_noise
@@ -28,7 +29,15 @@ from suite.diagnose.data.whitening import (
     make_whitening,
     slow_energy,
 )
-from suite.diagnose.data.windows import KNOTS, SLICES, STATE, FlightWindows, take
+from suite.diagnose.data.windows import (
+    KNOTS,
+    LENGTH_S,
+    SLICES,
+    STATE,
+    FlightWindows,
+    cut,
+    take,
+)
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.gauss_newton import fit, gauss_newton_step
 from suite.diagnose.estimate.parameters import (
@@ -36,6 +45,7 @@ from suite.diagnose.estimate.parameters import (
     ParameterLayout,
     ParameterSpace,
     effects_at,
+    make_space,
 )
 from suite.diagnose.evidence.evidence import Evidence, flights_agree
 from suite.diagnose.evidence.linearise import (
@@ -123,6 +133,29 @@ class RolloutEvidence(Evidence):
 def start_estimate(model: RolloutModel, windows: FlightWindows) -> Estimate:
     """Return the vehicle file's parameters and the measured start states."""
     return Estimate(model.space.array("start"), np.zeros((len(windows.flight), model.free)))
+
+
+def rollouts_along(
+    logs: Sequence[FlightLog],
+    vehicle: Vehicle,
+    rotor_input: bool,
+    voltage: bool = False,
+    integrator: str = "continuous",
+    stride_s: float = LENGTH_S,
+    limits: Thresholds = THRESHOLDS,
+) -> tuple[RolloutModel, FlightWindows, Estimate]:
+    """Return the model of rollouts of `vehicle` along `logs`, the windows, and the start of a fit.
+
+    The arguments are those of `cut` and `fly_windows`.
+
+    Raises:
+        ValueError: if no flight has a window.
+    """
+    windows, warnings = cut(logs, vehicle, rotor_input, stride_s, limits, integrator)
+    if windows is None:
+        raise ValueError("; ".join(warnings))
+    model = RolloutModel(vehicle, make_space(vehicle), rotor_input, voltage, integrator)
+    return model, windows, start_estimate(model, windows)
 
 
 def trusted(

@@ -7,10 +7,10 @@ import jax
 import numpy as np
 import pytest
 
-from suite.diagnose.data.windows import SLICES, STATE, cut
+from suite.diagnose.data.windows import KNOTS, SLICES, STATE, cut
 from suite.diagnose.estimate.parameters import make_space
 from suite.diagnose.evidence.linearise import arrays_of
-from suite.diagnose.evidence.rollouts import compiled
+from suite.diagnose.evidence.rollouts import compiled, rollouts_along
 from tests.support.continuous_flights import fly_finely
 from tests.support.diagnosis_flights import NOISE
 from tests.support.vehicles import PLAIN, with_effects
@@ -50,3 +50,15 @@ def test_a_second_of_flight_is_met_within_a_tenth_of_the_noise(frequency, rate_h
     for name, short in CHANNELS.items():
         error = float(np.sqrt((np.asarray(off)[..., SLICES[name]] ** 2).mean()))
         assert error < 0.1 * NOISE[short], name
+
+
+def test_rollouts_begin_at_the_file_and_the_measured_states_of_the_windows(log):
+    model, windows, start = rollouts_along([log], PLAIN, True, stride_s=0.5)
+    assert len(windows.flight) > len(rollouts_along([log], PLAIN, True)[1].flight) > 0
+    assert np.array_equal(start.theta, make_space(PLAIN).array("start"))
+    assert start.free.shape == (len(windows.flight), STATE + 4 * KNOTS) and not start.free.any()
+    assert len(model.starts) == start.free.shape[1]
+    with pytest.raises(ValueError, match=r"no stretch of 1\.\d+ s without a hole"):
+        rollouts_along(
+            [fly_finely(PLAIN, 1, 0.5, 100.0, 0.3, 3.0, 0.0, 0.0, DRAG, 1e-3)], PLAIN, False
+        )
