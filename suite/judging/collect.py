@@ -89,7 +89,7 @@ def collect(
     # Rows of flights that exist, then of the missing ones.
     rows = _existing_rows(out, identity)
     with Journal(out / JOURNAL, identity) as journal:
-        as_flown = _write_vehicle(collection, trial_set.vehicle, out)
+        as_flown = _write_vehicle(collection, trial_set.vehicle, out, console)
         rows |= {t: row for t, r in journal.done.items() if (row := _row(out, r)) is not None}
         _fly_missing(collection, trial_set, policy, out, rows, journal, console, workers)
         flights = [rows[trial] for trial in trial_set.trials]
@@ -114,15 +114,24 @@ def collect(
     return {**listing, "out": str(out)}
 
 
-def _write_vehicle(collection: Collection, vehicle: Vehicle, out: Path) -> str | None:
-    """Write the vehicle file that describes the flights, if `vehicle` does not; return its name."""
+def _write_vehicle(
+    collection: Collection, vehicle: Vehicle, out: Path, console: Console
+) -> str | None:
+    """Write the vehicle file that describes the flights, if `vehicle` does not; return its name.
+
+    It is not written, with a warning, if a value is beyond the bounds of vehicle files.
+    """
     from eval.quadrotor.vehicle_file import save_vehicle, vehicle_table
     from eval.worlds import nearest
 
     described = nearest(collection.simulator, vehicle)
     if vehicle_table(described) == vehicle_table(vehicle):
         return None
-    save_vehicle(described, out / AS_FLOWN, f"flights of the simulator {collection.simulator}")
+    try:
+        save_vehicle(described, out / AS_FLOWN, f"flights of the simulator {collection.simulator}")
+    except ValueError as error:
+        console.note(f"warning: no vehicle file describes these flights: {error}")
+        return None
     return AS_FLOWN
 
 

@@ -13,6 +13,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds import nearest
 from tests.support.commands import answer, refused, run
 from tests.support.engines import STAND_IN
+from tests.support.vehicles import with_effects
 
 GATE = "[[gates]]\ncenter = [{x}, 0.0, 1.3]\nwidth = 1.0\nheight = 1.0\n"
 COURSE = GATE.format(x=0.0) + GATE.format(x=5.0)
@@ -92,6 +93,10 @@ def test_a_simulator_that_differs_from_the_vehicle_file_writes_the_file_that_des
     assert described.effects.keys() == flown.effects.keys() >= {"angular_damping"}
     for name, values in described.effects.items():
         np.testing.assert_array_equal(np.hstack(values), np.hstack(flown.effects[name]), name)
+    beyond = with_effects(flown, rotor_drag=(1.0,))
+    monkeypatch.setattr("eval.worlds.nearest", lambda *_: beyond)
+    assert run(*line, "--policy", pilots["diver"], "--out", tmp_path / "beyond") == 0
+    assert "no vehicle file describes these flights: effects.rotor_drag" in capfd.readouterr().err
 
 
 def test_a_flight_whose_log_is_refused_does_not_stop_the_others(
