@@ -131,6 +131,9 @@ class Parameter:
     """Whether `typical` is a range of the values themselves, not of differences from neutral."""
     signs: tuple[int, ...] = (1,)
     """Usual signs of the difference from neutral; one sign if both signs are equivalent."""
+    tried: tuple[float, ...] = ()
+    """Further values that a diagnosis tries, if the model is far from linear in the parameter: a
+    delay moves jumps of the commands past the rows of a log."""
     direction: tuple[float, ...] = ()
     """Unit vector that divides the usual size among the components; (): each component has the full
     size."""

@@ -59,7 +59,17 @@ COMMAND_DELAY = Effect(
     equation="command(t) acts at t + delay",
     source="transport delay of the command link",
     values=CommandDelay,
-    parameters=(Parameter("delay", "s", neutral=0.0, low=0.0, high=0.1, typical=(0.005, 0.04)),),
+    parameters=(
+        Parameter(
+            "delay",
+            "s",
+            neutral=0.0,
+            low=0.0,
+            high=0.1,
+            typical=(0.005, 0.04),
+            tried=(0.01, 0.02, 0.03, 0.04),
+        ),
+    ),
     constants=command_delay_constants,
     needs=("command",),
 )

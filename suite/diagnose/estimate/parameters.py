@@ -42,6 +42,8 @@ class FittedNumber:
     """Value in the vehicle file, with which a fit starts."""
     step: float
     """Usual magnitude of the number, which scales the equations of a fit."""
+    tried: tuple[float, ...] = ()
+    """Further values at which the model is evaluated, see `Parameter.tried`."""
 
 
 @dataclass(frozen=True)
@@ -158,6 +160,7 @@ def make_space(vehicle: Vehicle) -> ParameterSpace:
                         high=bound_value(parameter.high, vehicle),
                         start=float(now[k]),
                         step=parameter.typical[1],
+                        tried=parameter.tried,
                     )
                 )
     return ParameterSpace(tuple(entries), base)

@@ -14,7 +14,13 @@ import numpy as np
 
 from suite.diagnose.estimate.block import Block, Estimate, NormalEquations
 from suite.diagnose.estimate.composites import acts_through, begin_of, inactive_at
-from suite.diagnose.estimate.gauss_newton import chi2_by_group, fit, gauss_newton_step, intervals95
+from suite.diagnose.estimate.gauss_newton import (
+    TINY,
+    chi2_by_group,
+    fit,
+    gauss_newton_step,
+    intervals95,
+)
 from suite.diagnose.estimate.parameters import Candidate, indices_of
 from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.evidence.evidence import Evidence
@@ -59,6 +65,7 @@ def evaluated_at(
 
     A wind acts only through a drag: without a drag the wind's column of slopes is zero. Then a
     second column is added, computed with a drag of usual size (see `estimate/composites.py`).
+    Some columns become secants (see `with_secants`).
 
     Args:
         linearised: the evidence and its block at the estimate.
@@ -66,6 +73,7 @@ def evaluated_at(
         among: the candidates.
     """
     evidence, block = linearised
+    block = with_secants(evidence, block, at, among)
     inactive = inactive_at(evidence.space, at.theta, among, block.acts())
     if inactive is not None:
         indices = inactive.indices
@@ -78,6 +86,44 @@ def evaluated_at(
             along=(*block.along, *indices),
         )
     return Evaluation(evidence, at, block)
+
+
+def with_secants(
+    evidence: Evidence, block: Block, at: Estimate, among: Sequence[Candidate]
+) -> Block:
+    """Return `block` with secants in place of tangents where these lead to a worse minimum.
+
+    A delay longer than the time between two rows is such a case: the tangent at no delay leads
+    nowhere near it. So the model is evaluated at the parameter's values `tried`. If the best of
+    them lowers chi-square more than a linear fit along the tangent, the column becomes the secant
+    to this value. A fit's first step then leads there. The arguments are those of `evaluated_at`.
+    """
+    entries, start = evidence.space.entries, evidence.space.array("start")
+    for index in indices_of(among):
+        if not entries[index].tried or at.theta[index] != start[index]:
+            continue  # linear, or fitted already
+        column = block.along.index(index)
+        tangent = block.slope[..., column]
+        fall = float((tangent * block.residual).sum()) ** 2 / max(float((tangent**2).sum()), TINY)
+        least, secant = float((block.residual**2).sum()) - fall, None
+        for value in entries[index].tried:
+            if value == start[index]:
+                continue
+            theta = at.theta.copy()
+            theta[index] = value
+            far = evidence.linearise(Estimate(theta, at.free), ())
+            chi2, change = float((far.residual**2).sum()), value - start[index]
+            if chi2 < least:  # never where the model diverges
+                least = chi2
+                secant = (
+                    (block.residual - far.residual) / change,
+                    (block.free - far.free) / change,
+                )
+        if secant is not None:
+            slope, free_slope = block.slope.copy(), block.free_slope.copy()
+            slope[..., column], free_slope[..., column] = secant
+            block = replace(block, slope=slope, free_slope=free_slope)
+    return block
 
 
 def fit_with(

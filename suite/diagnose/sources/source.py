@@ -157,8 +157,9 @@ class Source(ABC):
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
         """Return the sizes of the named effects on these flights, by the effect's name.
 
-        Each entry is the size and the upper end of its 95 % interval. The result is empty if the
-        size has no physical unit; then no effect counts as too small.
+        Each entry is the size and the upper end of its 95 % interval, which is zero if the model's
+        own error may be the whole effect. The result is empty if the size has no physical unit;
+        then no effect counts as too small.
         """
         return {}
 
@@ -179,6 +180,8 @@ def sizes_by_effect(
 ) -> dict[str, tuple[EffectSize, EffectSize]]:
     """Return the size of each named effect and the upper end of its 95 % interval, by name.
 
+    The upper end is zero if the model's own error may be the whole effect (see `beyond_error`).
+
     Args:
         found: result of a search with K named parameters.
         slope: (..., K) derivatives of the flights' errors with respect to these parameters.
@@ -188,12 +191,31 @@ def sizes_by_effect(
     """
     entries, width, change = found.last.evidence.space.entries, found.half_widths(), found.moved
     certain = np.sign(change) * np.maximum(np.abs(change) - model_error, 0.0)
-    sizes = {}
+    error, sizes = np.broadcast_to(model_error, change.shape), {}
     for name in dict.fromkeys(named.candidate.name for named in found.named):
         columns = [k for k, index in enumerate(found.indices) if entries[index].effect == name]
-        upper = upper_size(slope[..., columns], certain[columns], width[columns], size_of)
-        sizes[name] = (size_of(slope[..., columns] @ change[columns]), upper)
+        own_slope = slope[..., columns]
+        upper = size_of(0.0 * own_slope[..., 0])
+        if beyond_error(change[columns], error[columns], width[columns]):
+            upper = upper_size(own_slope, certain[columns], width[columns], size_of)
+        sizes[name] = (size_of(own_slope @ change[columns]), upper)
     return sizes
+
+
+def beyond_error(change: np.ndarray, error: np.ndarray, width: np.ndarray) -> bool:
+    """Return whether an effect is significantly more than the model's own error.
+
+    It is if a 95 % interval, widened by the error at both ends, does not contain zero. Where no
+    parameter is significant by itself, one has to change by more than the error.
+
+    Args:
+        change: (K,) fitted parameters minus those of the vehicle file.
+        error: (K,) changes of the parameters that the model's own numerical error may cause.
+        width: (K,) half-widths of the parameters' 95 % intervals.
+    """
+    distance = np.abs(change)
+    least = width if (distance > width).any() else 0.0
+    return bool((distance - error > least).any())
 
 
 @dataclass(frozen=True)

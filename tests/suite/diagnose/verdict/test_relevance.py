@@ -9,6 +9,7 @@ import pytest
 
 from suite.diagnose.data.windows import SLICES
 from suite.diagnose.sources.examine import relevant_part
+from suite.diagnose.sources.source import beyond_error, sizes_by_effect
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.gap import Channel, EffectSize, rollout_size, upper_size, view_size
 
@@ -60,6 +61,38 @@ def test_the_upper_end_of_a_size_holds_what_the_interval_allows():
     assert upper.force == pytest.approx(0.04) and not upper.relevant(LIMITS)
     unsure = upper_size(slope, np.array([0.03]), np.array([0.03]), size_of)
     assert unsure.relevant(LIMITS), "a small effect that may be large is no finding of none"
+
+
+def test_an_effect_that_the_models_own_error_may_be_has_no_size_for_certain():
+    """A wide interval is no reason to name it: the effect may be zero."""
+    change, width, slope = np.array([0.05]), np.array([0.03]), pushed(1.0)[..., None]
+    found: Any = SimpleNamespace(
+        named=[SimpleNamespace(candidate=SimpleNamespace(name="clock_offset"))],
+        last=SimpleNamespace(evidence=SimpleNamespace(
+            space=SimpleNamespace(entries=[SimpleNamespace(effect="clock_offset")]))),
+        indices=[0], moved=change, half_widths=lambda: width,
+    )  # fmt: skip
+
+    def size_of(moved):
+        return rollout_size(moved, windows())
+
+    def upper(error):
+        ((size, upper),) = sizes_by_effect(found, slope, size_of, np.array([error])).values()
+        assert size.force == pytest.approx(0.05)
+        return upper
+
+    assert upper(0.0).force == pytest.approx(0.08)
+    assert upper(0.01).force == pytest.approx(0.07)
+    assert upper(0.04) == EffectSize(0.0, 0.0, 0.0)
+
+
+def test_one_parameter_beyond_the_models_error_is_enough():
+    change, width = np.array([0.13, -0.12, 0.06]), np.array([0.03, 0.04, 0.05])
+    assert not beyond_error(change, np.array([0.20, 0.10, 0.12]), width)
+    assert beyond_error(change, np.array([0.20, 0.07, 0.12]), width)
+    # Only all parameters together are significant: the error must explain each of them.
+    assert beyond_error(change, np.array([0.20, 0.10, 0.12]), 5.0 * width)
+    assert not beyond_error(change, np.array([0.20, 0.13, 0.12]), 5.0 * width)
 
 
 @pytest.mark.parametrize(
