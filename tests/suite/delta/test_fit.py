@@ -1,13 +1,19 @@
 """Lag, drag and delay found again, and a residual learned, on flights whose truth is known."""
 
+from contextlib import nullcontext
+from dataclasses import replace
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import pytest
 
-from suite.delta.fit import FitConfig, _descend, _loss, fit_point_mass, identify, window_errors
+from eval.logs.flight_log import write_flight
+from policies.formats.policy_file import load_delta
+from suite.common.console import Console
+from suite.delta.fit import FitConfig, PointMassFit, _descend, _loss, identify, window_errors
 from suite.delta.replay import PointMassModel, nominal_model
-from suite.delta.run import table
+from suite.delta.run import fit_delta, table
 from suite.delta.windows import cut_windows
 from suite.train.config import PointMassConfig
 from tests.support.point_mass_flights import fly
@@ -21,7 +27,7 @@ class Record(NamedTuple):
 
 
 PHYSICS = PointMassConfig(drag=(0.3, 0.3), drag_up=(0.3, 0.3), action_delay=(0.5, 0.5))
-CONFIG = FitConfig(horizon_s=0.6, iterations=100, batch=32, rate=1e-2)
+CONFIG = FitConfig(horizon_s=0.6, stride_s=0.3, iterations=100, batch=32, rate=1e-2, held_out=0.5)
 
 
 def test_lag_drag_and_delay_of_a_point_mass_are_identified_in_a_third_of_the_steps(monkeypatch):
@@ -51,12 +57,16 @@ def push(vel_b, action_b):
     return -0.1 * action_b + np.array([0.0, 0.8, -0.5], np.float32)
 
 
-def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass():
+def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(tmp_path, monkeypatch):
     """As many flights are held out as are fitted: the errors of both are one program."""
-    logs = fly(nominal_model(PHYSICS), 8, extra_b=push)
-    known, held_out = (cut_windows(part, 0.6, 0.3) for part in (logs[:4], logs[4:]))
-    shown = []
-    result = fit_point_mass(CONFIG, PHYSICS, known, held_out, lambda *words: shown.append(words))
+    for number, log in enumerate(fly(nominal_model(PHYSICS), 8, extra_b=push)):
+        commands = {"thrust_cmd": np.full_like(log.time_s, 9.81), "rate_cmd_b": log.rate_b}
+        write_flight(tmp_path / f"{number}.parquet", replace(log, **commands))
+    console, shown = Console(), []
+    told = nullcontext(lambda *words: shown.append(words))
+    monkeypatch.setattr(console, "progress", lambda *_: told)
+    result = fit_delta(CONFIG, PHYSICS, [tmp_path], tmp_path / "out", console)
+    assert isinstance(result, PointMassFit)
     assert result.without.position_m > 0.1
     assert result.with_delta.position_m < 0.3 * result.without.position_m
     assert result.with_delta.velocity_m_s < 0.4 * result.without.velocity_m_s
@@ -65,7 +75,10 @@ def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass():
     held_out = [row["held_out_m"] for row in result.curve]
     assert held_out[-1] == pytest.approx(result.with_delta.position_m, rel=1e-5)
     assert held_out[-1] < 0.5 * held_out[0] and len(shown) == len(held_out)
-    assert "| point mass with Delta Action Model |" in table(result, 0.6)
+    stored = load_delta(tmp_path / "out" / "delta").params
+    jax.tree.map(np.testing.assert_array_equal, stored, result.params)
+    said = (tmp_path / "out" / "table.md").read_text()
+    assert said == table(result, 0.6) and "| point mass with Delta Action Model |" in said
 
 
 def test_a_replay_is_held_against_the_record_of_its_own_time():

@@ -16,6 +16,7 @@ from policies.formats.policy_file import load_delta
 from policies.networks import delta_network
 from policies.spec import PolicySpec
 from suite.common.console import Console
+from suite.delta import quadrotor
 from suite.delta.fit import FitConfig, window_errors
 from suite.delta.quadrotor import cut_quadrotor_windows, replay_quadrotor, row_period
 from suite.delta.run import fit_delta
@@ -63,19 +64,21 @@ def replayed(logs, config, horizon_s, stride_s):
     return windows, jax.jit(partial(replay_quadrotor, config, cut))
 
 
-def errors_of(logs, vehicle):
-    windows, replay = replayed(logs, QuadrotorConfig(vehicle), 1.0, 0.3)
-    pos, vel = window_errors(replay, windows, None)
-    return np.asarray(pos), np.asarray(vel), windows
+@pytest.fixture(scope="module")
+def of_true(logs):
+    """Return what `replayed` returns for the vehicle that was flown, and a second."""
+    return replayed(logs, QuadrotorConfig(TRUE), 1.0, 0.3)
 
 
-def test_flights_of_the_judge_replay_as_they_were_flown(logs):
+def test_flights_of_the_judge_replay_as_they_were_flown(logs, of_true):
     """Steps of 5 ms for the judge's 2 ms: centimetres after a second."""
-    pos, vel, windows = errors_of(logs, TRUE)
+    windows, replay = of_true
+    pos, vel = map(np.asarray, window_errors(replay, windows, None))
     moved = np.linalg.norm(windows.pos_w[:, -1] - windows.pos_w[:, 0], axis=-1)
     assert len(pos) > 12 and np.median(moved) > 1
     assert pos.max() < 0.05 and vel.max() < 0.1
-    assert np.median(errors_of(logs, BARE)[0]) > 10 * np.median(pos)
+    _, replay = replayed(logs, QuadrotorConfig(BARE), 1.0, 0.3)
+    assert np.median(window_errors(replay, windows, None)[0]) > 10 * np.median(pos)
 
 
 def test_windows_start_at_decisions_with_what_was_under_way(logs):
@@ -94,9 +97,9 @@ def test_windows_start_at_decisions_with_what_was_under_way(logs):
     np.testing.assert_allclose(windows.past[0, :6, 1:], log.rate_cmd_b[rows], atol=1e-6)
 
 
-def test_a_constant_delta_acts_as_the_action(logs):
+def test_a_constant_delta_acts_as_the_action(of_true):
     push = np.array([1.0, -0.5, 0.2], np.float32)
-    windows, replay = replayed(logs, QuadrotorConfig(TRUE), 0.5, 0.3)
+    windows, replay = of_true
     delta = delta_network.init(jax.random.key(0))
     # Two programs, which round alike to the last digit or two.
     np.testing.assert_allclose(replay(windows, None)[0], replay(windows, delta)[0], rtol=1e-6)
@@ -124,12 +127,13 @@ def test_the_network_remembers_the_flight_before_a_window(logs):
     assert np.abs(hidden[number]).max() > 1e-2
 
 
-def test_a_fit_cuts_the_error_and_says_what_it_corrects(logs, tmp_path):
+def test_a_fit_cuts_the_error_and_says_what_it_corrects(logs, tmp_path, monkeypatch):
     """As many flights are held out as are fitted: the errors of both are one program."""
+    monkeypatch.setattr(quadrotor, "LEAST_PHYSICS_HZ", 100.0)  # a step a row compiles faster
     for log in logs:
         write_flight(tmp_path / "logs" / log.name.replace(" ", "-"), log)
     config = FitConfig(horizon_s=0.5, iterations=30, batch=32, rate=1e-2, held_out=0.5)
-    quad = QuadrotorConfig(BARE)
+    quad = QuadrotorConfig(BARE, physics_hz=100.0)
     result = fit_delta(config, quad, [tmp_path / "logs"], tmp_path / "out", Console())
     assert result.without.position_m > 0.05
     assert result.with_delta.position_m < 0.6 * result.without.position_m

@@ -9,11 +9,10 @@ import pytest
 
 from eval.logs.flight_log import write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
-from policies.formats.policy_file import load_delta
 from suite.common.console import Console
 from suite.delta.fit import FitConfig
 from suite.delta.replay import check_corrects, describe_dynamics, nominal_model
-from suite.delta.run import fit_delta, flight_files, long_enough, split, table
+from suite.delta.run import fit_delta, flight_files, long_enough, split
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from suite.train.recipes import race, race_paper
 from tests.support.point_mass_flights import fly
@@ -23,23 +22,14 @@ from tracks.common.files import plain
 PHYSICS = PointMassConfig(drag=(0.3, 0.3), drag_up=(0.3, 0.3), action_delay=(0.5, 0.5))
 
 
-def test_logs_become_a_checkpoint_with_its_report(tmp_path):
-    (tmp_path / "logs").mkdir()
-    for i, log in enumerate(fly(nominal_model(PHYSICS), 3)):
-        thrust = np.full_like(log.time_s, 9.81)
-        commanded = replace(log, thrust_cmd=thrust, rate_cmd_b=log.rate_b)
-        write_flight(tmp_path / "logs" / f"{i}.parquet", commanded)
-    config = FitConfig(horizon_s=0.6, iterations=3, batch=8, held_out=0.4)
-    result = fit_delta(config, PHYSICS, [tmp_path / "logs"], tmp_path / "out", Console())
-    stored = load_delta(tmp_path / "out" / "delta").params
-    for name, value in result.params.items():
-        np.testing.assert_array_equal(stored[name], value)
-    assert (tmp_path / "out" / "table.md").read_text() == table(result, 0.6)
+def test_flight_logs_are_found_once_and_without_any_nothing_is_written(tmp_path):
     with pytest.raises(ValueError, match="no flight logs in"):
-        fit_delta(config, PHYSICS, [tmp_path / "out"], tmp_path / "again", Console())
-    assert not (tmp_path / "again").exists()
-    twice = [tmp_path / "logs", tmp_path / "logs" / "a" / ".." / "0.parquet"]
-    (tmp_path / "logs" / "a").mkdir()
+        fit_delta(FitConfig(), PHYSICS, [tmp_path], tmp_path / "out", Console())
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "a").mkdir()
+    for name in ("0.parquet", "1.parquet", "2.csv"):
+        (tmp_path / name).touch()
+    twice = [tmp_path, tmp_path / "a" / ".." / "0.parquet"]
     assert len(flight_files(twice)) == 3, "a flight that is named twice counts once"
 
 
