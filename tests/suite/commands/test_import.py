@@ -81,7 +81,7 @@ def test_the_real_flights_come_as_published_and_tell_a_vehicle_at_the_first_try(
     assert packed < 320_000
     raw, log = tmp_path / "B3_figure8_fast_rep1.csv", tmp_path / "eight.parquet"
     mapping, out = tmp_path / "nanobench.toml", tmp_path / "mine.toml"
-    assert run("import --vehicle crazyflie21 --map", mapping, "--out", log, raw) == 0
+    assert run("import --vehicle crazyflie21 --end 8 --map", mapping, "--out", log, raw) == 0
     found = answer(capsys, "identify --vehicle crazyflie21 --out", out, log)
     drag = found["parameters"]["effects.linear_drag.coefficient"]
     assert 0.3 < drag["value"][0] < 0.6 and 0.3 < drag["value"][1] < 0.6
