@@ -36,28 +36,30 @@ def blind(params, image):
 
 
 def loss_of(config, encode=blind):
-    """Return loss(params, worlds, delta, field_gain) of the plain loop with `encode` inside."""
+    """Return loss(params, worlds, delta, **weights) of the plain loop with `encode` inside."""
 
-    def loss(params, worlds, delta=None, field_gain=0.0):
-        weighted = replace(config, loss=replace(config.loss, field_gain=field_gain))
+    def loss(params, worlds, delta=None, **weights):
+        weighted = replace(config, loss=replace(config.loss, **weights))
         embedding_shift = jnp.zeros((config.episode.steps, worlds.pos_w.shape[0], SPEC.hidden_size))
         return make_rollout(weighted)(params, embedding_shift, worlds, KEY, encode, delta)[0]
 
     return loss
 
 
-def assert_gradient(value_and_gradient, params, names, step, rel):
-    """Compare gradients by `params` with central differences along random directions."""
-    gradient, rng = value_and_gradient(params)[1], np.random.default_rng(0)
+def assert_slopes(along, params, names, step, rel):
+    """Compare slopes with central differences, in a random direction of each named parameter.
+
+    `along(params, way)` returns the value and its slope in the direction `way`.
+    """
+    rng, still = np.random.default_rng(0), jax.tree.map(np.zeros_like, params)
     for name in names:
-        direction = rng.normal(size=params[name].shape)
+        way = {**still, name: rng.normal(size=params[name].shape)}
         ahead, behind = (
-            value_and_gradient({**params, name: params[name] + h * direction})[0]
-            for h in (step, -step)
+            along({**params, name: params[name] + h * way[name]}, way)[0] for h in (step, -step)
         )
         slope = float(ahead - behind) / (2 * step)
         assert abs(slope) > 1e-4, name
-        found = float((gradient[name] * direction).sum())
+        found = float(along(params, way)[1])
         assert abs(found - slope) <= rel * abs(slope), f"{name}: {found} is not {slope}"
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from policies.networks import network
 from suite.train import losses, rollout
 from suite.train.config import LossConfig, PointMassConfig
 from suite.train.dynamics import point_mass
@@ -23,7 +22,7 @@ from tests.support.canonical import NOISY, gradient_of
 from tests.support.training import (
     KEY,
     SPEC,
-    assert_gradient,
+    assert_slopes,
     blind,
     boxes_worlds,
     doubled,
@@ -33,13 +32,6 @@ from tests.support.training import (
     small_config,
 )
 from tracks.geometry.field import attractive_field, magnetic_field
-
-
-@pytest.fixture(scope="module")
-def two_pass():
-    """Return (config, worlds, params, gradient, loss, records) of the trainer's own method."""
-    worlds, params = boxes_worlds(NOISY), fresh_params()
-    return NOISY, worlds, params, *gradient_of(NOISY)(params, worlds, KEY, None)
 
 
 def test_training_casts_one_ray_a_pixel_whatever_the_camera_casts_in_flight(monkeypatch):
@@ -58,27 +50,51 @@ def test_training_casts_one_ray_a_pixel_whatever_the_camera_casts_in_flight(monk
     assert cast == [(camera.height * camera.width, 3)]
 
 
-@pytest.fixture
-def held_attitude(float64, monkeypatch):
-    """Hold the attitude: its gradient is cut on purpose, so differences must not move it."""
-    held = jnp.asarray(Rotation.from_euler("ZYX", [0.7, -0.3, 0.2]).as_matrix())
-    monkeypatch.setattr(
-        point_mass, "attitude", lambda thrust, _: jnp.broadcast_to(held, (*thrust.shape[:-1], 3, 3))
+DELAYED = small_config(batch=6, steps=8, physics={"state_delay": 1, "image_delay": 1})
+FREE = {"gradient_decay": 0.0, "field_gain": 0.0, "collide": 0.0}
+"""Weights with which nothing of a gradient is cut."""
+
+
+@pytest.fixture(scope="module")
+def slopes():
+    """Return a function (params, worlds, weights, free, held) -> (loss, gradients) of DELAYED.
+
+    Gradients are by the parameters and by where the worlds start. The policy sees how bright an
+    image is, `free` times with and `held` times without gradient. The attitude is held: its
+    gradient is cut on purpose, so differences must not move it.
+    """
+    turn = Rotation.from_euler("ZYX", [0.7, -0.3, 0.2]).as_matrix()
+
+    def loss(params, pos_w, worlds, weights, free, held):
+        def encode(_, image):
+            bright = image.mean((1, 2))[:, None] * jnp.ones(SPEC.hidden_size)
+            return free * bright + held * jax.lax.stop_gradient(bright)
+
+        return loss_of(DELAYED, encode)(params, worlds._replace(pos_w=pos_w), **weights)
+
+    both = jax.jit(jax.value_and_grad(loss, (0, 1)))
+    with jax.enable_x64(True), pytest.MonkeyPatch.context() as patch:
+        held_w = lambda thrust, _: jnp.broadcast_to(turn, (*thrust.shape[:-1], 3, 3))  # noqa: E731
+        patch.setattr(point_mass, "attitude", held_w)
+        patch.setattr(losses, "BARRIER_SLOPE", -4.0)  # smooth enough for differences
+        params, worlds = doubled(fresh_params()), doubled(boxes_worlds(DELAYED))
+        compiled = both.lower(params, worlds.pos_w, worlds, FREE, 0.0, 0.0).compile()
+
+    return lambda params, worlds, weights, *see: compiled(
+        params, worlds.pos_w, worlds, weights, *(see or (0.0, 0.0))
     )
 
 
-def test_the_rollouts_gradient_is_that_of_finite_differences(held_attitude, monkeypatch):
+def test_the_rollouts_gradient_is_that_of_finite_differences(float64, slopes):
     """Where nothing is cut: no decay, no field, no closing speed, attitude held."""
-    config = small_config(
-        steps=8,
-        physics={"state_delay": 1, "image_delay": 1},
-        loss={"gradient_decay": 0.0, "field_gain": 0.0, "collide": 0.0},
-    )
-    monkeypatch.setattr(losses, "BARRIER_SLOPE", -4.0)  # smooth enough for differences
-    both = jax.jit(jax.value_and_grad(loss_of(config)))
-    params, worlds = doubled(fresh_params()), doubled(boxes_worlds(config))
+    params, worlds = doubled(fresh_params()), doubled(boxes_worlds(DELAYED))
     names = ("state.weight", "gru.weight_hidden", "gru.bias_input", "action.weight")
-    assert_gradient(lambda params: both(params, worlds), params, names, 1e-5, rel=1e-5)
+
+    def along(params, way):
+        loss, (gradient, _) = slopes(params, worlds, FREE)
+        return loss, sum((gradient[name] * way[name]).sum() for name in names)
+
+    assert_slopes(along, params, names, 1e-5, rel=1e-5)
 
 
 @jax.jit
@@ -93,23 +109,7 @@ AIR = {"drag": (0.0, 0.0), "drag_up": (0.0, 0.0), "wind_std": (0.0, 0.0, 0.0)}
 STILL = small_config(batch=6, steps=8, physics=AIR, rest_share=1.0)
 
 
-@jax.jit
-def start_gradient(params, worlds, field_gain, free, held):
-    """Return the loss's gradient by where the worlds of STILL start.
-
-    The policy sees how bright an image is, `free` times with and `held` times without gradient.
-    """
-
-    def encode(_, image):
-        bright = image.mean((1, 2))[:, None] * jnp.ones(SPEC.hidden_size)
-        return free * bright + held * jax.lax.stop_gradient(bright)
-
-    loss = loss_of(STILL, encode)
-    move = lambda pos: loss(params, worlds._replace(pos_w=pos), None, field_gain)  # noqa: E731
-    return jax.grad(move)(worlds.pos_w)
-
-
-def test_the_fields_strength_depends_on_neither_horizon_nor_batch(float64):
+def test_the_fields_strength_depends_on_neither_horizon_nor_batch(float64, slopes):
     """A world that hangs still: every step pulls alike, so the mean is one step's pull."""
     config, steps, batch = STILL, STILL.episode.steps, STILL.episode.batch
     worlds, params = doubled(boxes_worlds(config)), doubled(fresh_params(lively=0.0))
@@ -117,20 +117,23 @@ def test_the_fields_strength_depends_on_neither_horizon_nor_batch(float64):
     fade = np.exp(-config.loss.gradient_decay * np.array(worlds.constants.time_step))
     share = np.mean([fade ** (k + 1) for k in range(steps)], axis=0)
     pull = 0.42 * np.array(pull_at(worlds, worlds.pos_w, worlds.vel_w)) * share[:, None]
-    pulled, free = (start_gradient(params, worlds, gain, 0.0, 0.0) for gain in (0.42, 0.0))
+    decay = {**FREE, "gradient_decay": config.loss.gradient_decay}
+    pulled, free = (
+        slopes(params, worlds, {**decay, "field_gain": gain})[1][1] for gain in (0.42, 0.0)
+    )
     change = np.array(free - pulled)
     np.testing.assert_allclose(change * batch, pull, rtol=1e-6, atol=1e-9)
 
 
-def test_images_carry_no_gradient_to_the_state(float64):
-    slopes = partial(start_gradient, doubled(fresh_params()), doubled(boxes_worlds(STILL)))
-    seen = slopes(0.0, 1.0, 0.0)
-    np.testing.assert_allclose(seen, slopes(0.0, 0.0, 1.0), atol=1e-12)
-    assert np.abs(np.array(seen - slopes(0.0, 0.0, 0.0))).max() > 1e-6
+def test_images_carry_no_gradient_to_the_state(float64, slopes):
+    of = partial(slopes, doubled(fresh_params()), doubled(boxes_worlds(STILL)), FREE)
+    seen, held, without = (of(*see)[1][1] for see in ((1.0, 0.0), (0.0, 1.0), (0.0, 0.0)))
+    np.testing.assert_allclose(seen, held, atol=1e-12)
+    assert np.abs(np.array(seen - without)).max() > 1e-6
 
 
-def test_a_world_that_crashed_deep_leaves_the_loss(two_pass):
-    _, worlds, params = two_pass[:3]
+def test_a_world_that_crashed_deep_leaves_the_loss():
+    worlds, params = boxes_worlds(NOISY), fresh_params()
     inside = worlds.scene.gates.center_w[:, 0]
     boxes = worlds.scene.boxes
     wall = np.array(boxes.half_size)
@@ -222,21 +225,10 @@ def test_a_world_that_has_passed_its_last_gate_leaves_the_loss_where_that_is_the
     assert np.array_equal(alive == 0, after & finish)
 
 
-def test_images_outside_the_loop_give_the_gradient_of_the_plain_loop(two_pass):
-    """The sums run in another order in float32: 1e-4 of each array's largest entry."""
-    config, worlds, params, gradient, loss, _ = two_pass
-    plain = jax.jit(jax.value_and_grad(loss_of(config, network.encode)))
-    expected_loss, expected = plain(params, worlds, None, config.loss.field_gain)
-    assert float(loss) == pytest.approx(float(expected_loss), rel=1e-5)
-    sizes = {k: float(np.abs(np.array(g)).max()) for k, g in expected.items()}
-    assert min(sizes.values()) > 1e-7, sizes
-    assert largest_difference(gradient, expected) < 1e-4
-
-
 def test_the_encoders_gradient_is_that_of_its_chunks_and_on_average_of_every_other_image(
-    two_pass, monkeypatch
+    monkeypatch,
 ):
-    params, rng = two_pass[2], np.random.default_rng(1)
+    params, rng = fresh_params(), np.random.default_rng(1)
     images = jnp.asarray(rng.normal(size=(6, 2, 20, 20)), jnp.float32)
     cotangents = jnp.asarray(rng.normal(size=(6, 2, 8)), jnp.float32)
     inputs = params, images.reshape(12, 20, 20), cotangents.reshape(12, 8)

@@ -11,8 +11,8 @@ import pytest
 from suite.train import shards
 from suite.train.config import check
 from suite.train.shards import check_processes, curve_numbers, flight_numbers, sample_hidden
-from suite.train.update import make_update, start_state
-from tests.support.canonical import NOISY, gradient_of, update_of
+from suite.train.update import start_state
+from tests.support.canonical import NOISY, gradient_of, shards_of, update_of
 from tests.support.training import boxes_worlds, fresh_params, largest_difference, small_config
 
 KEY = jax.random.key(3)
@@ -26,48 +26,52 @@ def test_shards_divide_the_batch_and_processes_the_shards(monkeypatch):
         check_processes(small_config(batch=8, shards=4))
 
 
-@pytest.fixture(scope="module")
-def sharded():
-    """Return a configuration of four shards, and its update for two cores."""
-    config = replace(NOISY, episode=replace(NOISY.episode, shards=4))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shards, "usable_cores", lambda: 2)
-        return config, make_update(config)
-
-
-def test_two_threads_compute_shards_at_once_and_come_to_the_same_bits(sharded, monkeypatch):
-    """Each thread waits for the other, so that one after the other would never end.
-
-    The first update is computed one shard after the other, so that each is compiled once.
-    """
-    config, update = sharded
+def test_two_threads_compute_shards_at_once_and_come_to_the_same_bits(monkeypatch):
+    """Each thread waits for the other, so that one after the other would never end."""
     both, names = threading.Barrier(2, timeout=60), list[str]()
+    update, state, worlds = update_of(NOISY), start_state(NOISY), boxes_worlds(NOISY)
+    with monkeypatch.context() as patch:
+        patch.setattr(shards.ThreadPoolExecutor, "map", lambda _, *given: map(*given))
+        alone = update(state, worlds)
     real = shards.jax.block_until_ready
 
     def met(found):
         names.append(threading.current_thread().name)
-        if len(names) > config.episode.shards:
-            both.wait()
+        both.wait()
         return real(found)
 
     monkeypatch.setattr(shards.jax, "block_until_ready", met)
-    state, worlds = start_state(config), boxes_worlds(config)
-    alone, together = update(state, worlds), update(state, worlds)
-    assert len(set(names[: config.episode.shards])) == 1
-    assert len(set(names[config.episode.shards :])) == 2
-    jax.tree.map(np.testing.assert_array_equal, together, alone)
+    jax.tree.map(np.testing.assert_array_equal, update(state, worlds), alone)
+    assert len(set(names)) == len(names) == 2
 
 
-def test_shards_have_the_gradient_of_the_whole_batch(sharded):
-    """The sums run in another order; noise is a world's own, whichever shard it is in."""
-    ends = []
-    for config, update in (sharded, (NOISY, update_of(NOISY))):
-        state = start_state(config)
-        for number in range(3):  # the first one's rate is 0
-            state, numbers = update(state, boxes_worlds(config, number))
-        ends.append((state.params, state.hidden, numbers))
-    for found, expected in zip(*ends, strict=True):
-        assert largest_difference(found, expected) < 1e-3
+def test_the_first_shards_are_computed_one_after_the_other_so_that_one_thread_compiles(monkeypatch):
+    names = []
+    note = lambda *given: names.append(threading.current_thread()) or given[0]  # noqa: E731
+    monkeypatch.setattr(shards.jax, "jit", lambda _: note)
+    compute, state = shards.make_shards(NOISY), start_state(NOISY)
+    for _ in range(2):
+        compute(state.params, state.hidden, state.iteration, boxes_worlds(NOISY))
+    assert [name is threading.main_thread() for name in names] == [True, True, False, False]
+
+
+def test_shards_and_images_outside_the_loop_give_the_gradient_of_the_plain_loop(monkeypatch):
+    """Sums of float32 in another order: 1e-4 of an array's largest. Noise is a world's own."""
+    config, plain = replace(NOISY, episode=replace(NOISY.episode, shards=1)), gradient_of(NOISY)
+    state, worlds = start_state(NOISY), boxes_worlds(NOISY)
+    hidden = jax.random.normal(KEY, state.hidden.shape)
+    given = state.params, hidden, state.iteration, worlds
+    found = shards.batch_mean(shards_of(NOISY)(*given))
+    monkeypatch.setattr(shards, "make_gradient", lambda _: plain)
+    monkeypatch.setattr(shards.jax, "device_put", lambda tree, _: tree)
+    with monkeypatch.context() as patch:
+        patch.setattr(shards.jax, "jit", lambda function: function)
+        whole = shards.make_shards(config)
+    expected = shards.batch_mean(whole(*given))
+    sizes = {k: float(np.abs(np.array(g)).max()) for k, g in expected.gradient.items()}
+    assert min(sizes.values()) > 1e-7, sizes
+    for one, other in zip(found, expected, strict=True):
+        assert largest_difference(one, other) < 1e-4
 
 
 def test_the_curve_and_remembered_states_are_of_steps_that_counted():

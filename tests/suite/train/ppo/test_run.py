@@ -99,12 +99,12 @@ def test_the_learner_meets_the_actions_density_that_the_rollout_recorded():
     hidden = np.random.default_rng(0).normal(size=worlds.hidden.shape).astype(np.float32)
     actor, records = flown(worlds._replace(hidden=hidden))
     assert bool(records.done[:, 0].any()) and not bool(records.done[-1, 0])
-    embeddings = network.encode(actor.params, records.image.reshape(-1, 20, 20))
+    embeddings = jax.jit(network.encode)(actor.params, records.image.reshape(-1, 20, 20))
     sequences = Sequences(
         state=records.state, action_b=records.action_b, log_prob=records.log_prob,
         done=records.done, advantage=records.log_prob, start=jnp.asarray(hidden)[None],
     )  # fmt: skip
-    mean = action_means(actor.params, embeddings.reshape(6, 4, -1), sequences)
+    mean = jax.jit(action_means)(actor.params, embeddings.reshape(6, 4, -1), sequences)
     found = log_probability(mean, actor.log_deviation, records.action_b)
     np.testing.assert_allclose(found, records.log_prob, atol=1e-3)
 
