@@ -106,7 +106,8 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
         return None
     time_s, quat = rows["time"], _unit(rows["quat"])
     every = max(1, len(time_s) // POINTS)
-    turned = {steps: _turns(time_s, _as(quat, steps))[::every] for steps in _bases()}
+    turned: dict[str, np.ndarray] = {}
+    seen_as: dict[tuple[str, bool], Match] = {}
     gyro = smooth(time_s, rows["rate"], WIDTH_S)[::every] if "rate" in rows else None
     path = _path(time_s, rows["pos"], every) if "pos" in rows else None
     found, level = [], 0.0
@@ -115,21 +116,26 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
             break
         base = "+".join(step for step in steps.split("+") if step not in ("ned", "frd"))
         frames = {"ned", "frd"} & set(steps.split("+"))
-        seen = None if gyro is None else _gyro_match(turned[base], gyro, "frd" in frames)
+        read, frd = _as(quat, steps), "frd" in frames
+        if gyro is not None and base not in turned:  # frames change no size of a rotation
+            turned[base] = _turns(time_s, read)[::every]
+        if gyro is not None and (base, frd) not in seen_as:
+            seen_as[base, frd] = _gyro_match(turned[base], gyro, frd)
+        seen = seen_as.get((base, frd))
         turns = None if seen is None else _misfit_of(seen)
-        axes = _axes_of(time_s, _as(quat, steps), every) if path is not None else None
+        forces: dict[tuple[str, float], tuple[float, float]] = {}
+        if path is not None:
+            forces = _force_misfits(_axes_of(time_s, read, every), path)
         # A wrong frame is one mistake, of the attitude alone or of attitude and gyro.
         count = sum(step not in ("", "ned", "frd") for step in steps.split("+")) + bool(frames)
         apart = 0 if seen is None else int(seen.axes != "x,y,z")
         apart = 0 if "frd" in frames and seen is not None and seen.axes == "x,-y,-z" else apart
-        for pos, name in POSITIONS if path is not None else POSITIONS[:1]:
+        for pos, _ in POSITIONS if path is not None else POSITIONS[:1]:
             for length in LENGTHS if path is not None else LENGTHS[:1]:
                 if len(found) == 1 and _is_right(found[0]):
                     break
-                force = None
-                if path is not None and axes is not None:
-                    force, size = _force_misfit(axes, path, axes_matrix(name) * length)
-                    level = max(level, size) if not steps and not pos and length == 1.0 else level
+                force, size = forces.get((pos, length), (None, 0.0))
+                level = max(level, size) if not steps and not pos and length == 1.0 else level
                 taken = count + apart + (pos != "") + (length != 1.0)
                 if frames == {"ned", "frd"} and pos == "x,-y,-z":
                     taken -= 1  # one mistake: the whole log is north-east-down
@@ -261,12 +267,6 @@ def _figures(one: Reading) -> str:
     return ", ".join(parts)
 
 
-def _bases() -> Iterator[str]:
-    """Yield the attitude's readings without frames, which do not change the size of a rotation."""
-    yield from ("+".join(s for s in (o, i) if s) for o in ("", *ORDERS) for i in _SENSES)
-    yield from _ANGLES
-
-
 def _attitudes() -> Iterator[str]:
     """Yield all readings of the attitude, the given one ("") first."""
     for base in ("+".join(s for s in (o, i) if s) for o in ("", *ORDERS) for i in _SENSES):
@@ -325,37 +325,52 @@ def _path(time_s: np.ndarray, pos: np.ndarray, every: int) -> tuple[np.ndarray, 
     return smooth(time_s, vel, WIDTH_S)[::every], smooth(time_s, acc, WIDTH_S)[::every]
 
 
-def _force_misfit(
-    axes: np.ndarray, path: tuple[np.ndarray, np.ndarray], change: np.ndarray
-) -> tuple[float, float]:
-    """Return the misfit of the force: the share that is not along body z, without drag.
+def _force_misfits(
+    axes: np.ndarray, path: tuple[np.ndarray, np.ndarray]
+) -> dict[tuple[str, float], tuple[float, float]]:
+    """Return the misfit of the force and its level for each reading (step, unit) of a position.
+
+    The misfit is the share of the force that is not along body z, without drag. The level is what
+    it is relative to: the larger of horizontal acceleration and tilt times gravity [m/s^2].
 
     Args:
         axes: (N, 3, 3) body axes in the world.
         path: velocity and acceleration (N, 3) in the given reading.
-        change: (3, 3) matrix from the given reading to the reading's axes and unit.
-
-    Returns:
-        The misfit, and the level to which it is relative: the larger of horizontal acceleration
-        and tilt times gravity [m/s^2].
     """
-    vel, acc = path[0] @ change.T, path[1] @ change.T
-    good = np.isfinite(axes).all(axis=(1, 2)) & np.isfinite(acc).all(axis=1)
+    good = np.isfinite(axes).all(axis=(1, 2)) & np.isfinite(path[1]).all(axis=1)
     if good.sum() < 20:
-        return 0.0, 0.0
-    axes, vel, acc = axes[good], vel[good], acc[good]
-    acc_size = np.linalg.norm(acc, axis=1)
-    usual = acc_size <= 4.0 * np.median(acc_size) + 1.0
-    axes, vel, acc = axes[usual], vel[usual], acc[usual]
-    force = np.einsum("nik,ni->nk", axes, acc + [0.0, 0.0, GRAVITY])
-    vel_b = np.einsum("nik,ni->nk", axes, vel)
-    residual = force.copy()
-    residual[:, 2] = np.minimum(force[:, 2], 0.0)  # thrust only pushes
-    for k in range(2):
-        speed = vel_b[:, k] - vel_b[:, k].mean()
-        slope = float(speed @ force[:, k]) / max(float(speed @ speed), 1e-9)
-        residual[:, k] -= np.clip(slope, -DRAG, 0.0) * speed
-        residual[:, k] -= np.clip(residual[:, k].mean(), -BIAS, BIAS)
-    tilt = GRAVITY * axes[:, :2, 2]
-    level = float(np.sqrt(max(rms(acc[:, :2]) ** 2, rms(tilt - tilt.mean(axis=0)) ** 2)))
-    return rms(residual) / max(level, CALM_ACC), level
+        return {(pos, length): (0.0, 0.0) for pos, _ in POSITIONS for length in LENGTHS}
+    changes = np.stack([axes_matrix(name) for _, name in POSITIONS])
+    acc_size, found = np.linalg.norm(path[1][good], axis=1), {}
+    for length in LENGTHS:
+        usual = length * acc_size <= 4.0 * length * np.median(acc_size) + 1.0
+        body = np.moveaxis(axes[good][usual], 0, -1)  # (3, 3, N), rows are contiguous
+        vel, acc = (length * np.ascontiguousarray(x[good][usual].T) for x in path)
+        # Of each reading: (components, readings, N).
+        force, vel_b = _in_body(changes, body, acc), _in_body(changes, body[:, :2], vel)
+        force = force + GRAVITY * body[2][:, None]
+        speed = vel_b - vel_b.mean(axis=-1, keepdims=True)
+        slope = (speed * force[:2]).sum(-1) / np.maximum((speed**2).sum(-1), 1e-9)
+        side = force[:2] - np.clip(slope, -DRAG, 0.0)[..., None] * speed
+        side = side - np.clip(side.mean(axis=-1, keepdims=True), -BIAS, BIAS)
+        wrong = (side**2).sum(axis=0) + np.minimum(force[2], 0.0) ** 2  # thrust only pushes
+        tilt = GRAVITY * body[:2, 2]
+        leaning = (tilt - tilt.mean(axis=-1, keepdims=True)) ** 2
+        level = _rms_of(((changes[:, :2] @ acc) ** 2).sum(axis=1))
+        level = np.maximum(level, _rms_of(leaning.sum(axis=0)))
+        misfit = _rms_of(wrong) / np.maximum(level, CALM_ACC)
+        pairs = zip(misfit.tolist(), level.tolist(), strict=True)
+        found |= {(pos, length): pair for (pos, _), pair in zip(POSITIONS, pairs, strict=True)}
+    return found
+
+
+def _in_body(changes: np.ndarray, body: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Return vectors (3, N) after each change (C, 3, 3) along body axes (3, K, N): (K, C, N)."""
+    products = (body[:, None] * value[None, :, None]).transpose(2, 0, 1, 3)
+    return changes.reshape(len(changes), 9) @ products.reshape(body.shape[1], 9, -1)
+
+
+def _rms_of(squared: np.ndarray) -> np.ndarray:
+    """Return `relation.rms` of squared sizes (..., N), which are finite, or NaN for 0."""
+    kept = max(1, int(0.95 * squared.shape[-1]))
+    return np.nan_to_num(np.sqrt(np.sort(squared, axis=-1)[..., :kept].mean(axis=-1)))
