@@ -219,9 +219,9 @@ class MjxWorld:
         assert track is not None
         gates = pad_gates(track.scene.gates, self._layout.gates, self._layout.corners)
         scene = pad(track.scene._replace(gates=gates), self._layout.solids)
-        scene = jax.tree.map(lambda a: jnp.asarray(a[None], jnp.float32), scene)
-        pos_w, rot_w, _, _ = _motion(self._state.qpos[slot][None], self._state.qvel[slot][None])
-        distance = _box_distances(scene, pos_w, rot_w, self._half_size, self._middle_b)
+        scene = jax.tree.map(lambda a: np.asarray(a[None], np.float32), scene)
+        qpos, qvel = np.asarray(self._state.qpos)[[slot]], np.asarray(self._state.qvel)[[slot]]
+        distance = _distances_at(scene, qpos, qvel, self._half_size, self._middle_b)
         return _solid_names(track, self._layout)[int(np.asarray(distance)[0].argmin())]
 
     def view(self, wanted: np.ndarray) -> View:
@@ -349,7 +349,13 @@ class MjxWorld:
         )  # fmt: skip
 
 
-_box_distances = jax.jit(box_distances)
+@jax.jit
+def _distances_at(
+    scene: Scene, qpos: Array, qvel: Array, half_size: Array, middle_b: Array
+) -> Array:
+    """Return `box_distances` of free joints (N, 7) and (N, 6)."""
+    pos_w, rot_w, _, _ = _motion(qpos, qvel)
+    return box_distances(scene, pos_w, rot_w, half_size, middle_b)
 
 
 def _check_near(track: Track) -> None:
