@@ -4,7 +4,7 @@ A constant in the place of a limit has the right value and no slope: a training 
 it. Every function is compared with finite differences at its special states and beside them.
 """
 
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -116,11 +116,14 @@ STEP = 1e-4
 
 @cache
 def compiled(function):
-    """Return the function's values and Jacobians at many points, one program for all its cases."""
+    """Return the function's values and Jacobians at many points, one program for all its cases.
+
+    Forward: its program is half as large, and nothing here has a gradient of its own backwards.
+    """
 
     def both(point):
-        value, pull = jax.vjp(lambda at: jnp.ravel(function(at)), point)
-        return value, jax.vmap(pull)(jnp.eye(len(value)))[0]
+        push = partial(jax.jvp, lambda at: jnp.ravel(function(at)), (point,))
+        return jax.vmap(lambda way: push((way,)), out_axes=(None, -1))(jnp.eye(3))
 
     return jax.jit(jax.vmap(both))
 

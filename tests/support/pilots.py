@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -77,7 +78,8 @@ class RandomNetwork:
         self.spec = PolicySpec()
         params = init(jax.random.key(seed), self.spec)
         params["action.weight"] *= 100.0
-        self._network = verify_rows(native_policy(params, self.spec, self.name), "test")
+        policy = replace(native_policy(params, self.spec, self.name), block=8, rows=8)
+        self._network = verify_rows(policy, "test")
         self._pursuit = Pursuit()
         self._share = share
 
@@ -88,3 +90,7 @@ class RandomNetwork:
         extra, hidden = self._network.act(hidden, state, image, fresh)
         action, _ = self._pursuit.act(np.zeros((len(state), 3)), state, image, fresh)
         return action + np.float32(self._share) * np.tanh(extra), hidden
+
+
+random_network = cache(RandomNetwork)
+"""The pilot with a network, compiled once for all tests."""

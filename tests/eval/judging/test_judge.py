@@ -1,7 +1,6 @@
 """The judge: wrong input, interrupts, recordings, and outcomes that are the trial's alone."""
 
 import multiprocessing
-from functools import cache
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from eval.worlds import Rows
 from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
 from tests.support.courses import fly_on, straight
-from tests.support.pilots import Pursuit, RandomNetwork, Steady
+from tests.support.pilots import Pursuit, Steady, random_network
 from tracks.formats.custom import load_track
 
 VEHICLE = load_vehicle("reference")
@@ -99,14 +98,9 @@ TRIALS = [
 RULES = Rules(time_limit_s=0.5)
 
 
-@cache
-def network():
-    return RandomNetwork()
-
-
 def results(trials, slots=64, threads=1, world="mujoco"):
     options = JudgeOptions(slots, threads, rules=RULES)
-    return fly(network(), trials, VEHICLE, world, options)
+    return fly(random_network(), trials, VEHICLE, world, options)
 
 
 @pytest.fixture(scope="module")
@@ -180,7 +174,7 @@ def test_recording_changes_nothing():
     levels = ((track, level) for track in ("zigzag", "circular") for level in (1, 6))
     trials = [TrialSpec(track, level, 0) for track, level in levels]
     options, flights = JudgeOptions(slots=3, rules=Rules(time_limit_s=1.0)), {}
-    policy = RandomNetwork()
+    policy = random_network()
     found = fly(
         policy, trials, VEHICLE, "mujoco", options,
         on_result=lambda result, flight: flights.update({result.trial: flight}),

@@ -60,18 +60,19 @@ def test_contact_with_the_wall_or_the_ground_is_a_collision(world):
 
 def test_a_load_on_a_line_is_the_trials_own():
     """It begins hanging in each slot's trial, whatever flew there before and flies beside it."""
-    loaded = replace(VEHICLE, effects={**VEHICLE.effects, "slung_load": SlungLoad(0.1, 0.5)})
-    how = {"seeds": (0, 1, 2), "workers": 1, "rules": Rules(time_limit_s=0.6)}
+    loaded = replace(VEHICLE, effects={**VEHICLE.effects, "slung_load": SlungLoad(0.2, 0.5)})
+    how = {"workers": 1, "rules": Rules(time_limit_s=0.4)}
 
-    def flown(vehicle, world, slots):
-        track, how["slots"] = straight(height=3.0), slots
-        found, _ = fly_on(Pursuit(2.5), track, vehicle=vehicle, world=world, **how)
+    def flown(vehicle, world, slots, seeds=(0, 1, 2)):
+        how.update(slots=slots, seeds=seeds)
+        found, _ = fly_on(Pursuit(2.5), straight(height=3.0), vehicle=vehicle, world=world, **how)
         return [(r.pos_x, r.pos_y, r.pos_z, r.v_max, r.gates_passed) for r in found]
 
     ours = flown(loaded, "mujoco", 2)
-    assert ours == flown(loaded, "mujoco", 1) == flown(loaded, "reference", 3)
+    assert ours == flown(loaded, "reference", 3)
+    assert ours[:2] == flown(loaded, "mujoco", 1, (0, 1)), "alone"
     assert ours[0] == ours[1] == ours[2], "the same flight in a slot that is used again"
-    without = flown(VEHICLE, "mujoco", 3)
+    without = flown(VEHICLE, "mujoco", 1, (0,))
     assert ours[0][2] < without[0][2] - 0.1, "nothing makes up for its weight"
 
 
