@@ -116,12 +116,9 @@ STEP = 1e-4
 
 @cache
 def compiled(function):
-    """Return the function's values and Jacobians at many points, one program for all its cases.
+    """Return the function's values and Jacobians at many points, one program for all its cases."""
 
-    Forward: its program is half as large, and nothing here has a gradient of its own backwards.
-    """
-
-    def both(point):
+    def both(point):  # forward: half the program, and no function here has its own gradient
         push = partial(jax.jvp, lambda at: jnp.ravel(function(at)), (point,))
         return jax.vmap(lambda way: push((way,)), out_axes=(None, -1))(jnp.eye(3))
 

@@ -92,5 +92,4 @@ class RandomNetwork:
         return action + np.float32(self._share) * np.tanh(extra), hidden
 
 
-random_network = cache(RandomNetwork)
-"""The pilot with a network, compiled once for all tests."""
+random_network = cache(RandomNetwork)  # compiled once for all tests

@@ -1,7 +1,5 @@
 """A track's scene in MuJoCo and as a batch, and poses in it to look from."""
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -43,7 +41,7 @@ def free_poses(model, data, track: Track, rng, n=POSES):
 def batch(track: Track, n: int, to=None) -> Scene:
     """Return the track's scene `n` times, padded to the counts `to`."""
     to = counts(track.scene) if to is None else to
-    return jax.tree.map(jnp.asarray, stack([track.scene] * n, to))
+    return stack([track.scene] * n, to)
 
 
 def by_mujoco(model, data, pos_w, rot_w, rays_b, range_m):

@@ -84,7 +84,7 @@ def test_a_fresh_trial_sees_its_own_start_while_the_others_go_on():
 @pytest.mark.parametrize(("age_s", "jitter"), [(0.05, 1.0), (0.1, 0.4), (0.02, 1.0)])
 def test_ages_that_jitter_have_the_mean_and_the_spread_that_are_asked_for(age_s, jitter):
     ages = Ages(age_s, age_s, jitter)
-    found = ages_seen(ages, TRIALS, 600)[6:]
+    found = ages_seen(ages, TRIALS, 300)[6:]
     spread = jitter * age_s
     assert found.min() >= age_s - spread - DT / 2 - 1e-9
     assert found.max() <= age_s + spread + DT / 2 + 1e-9
@@ -92,7 +92,7 @@ def test_ages_that_jitter_have_the_mean_and_the_spread_that_are_asked_for(age_s,
     assert found.std() == pytest.approx(spread / np.sqrt(3), rel=0.1)
     state, image = found[:, 0].ravel(), found[:, 1].ravel()
     assert abs(np.corrcoef(state, image)[0, 1]) < 0.1, "that of the state says nothing of the other"
-    turned = ages_seen(ages, TRIALS[::-1], 600)[6:]
+    turned = ages_seen(ages, TRIALS[::-1], 300)[6:]
     assert np.array_equal(turned[:, :, ::-1], found), "they are set by the trial"
 
 

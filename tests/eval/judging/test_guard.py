@@ -70,8 +70,9 @@ class Faulty(Pursuit):
 
 @pytest.mark.parametrize("world", ["mujoco", "reference"])
 def test_the_trial_says_so(world):
-    how = {"seeds": range(4), "slots": 3, "rules": Rules(time_limit_s=0.99)}
-    found, _ = fly_on(Faulty(1.0), straight(), vehicle=VEHICLE, world=world, **how)
+    how = {"seeds": range(4), "slots": 3, "rules": Rules(time_limit_s=0.295)}
+    pilot = Faulty(1.0, spec=PolicySpec(rate_hz=100.0))
+    found, _ = fly_on(pilot, straight(), vehicle=VEHICLE, world=world, **how)
     # 30 decisions: 10 thirds of which 2 are fifths too, 6 fifths.
     assert {(r.bad_actions, r.limited_actions, r.late_actions) for r in found} == {(8, 6, 0)}
 

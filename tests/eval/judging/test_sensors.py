@@ -95,15 +95,13 @@ def flown():
 
 
 def test_every_model_reaches_the_policy():
-    few = TRIALS[:3]
+    few, flying = TRIALS[:3], {}
     true = results(few, PERFECT)
-    flying = {}
     for name in ("all", "tof-depth", "nanobench"):
         flying |= load_sensors(name).models
     for model in set(flying) - {"imu"}:
         # Grown, as rare faults would not come within so short a flight.
         strong = scale_sensors(sensor_set({model: flying[model]._asdict()}), 1e3)
-        # One trial after the other, until one shows it.
         found = (results([trial], strong)[0].v_mean for trial in few)
         assert any(one != two.v_mean for one, two in zip(found, true, strict=False)), model
 

@@ -38,8 +38,8 @@ def test_rotors_follow_exactly(time_constant):
 
 
 def test_lag_can_be_fitted_from_none():
-    speed, wanted = jax.numpy.full(4, 1000.0), jax.numpy.full(4, 1500.0)
-    slope = jax.grad(lambda tau: follow(speed, wanted, tau, 0.002).mean_square.sum())(0.0)
+    speed, wanted = (jax.numpy.asarray(np.full(4, rate)) for rate in (1000.0, 1500.0))
+    slope = jax.jit(jax.grad(lambda tau: follow(speed, wanted, tau, 0.002).mean_square.sum()))(0.0)
     # Thrust comes late: dt mean(Omega^2) loses (Omega_c^2 - Omega^2) tau - (...)^2 tau / 2.
     expected = 4 * (2 * 1500.0 * -500.0 + 0.5 * 500.0**2) / 0.002
     assert slope == pytest.approx(expected, rel=1e-5)

@@ -39,15 +39,13 @@ def fly(plant, motion, commands, noise=None):
     """Roll out in parts of one length, so that all tests share one compiled model."""
     steps = len(commands.thrust)
     noise = np.zeros((steps, 3)) if noise is None else noise
-    state, motion = hover_state(plant, (), jnp), Motion(*map(jnp.asarray, motion))
-    rows = [motion]
+    state, rows = hover_state(plant, ()), [Motion(*(field[None] for field in motion))]
     for k in range(0, steps, PART):
         inputs = Inputs(commands, noise=noise)
-        part = jax.tree.map(lambda field, k=k: jnp.asarray(field[k : k + PART]), inputs)
-        flown = ROLLOUT(plant, motion, part, state, k * plant.dt)
+        part = jax.tree.map(lambda field, k=k: field[k : k + PART], inputs)
+        flown = jax.tree.map(np.asarray, ROLLOUT(plant, motion, part, state, k * plant.dt))
         state, motion = flown.state, Motion(*(field[-1] for field in flown.motion))
         rows.append(Motion(*(field[1:] for field in flown.motion)))
-    rows[0] = Motion(*(field[None] for field in rows[0]))
     return Motion(*(np.concatenate(parts) for parts in zip(*rows, strict=True))), state
 
 
@@ -172,9 +170,10 @@ def test_gradient_of_every_parameter_is_that_of_finite_differences(slopes, name)
 
 
 def test_measured_rotor_speeds_stand_for_the_command():
-    plant, speed = make_plant(PLAIN, 0.002), jnp.full((40, 4), 1200.0)
-    held = rollout(plant, FAST, Inputs(aggressive_commands(40), rotor_speed=speed))
-    bare = rollout(plant, FAST, Inputs(rotor_speed=speed))
+    plant, speed = make_plant(PLAIN, 0.002), np.full((40, 4), 1200.0)
+    start = hover_state(plant, ())
+    held = rollout(plant, FAST, Inputs(aggressive_commands(40), rotor_speed=speed), start)
+    bare = rollout(plant, FAST, Inputs(rotor_speed=speed), start)
     np.testing.assert_array_equal(held.rotor_speed[1:], 1200.0)
     np.testing.assert_array_equal(held.motion.pos_w, bare.motion.pos_w)
     np.testing.assert_allclose(held.acc_b[:, 2], 4 * 1.6e-6 * 1200.0**2 / 0.75)
@@ -192,7 +191,7 @@ def test_a_push_is_an_acceleration_in_body_axes():
     found = np.concatenate([new - old for new, old in both])
     np.testing.assert_allclose(found, push_b[0], atol=1e-12)
 
-    given = rollout(plant, start, inputs._replace(push_b=push_b))
+    given = rollout(plant, start, inputs._replace(push_b=push_b), still)
     assert given.motion.vel_w[-1, 0] > 0.09
 
 

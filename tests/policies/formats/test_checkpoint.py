@@ -2,8 +2,10 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +21,12 @@ ARRAYS = {"a.weight": np.arange(6, dtype=np.float32).reshape(2, 3), "step": np.i
 
 def save(folder, arrays=ARRAYS, **extra):
     return save_arrays(folder, arrays, kind="policy", seed=3, extra=extra)
+
+
+@pytest.fixture(scope="module")
+def copied(tmp_path_factory):
+    saved = save(tmp_path_factory.mktemp("saved") / "c")  # once, for many copies
+    return lambda: Path(shutil.copytree(saved, tmp_path_factory.mktemp("copy") / "c"))
 
 
 @settings(max_examples=15)
@@ -62,8 +70,8 @@ def test_the_config_says_what_the_weights_are(tmp_path):
 
 @settings(max_examples=20)
 @given(file=st.sampled_from([WEIGHTS, CONFIG]), keep=st.floats(0, 1, exclude_max=True))
-def test_a_file_cut_anywhere_is_refused_by_name(tmp_path_factory, file, keep):
-    folder = save(tmp_path_factory.mktemp("cut") / "c")
+def test_a_file_cut_anywhere_is_refused_by_name(copied, file, keep):
+    folder = copied()
     path = folder / file
     whole = path.read_bytes().rstrip()
     path.write_bytes(whole[: int(keep * len(whole))])
@@ -75,8 +83,8 @@ def test_a_file_cut_anywhere_is_refused_by_name(tmp_path_factory, file, keep):
 
 @settings(max_examples=20)
 @given(at=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255))
-def test_a_changed_byte_of_the_weights_is_refused(tmp_path_factory, at, flip):
-    folder = save(tmp_path_factory.mktemp("flip") / "c")
+def test_a_changed_byte_of_the_weights_is_refused(copied, at, flip):
+    folder = copied()
     data = bytearray((folder / WEIGHTS).read_bytes())
     data[int(at * len(data))] ^= flip
     (folder / WEIGHTS).write_bytes(data)
@@ -89,8 +97,8 @@ def test_a_changed_byte_of_the_weights_is_refused(tmp_path_factory, at, flip):
     key=st.sampled_from(["schema", "kind", "weights", "weights.sha256", "weights.bytes"]),
     value=st.one_of(st.none(), st.booleans(), st.floats(allow_nan=False), st.text(), st.just([])),
 )
-def test_a_damaged_config_is_refused_by_key(tmp_path_factory, key, value):
-    folder = save(tmp_path_factory.mktemp("key") / "c")
+def test_a_damaged_config_is_refused_by_key(copied, key, value):
+    folder = copied()
     config = json.loads((folder / CONFIG).read_text())
     table = config["weights"] if "." in key else config
     if table[key.split(".")[-1]] == value:
