@@ -1,8 +1,6 @@
 """Settings of all tests: JAX on the CPU with a cache of compiled code, repeatable hypothesis."""
 
-import contextlib
 import gc
-import importlib
 import os
 from pathlib import Path
 from typing import Any
@@ -71,16 +69,6 @@ def folder_of(path: Path) -> str:
     """Return the folder of `TOGETHER` that has a test file, or the file."""
     name = path.relative_to(ROOT / "tests").as_posix()
     return max((one for one in TOGETHER if name.startswith(f"{one}/")), key=len, default=name)
-
-
-def pytest_collection(session: pytest.Session) -> None:
-    """Let every second process load all files, the last first: each is compiled by one of two."""
-    number = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:])
-    if number % 2 and session.config.args == session.config.getini("testpaths"):
-        for path in sorted(ROOT.glob("tests/**/test_*.py"), reverse=True):
-            name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-            with contextlib.suppress(Exception):  # which the collection shows
-                importlib.import_module(name)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
