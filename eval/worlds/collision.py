@@ -98,10 +98,9 @@ def box_distances(
         _from_cylinders(rods_to_box(scene.cylinders), half_size),
         _from_capsules(rods_to_box(scene.capsules), half_size),
         _from_points(to_box(scene.spheres.center_w), half_size) - scene.spheres.radius,
+        _from_triangles(corners, half_size),
         ground[:, None],
     ]
-    if scene.triangles.shape[1] > 0:
-        distances_m.insert(4, _from_triangles(corners, half_size))
     return jnp.concatenate(distances_m, axis=-1)
 
 
@@ -123,14 +122,16 @@ def _separation(
 
     Args:
         axes: directions, (..., 3) each, of any length; axes of length zero are ignored.
-        low_high: function that returns the two ends of the solid's extent along axes (A, ..., 3).
+        low_high: function that returns the two ends of the solid's extent along an axis.
         half_size: (3,) half extents of the box.
     """
-    axis = jnp.stack(jnp.broadcast_arrays(*axes))
-    size = jnp.sqrt((axis * axis).sum(-1))
-    low, high = low_high(axis)
-    gap = jnp.maximum(low, -high) - (jnp.abs(axis) * half_size).sum(-1)
-    return jnp.where(size > PARALLEL, gap / jnp.maximum(size, PARALLEL), -jnp.inf).max(0)
+    gaps = []
+    for axis in axes:
+        size = jnp.sqrt((axis * axis).sum(-1))
+        low, high = low_high(axis)
+        gap = jnp.maximum(low, -high) - (jnp.abs(axis) * half_size).sum(-1)
+        gaps.append(jnp.where(size > PARALLEL, gap / jnp.maximum(size, PARALLEL), -jnp.inf))
+    return functools.reduce(jnp.maximum, gaps)
 
 
 def _from_boxes(center: Array, sides: list[Array], extent: Array, half_size: Array) -> Array:
@@ -168,11 +169,10 @@ def _from_triangles(corners: list[Array], half_size: Array) -> Array:
 
 def _normals(directions: list[Array]) -> list[Array]:
     """Return the common normals of the box's sides and each of `directions`."""
-    direction = jnp.stack(directions)
     return [
-        normal
+        cross(jnp.broadcast_to(box_axis, direction.shape), direction)
         for box_axis in _BOX_AXES
-        for normal in cross(jnp.broadcast_to(box_axis, direction.shape), direction)
+        for direction in directions
     ]
 
 
