@@ -16,7 +16,7 @@ TRUE = 4e-7
 
 @pytest.fixture(scope="module")
 def blown():
-    return flights(3, 5, 6.0, blade_flapping=(TRUE,))
+    return flights(3, 5, 5.0, blade_flapping=(TRUE,))
 
 
 def test_flapping_is_within_its_interval_and_none_without_what_it_needs(blown):
@@ -31,7 +31,7 @@ def test_flapping_is_within_its_interval_and_none_without_what_it_needs(blown):
     hover = np.full(len(blown[0].time_s), 9.81)
     bare = [replace(log, rotor_speed=None, thrust_cmd=hover) for log in blown]
     assert flapping_of(bare, VEHICLE) is None
-    still = flights(3, 6, 4.0)
+    still = flights(3, 6, 3.0)
     assert flapping_of(still, VEHICLE) is None, "of a vehicle without flapping"
 
 

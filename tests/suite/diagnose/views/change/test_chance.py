@@ -7,7 +7,7 @@ from suite.diagnose.estimate.permutation import corrected_p_values
 from suite.diagnose.evidence.moments import ViewData, Weights, whitened
 
 FREEDOM = 12
-SIZES = np.random.default_rng(0).chisquare(FREEDOM, (999, 3)) / FREEDOM
+SIZES = np.random.default_rng(0).chisquare(FREEDOM, (299, 3)) / FREEDOM
 
 
 def searched(slope, groups, truth=0.0, fitted=(), seed=0):
@@ -64,7 +64,7 @@ def test_what_all_flights_are_judged_from_is_off_for_all_alike():
     weights = Weights(np.full(3, 1e-3), np.ones(3), np.ones(3), np.full(3, 1.0 / np.sqrt(few)))
     unknown = weights._replace(trim=np.array([1.0, np.inf, 1.0]))
     sums = {"with it": [], "without": []}
-    for _ in range(2000):
+    for _ in range(1000):
         base = rng.standard_normal((few, 3)).mean(axis=0)
         residual = rng.standard_normal((many, 3)) - base
         slope, none = np.ones((many, 3, 1)), np.zeros((many, 3, 0))
