@@ -52,7 +52,9 @@ from suite.diagnose.verdict.gap import (
     true_starts,
 )
 from suite.diagnose.verdict.residual_structure import (
+    DisturbanceEquations,
     ResidualStructure,
+    beyond_model_error,
     disturbance_equations,
     residual_structure,
 )
@@ -180,7 +182,10 @@ class RolloutSource(Source):
         """
         structure, wind = self._structure(found, seed)
         details = {
-            "shapes": [shape._asdict() for shape in structure.shapes[:SHAPES]],
+            "shapes": [
+                {"label": shape.label, "gain": shape.gain, "p_value": shape.p_value}
+                for shape in structure.shapes[:SHAPES]
+            ],
             "coloured": structure.coloured,
         }
         share = remaining_share(*gaps) if found.named else 0.0
@@ -206,17 +211,27 @@ class RolloutSource(Source):
         equations = disturbance_equations(model, windows, whitening, found.estimate, limits)
         fold = folds_of(windows.flight, windows.start_s, limits.folds)
         residual = residual_structure(equations, fold, seed, limits)
+        wind = self._wind(found, equations, residual)
+        if self.coarser is not None:
+            coarse = disturbance_equations(model, self.coarser, whitening, found.estimate, limits)
+            residual = beyond_model_error(residual, equations, coarse, self.coarser_share, limits)
+        return residual, wind
+
+    def _wind(
+        self, found: SearchResult, equations: DisturbanceEquations, residual: ResidualStructure
+    ) -> TestedEffect | None:
+        """Return the random wind that causes the remaining error, if any."""
         force_p_values = [p for axis, p in residual.coloured.items() if axis.startswith("force")]
-        if not any(p <= limits.colour_p_value for p in force_p_values):
-            return residual, None
-        found_wind = find_turbulence(model, found.estimate.theta, equations, limits)
+        if not any(p <= self.limits.colour_p_value for p in force_p_values):
+            return None
+        found_wind = find_turbulence(self.model, found.estimate.theta, equations, self.limits)
         if found_wind is None:
-            return residual, None
+            return None
         # Wind is not named if a force that is a simple function of the state explains more.
         (wind, log_ratio), shape = found_wind, residual.shapes[0]
-        if shape.p_value <= limits.shape_p_value and shape.gain > log_ratio:
-            return residual, None
-        return residual, wind
+        if shape.p_value <= self.limits.shape_p_value and shape.gain > log_ratio:
+            return None
+        return wind
 
     def _swing(self, theta: np.ndarray) -> Swing | None:
         """Return an oscillating force in the flights' force errors at `theta` (P,), if any.

@@ -29,6 +29,7 @@ from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.actuators import TestedEffect
 from suite.diagnose.verdict.disturbances import Swing
 from suite.diagnose.verdict.gap import EffectSize, Gap, upper_size
+from suite.diagnose.verdict.model_error import beyond_error
 
 LEAST_GAP = 1e-9
 """Lower limit of a gap minus its noise floor in a division, in the gap's unit."""
@@ -200,22 +201,6 @@ def sizes_by_effect(
             upper = upper_size(own_slope, certain[columns], width[columns], size_of)
         sizes[name] = (size_of(own_slope @ change[columns]), upper)
     return sizes
-
-
-def beyond_error(change: np.ndarray, error: np.ndarray, width: np.ndarray) -> bool:
-    """Return whether an effect is significantly more than the model's own error.
-
-    It is if a 95 % interval, widened by the error at both ends, does not contain zero. Where no
-    parameter is significant by itself, one has to change by more than the error.
-
-    Args:
-        change: (K,) fitted parameters minus those of the vehicle file.
-        error: (K,) changes of the parameters that the model's own numerical error may cause.
-        width: (K,) half-widths of the parameters' 95 % intervals.
-    """
-    distance = np.abs(change)
-    least = width if (distance > width).any() else 0.0
-    return bool((distance - error > least).any())
 
 
 @dataclass(frozen=True)

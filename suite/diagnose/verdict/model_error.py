@@ -110,6 +110,22 @@ def commands_are_slow(logs: Sequence[FlightLog], limits: Thresholds) -> bool:
     )
 
 
+def beyond_error(change: np.ndarray, error: np.ndarray, width: np.ndarray) -> bool:
+    """Return whether an effect, or a shape of the residual, is more than the model's own error.
+
+    It is if a 95 % interval, widened by the error at both ends, does not contain zero. Where no
+    parameter is significant by itself, one has to change by more than the error.
+
+    Args:
+        change: (K,) fitted parameters minus those of the vehicle file.
+        error: (K,) changes of the parameters that the model's own error may cause.
+        width: (K,) half-widths of the parameters' 95 % intervals.
+    """
+    distance = np.abs(change)
+    least = width if (distance > width).any() else 0.0
+    return bool((distance - error > least).any())
+
+
 def _difference(
     model: RolloutModel, theta: np.ndarray, linear: Linearisation, other: FlightWindows
 ) -> np.ndarray:

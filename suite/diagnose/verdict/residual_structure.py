@@ -10,6 +10,7 @@ energy than noise gives (a score test of a smooth random disturbance).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,10 +20,12 @@ from eval.effects.interface import GRAVITY
 from suite.diagnose.data.whitening import Whitening, block_of
 from suite.diagnose.data.windows import KNOTS, FlightWindows
 from suite.diagnose.estimate.block import Estimate
+from suite.diagnose.estimate.gauss_newton import Z95
 from suite.diagnose.estimate.permutation import permutation_test
 from suite.diagnose.evidence.rollout import Flown
 from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.verdict.model_error import beyond_error
 
 AXES = ("force x", "force y", "force z", "torque x", "torque y", "torque z")
 
@@ -49,6 +52,8 @@ class ShapeScore(NamedTuple):
     label: str
     gain: float
     p_value: float
+    columns: tuple[int, ...]
+    """Numbers of its columns in `ShapeLibrary.unit`."""
 
 
 class ResidualStructure(NamedTuple):
@@ -114,11 +119,48 @@ def residual_structure(
         seed,
         limits=limits,
     )
-    scores = [ShapeScore(g.label, *x) for g, *x in zip(groups, gains, p_values, strict=True)]
+    scores = [
+        ShapeScore(group.label, gain, p_value, group.columns)
+        for group, gain, p_value in zip(groups, gains, p_values, strict=True)
+    ]
     return ResidualStructure(
         sorted(scores, key=lambda shape: -shape.gain),
         {axis: _energy_p_value(equations, i, limits) for i, axis in enumerate(AXES)},
     )
+
+
+def beyond_model_error(
+    structure: ResidualStructure,
+    equations: DisturbanceEquations,
+    coarse: DisturbanceEquations,
+    share: float,
+    limits: Thresholds = THRESHOLDS,
+) -> ResidualStructure:
+    """Return `structure` without the significant shapes that the model's own error may explain.
+
+    Args:
+        structure: result of both tests.
+        equations: normal equations of the disturbance.
+        coarse: the same with fewer rotor speeds or commands as input, which makes the error larger.
+        share: share of the change of a shape's coefficients that counts as the error.
+        limits: threshold of significance.
+    """
+
+    def is_kept(shape: ShapeScore) -> bool:
+        value, width = _fit(equations, shape.columns)
+        error = share * np.abs(_fit(coarse, shape.columns)[0] - value)
+        return shape.p_value > limits.shape_p_value or beyond_error(value, error, width)
+
+    return structure._replace(shapes=[shape for shape in structure.shapes if is_kept(shape)])
+
+
+def _fit(equations: DisturbanceEquations, columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the coefficients (C,) of columns of the shapes, and half-widths of 95 % intervals."""
+    along = equations.shapes.unit[..., list(columns)]
+    transposed = np.swapaxes(along, 1, 2)
+    covariance = np.linalg.pinv((transposed @ equations.hessian @ along).sum(axis=0))
+    gradient = (transposed @ equations.gradient[..., None])[..., 0].sum(axis=0)
+    return covariance @ gradient, Z95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
 
 
 def _energy_p_value(equations: DisturbanceEquations, axis: int, limits: Thresholds) -> float:

@@ -9,9 +9,10 @@ import pytest
 
 from suite.diagnose.data.windows import SLICES
 from suite.diagnose.sources.examine import relevant_part
-from suite.diagnose.sources.source import beyond_error, sizes_by_effect
+from suite.diagnose.sources.source import sizes_by_effect
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.gap import Channel, EffectSize, rollout_size, upper_size, view_size
+from suite.diagnose.verdict.model_error import beyond_error
 
 LIMITS = Thresholds()
 

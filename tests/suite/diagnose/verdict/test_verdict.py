@@ -30,7 +30,7 @@ def slow_errors(size=1.0):
 
 
 def left(p_value=0.5, coloured=0.5):
-    shapes = [ShapeScore("force with the speed", 1.0, p_value)]
+    shapes = [ShapeScore("force with the speed", 1.0, p_value, ())]
     return ResidualStructure(shapes, dict.fromkeys(AXES, coloured))
 
 
