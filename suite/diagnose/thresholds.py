@@ -261,7 +261,8 @@ class Thresholds:
     structure: float = 1.15
     """Ratio of the energy of slow errors to its expectation, above which they are not noise."""
     structure_rotor_input: float = 1.3
-    """The same if measured rotor speeds are the input; their noise is less certain."""
+    """The same if measured rotor speeds are the input, or if the log lacks commands; the noise is
+    then less certain."""
     unexplained_share: float = 0.7
     """Largest remaining share of the gap for the verdict `partly`; above it, it is `unknown`."""
     wind_lengths_m: tuple[float, float, int] = (0.5, 40.0, 25)

@@ -193,7 +193,8 @@ class RolloutSource(Source):
             return Remaining(False, share, details=details)
         # Slow errors are those that a low polynomial over a window describes: noise has few.
         slow = of_rollouts(found.last).slow_errors(found.last.block)
-        where = structure_where(slow, structure, self.rotor_input, self.limits)
+        is_uncertain = self.rotor_input or self.coarser is not None
+        where = structure_where(slow, structure, is_uncertain, self.limits)
         swing = self._swing(found.estimate.theta) if wind or where else None
         # Wind explains the structure, unless the force oscillates regularly.
         if wind and not swing:
@@ -324,7 +325,7 @@ class RolloutSource(Source):
 def structure_where(
     slow_errors: tuple[np.ndarray, np.ndarray],
     residual: ResidualStructure,
-    rotor_input: bool,
+    noise_is_uncertain: bool,
     limits: Thresholds = THRESHOLDS,
 ) -> str | None:
     """Return in words the quantity that a structured residual depends on; None if it is noise.
@@ -332,8 +333,9 @@ def structure_where(
     Args:
         slow_errors: energy of slow errors and its expectation, from `RolloutEvidence.slow_errors`.
         residual: result of the tests for structure.
-        rotor_input: whether measured rotor speeds are the input. The size of their noise is less
-            certain, so the thresholds are higher.
+        noise_is_uncertain: whether measured rotor speeds are the input, or commands of which the
+            log lacks some. The size of the noise is then less certain, so the thresholds are
+            higher.
         limits: thresholds above which structure is not noise.
     """
     slow, expected = slow_errors
@@ -344,9 +346,9 @@ def structure_where(
     coloured = [
         axis
         for axis, p_value in residual.coloured.items()
-        if p_value <= limits.colour_p_value and not rotor_input
+        if p_value <= limits.colour_p_value and not noise_is_uncertain
     ]
-    least = limits.structure_rotor_input if rotor_input else limits.structure
+    least = limits.structure_rotor_input if noise_is_uncertain else limits.structure
     if not (shape or coloured or slow.sum() / expected.sum() > least):
         return None
     where = [shape.label] if shape else []

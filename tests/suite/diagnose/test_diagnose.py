@@ -24,6 +24,8 @@ from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.page import page
+from suite.diagnose.sources import rollout_source
+from suite.diagnose.sources.rollout_source import RolloutSource
 from suite.diagnose.sources.rollouts import LACKING
 from suite.diagnose.thresholds import Thresholds
 from tests.support import diagnosis_flights
@@ -274,6 +276,11 @@ def test_without_noise_the_models_own_error_is_no_finding(vehicle, drive):
 
 def test_commands_between_the_rows_of_a_log_are_no_effect(monkeypatch):
     """If the log has every command, its slow rows limit nothing."""
+    uncertain = list[bool]()
+    monkeypatch.setattr(RolloutSource, "is_relevant", lambda *_: True)
+    monkeypatch.setattr(
+        rollout_source, "structure_where", lambda *got: uncertain.append(got[2])
+    )
     logs = flights(LAGGED, duration_s=5.0, noise=0.1)
     found = diagnose([rows_of(log, slice(0, None, 2)) for log in logs], LAGGED, drive="commands")
     assert (found.verdict.label, found.named) == ("no_gap", [])
@@ -283,6 +290,7 @@ def test_commands_between_the_rows_of_a_log_are_no_effect(monkeypatch):
     found = diagnose(flights(LAGGED, duration_s=5.0, noise=0.1), LAGGED, drive="commands")
     assert (found.verdict.label, found.named) == ("no_gap", [])
     assert LACKING not in found.warnings
+    assert uncertain == [True, False], "the noise counts as certain only if no command is lacking"
 
 
 def rows_of(log, rows):
