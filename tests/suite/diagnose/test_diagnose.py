@@ -278,9 +278,7 @@ def test_commands_between_the_rows_of_a_log_are_no_effect(monkeypatch):
     """If the log has every command, its slow rows limit nothing."""
     uncertain = list[bool]()
     monkeypatch.setattr(RolloutSource, "is_relevant", lambda *_: True)
-    monkeypatch.setattr(
-        rollout_source, "structure_where", lambda *got: uncertain.append(got[2])
-    )
+    monkeypatch.setattr(rollout_source, "structure_where", lambda *got: uncertain.append(got[2]))
     logs = flights(LAGGED, duration_s=5.0, noise=0.1)
     found = diagnose([rows_of(log, slice(0, None, 2)) for log in logs], LAGGED, drive="commands")
     assert (found.verdict.label, found.named) == ("no_gap", [])
