@@ -93,8 +93,8 @@ def collect(
         rows |= {t: row for t, r in journal.done.items() if (row := _row(out, r)) is not None}
         _fly_missing(collection, trial_set, policy, out, rows, journal, console, workers)
         flights = [rows[trial] for trial in trial_set.trials]
-        listing = {**stamp(1, collection.seed), **settings, "as_flown": as_flown}
-        listing["flights"] = flights
+        made = {"as_flown": as_flown, "flights": flights}
+        listing = {**stamp(1, collection.seed), **settings, **made}
         write_json(out / LIST, listing)
     (out / JOURNAL).unlink()
     write_run_record(out, collection, collection.seed)

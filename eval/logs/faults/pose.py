@@ -17,7 +17,7 @@ from eval.effects.interface import GRAVITY
 from eval.importers.frames import conjugate, multiply, rotate, rotation_vector
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.reading import ORDERS, axes_matrix, option, read_as
-from eval.logs.faults.relation import Match, match, rms, smooth
+from eval.logs.faults.relation import Match, match, rms, rms_of_squares, smooth
 from eval.logs.velocity import velocity_from_position
 
 Rows = Mapping[str, np.ndarray]
@@ -356,9 +356,10 @@ def _force_misfits(
         wrong = (side**2).sum(axis=0) + np.minimum(force[2], 0.0) ** 2  # thrust only pushes
         tilt = GRAVITY * body[:2, 2]
         leaning = (tilt - tilt.mean(axis=-1, keepdims=True)) ** 2
-        level = _rms_of(((changes[:, :2] @ acc) ** 2).sum(axis=1))
-        level = np.maximum(level, _rms_of(leaning.sum(axis=0)))
-        misfit = _rms_of(wrong) / np.maximum(level, CALM_ACC)
+        level = rms_of_squares(((changes[:, :2] @ acc) ** 2).sum(axis=1))
+        level = np.maximum(level, rms_of_squares(leaning.sum(axis=0)))
+        # A velocity may be unknown where the acceleration is not; the misfit is then 0.
+        misfit = np.nan_to_num(rms_of_squares(wrong)) / np.maximum(level, CALM_ACC)
         pairs = zip(misfit.tolist(), level.tolist(), strict=True)
         found |= {(pos, length): pair for (pos, _), pair in zip(POSITIONS, pairs, strict=True)}
     return found
@@ -368,9 +369,3 @@ def _in_body(changes: np.ndarray, body: np.ndarray, value: np.ndarray) -> np.nda
     """Return vectors (3, N) after each change (C, 3, 3) along body axes (3, K, N): (K, C, N)."""
     products = (body[:, None] * value[None, :, None]).transpose(2, 0, 1, 3)
     return changes.reshape(len(changes), 9) @ products.reshape(body.shape[1], 9, -1)
-
-
-def _rms_of(squared: np.ndarray) -> np.ndarray:
-    """Return `relation.rms` of squared sizes (..., N), which are finite, or NaN for 0."""
-    kept = max(1, int(0.95 * squared.shape[-1]))
-    return np.nan_to_num(np.sqrt(np.sort(squared, axis=-1)[..., :kept].mean(axis=-1)))

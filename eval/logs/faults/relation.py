@@ -149,9 +149,14 @@ def shift_rows(values: np.ndarray, count: int) -> np.ndarray:
 def rms(value: np.ndarray) -> float:
     """Return the root mean square of the smallest 95 % of rows, so that glitches do not count."""
     squared = np.sum(np.atleast_2d(value.T).T ** 2, axis=1)
-    squared = np.sort(squared[np.isfinite(squared)])
-    squared = squared[: max(1, int(0.95 * len(squared)))]
-    return float(np.sqrt(np.mean(squared))) if len(squared) else 0.0
+    squared = squared[np.isfinite(squared)]
+    return float(rms_of_squares(squared)) if len(squared) else 0.0
+
+
+def rms_of_squares(squared: np.ndarray) -> np.ndarray:
+    """Return `rms` (...) of rows whose squared sizes (..., N) are given and finite."""
+    kept = max(1, int(0.95 * squared.shape[-1]))
+    return np.sqrt(np.sort(squared, axis=-1)[..., :kept].mean(axis=-1))
 
 
 def jackknife_error(left_out: np.ndarray) -> float:

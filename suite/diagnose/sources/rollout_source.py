@@ -213,7 +213,8 @@ class RolloutSource(Source):
         fold = folds_of(windows.flight, windows.start_s, limits.folds)
         residual = residual_structure(equations, fold, seed, limits)
         wind = self._wind(found, equations, residual)
-        if self.coarser is not None:
+        is_significant = any(s.p_value <= limits.shape_p_value for s in residual.shapes)
+        if self.coarser is not None and is_significant:
             coarse = disturbance_equations(model, self.coarser, whitening, found.estimate, limits)
             residual = beyond_model_error(residual, equations, coarse, self.coarser_share, limits)
         return residual, wind

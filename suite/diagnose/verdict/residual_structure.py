@@ -105,10 +105,8 @@ def residual_structure(
         limits: number of draws, and thresholds.
     """
     # From forces and torques at the knots to coefficients of the shapes.
-    along, groups = equations.shapes.unit, equations.shapes.groups
-    transposed = np.swapaxes(along, 1, 2)
-    hessian = transposed @ equations.hessian @ along
-    gradient = (transposed @ equations.gradient[..., None])[..., 0]
+    groups = equations.shapes.groups
+    hessian, gradient = _along(equations, equations.shapes.unit)
     size = np.sqrt(np.maximum(np.einsum("wjj->j", hessian), 1e-12))
     gains, p_values, _ = permutation_test(
         hessian / np.outer(size, size),
@@ -147,20 +145,28 @@ def beyond_model_error(
     """
 
     def is_kept(shape: ShapeScore) -> bool:
+        if shape.p_value > limits.shape_p_value:
+            return True
         value, width = _fit(equations, shape.columns)
         error = share * np.abs(_fit(coarse, shape.columns)[0] - value)
-        return shape.p_value > limits.shape_p_value or beyond_error(value, error, width)
+        return beyond_error(value, error, width)
 
     return structure._replace(shapes=[shape for shape in structure.shapes if is_kept(shape)])
 
 
 def _fit(equations: DisturbanceEquations, columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Return the coefficients (C,) of columns of the shapes, and half-widths of 95 % intervals."""
-    along = equations.shapes.unit[..., list(columns)]
-    transposed = np.swapaxes(along, 1, 2)
-    covariance = np.linalg.pinv((transposed @ equations.hessian @ along).sum(axis=0))
-    gradient = (transposed @ equations.gradient[..., None])[..., 0].sum(axis=0)
-    return covariance @ gradient, Z95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    hessian, gradient = _along(equations, equations.shapes.unit[..., list(columns)])
+    covariance = np.linalg.pinv(hessian.sum(axis=0))
+    half_width = Z95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return covariance @ gradient.sum(axis=0), half_width
+
+
+def _along(equations: DisturbanceEquations, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return J'J (W, C, C) and J'r (W, C) by coefficients of the columns `unit` (W, 6 KNOTS, C)."""
+    transposed = np.swapaxes(unit, 1, 2)
+    gradient = (transposed @ equations.gradient[..., None])[..., 0]
+    return transposed @ equations.hessian @ unit, gradient
 
 
 def _energy_p_value(equations: DisturbanceEquations, axis: int, limits: Thresholds) -> float:
