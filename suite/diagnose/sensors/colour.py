@@ -263,15 +263,20 @@ def _drift(flights: Sequence[Series]) -> Interval:
     variograms = _variograms(flights, lag_s)
     if variograms is None:
         return ZERO
-    # A line in the lag: a constant for the noise, and a slope for the drift.
-    root = np.sqrt(variograms.weight)
+    # A line in the lag: a constant for the noise, and a slope for the drift. The variance of a
+    # variogram g grows like g^2 times the lag (Cressie 1993, section 2.4).
+    pooled = (variograms.weight * variograms.value).sum(axis=0)
+    root = np.sqrt(variograms.weight / lag_s) / np.maximum(pooled, 1e-300)
     columns = [np.ones_like(root), 0.5 * variograms.speed * lag_s]
     slope = np.stack(columns, axis=-1) * root[..., None]
     flat, measured = slope.reshape(-1, 2), (root * variograms.value).ravel()
     theta = np.linalg.lstsq(flat, measured, rcond=None)[0]
     half = _half_widths(slope, measured - flat @ theta, variograms.flight)[1]
-    ends = np.clip([theta[1], theta[1] - half, theta[1] + half], 0.0, None)
-    return Interval(*(float(v) for v in np.sqrt(ends)))
+    # A variance that is estimated too low seems too certain. So the upper end is that of an
+    # interval of the logarithm; the lower end can be 0.
+    power, half = max(float(theta[1]), 0.0), float(half)
+    high = max(power + half, power * np.exp(half / power) if half < power else 0.0)
+    return Interval(*(float(v) for v in np.sqrt([power, max(power - half, 0.0), high])))
 
 
 def _variograms(flights: Sequence[Series], lag_s: np.ndarray | None) -> _Variograms | None:

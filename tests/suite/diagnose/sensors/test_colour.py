@@ -33,3 +33,16 @@ def test_a_drift_and_the_noise_around_it_have_their_true_sizes(monkeypatch):
     fitted = found.noise.value, found.lasts_s.value, found.drift.value
     # At the shortest lag of the drift's fit, 2 s, exp(-10) of the noise is still correlated.
     assert fitted == pytest.approx((SD, LASTS_S, DRIFT), rel=1e-3)
+
+
+def test_a_drift_of_flights_is_significant_and_within_its_interval():
+    rng, count, step_s = np.random.default_rng(3), 60, 0.1
+    steps = DRIFT * np.sqrt(SPEED * step_s) * rng.normal(size=(count, 4, ROWS))
+    values = SD * rng.normal(size=steps.shape) + steps.cumsum(axis=2)
+    found = [
+        colour._drift([Series(value, np.full(ROWS, SPEED), step_s) for value in flights])
+        for flights in values
+    ]
+    assert sum(drift.low > 0.0 for drift in found) > 0.6 * count
+    assert sum(drift.low <= DRIFT <= drift.high for drift in found) > 0.85 * count
+    assert np.median([drift.value for drift in found]) == pytest.approx(DRIFT, rel=0.1)
