@@ -65,7 +65,7 @@ def digest(out: Path) -> str:
     sums = hashlib.sha256()
     paths = {path for pattern in COMPARED for path in out.rglob(pattern)}
     for path in sorted(paths):
-        sums.update(f"{path.relative_to(out)}\\0".encode() + _content(path))
+        sums.update(f"{path.relative_to(out)}\0".encode() + _content(path))
     return sums.hexdigest()[:16] if paths else "nothing"
 
 

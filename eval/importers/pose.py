@@ -10,7 +10,6 @@ least squares (Gauss-Newton; the rotation by Kabsch 1976).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -228,7 +227,8 @@ def align(quat: Signal, rate: Signal, name: str, mirrored: bool = False) -> Alig
     offset = _coarse_offset(centre_s, pose_rate_b, rate, name)
     shared = (centre_s + offset > rate.time_s[0]) & (centre_s + offset < rate.time_s[-1])
     middle = float(np.mean(centre_s[shared]))
-    fit = _Fit(offset, 0.0, np.eye(3), 0.0, np.inf, np.inf)
+    # During the fit, the offset is that in the middle of the flight.
+    fit = Alignment(offset, 0.0, np.eye(3), 0.0, np.inf, np.inf)
     reach, full_reach = FIRST_REACH_S, float(np.max(np.abs(centre_s - middle)))
     # From the middle outwards, because over a long flight the drift is too large for one step.
     while True:
@@ -242,20 +242,7 @@ def align(quat: Signal, rate: Signal, name: str, mirrored: bool = False) -> Alig
         if reach >= full_reach:
             break
         reach *= 2.0
-    start = fit.offset - fit.drift * middle
-    return Alignment(start, fit.drift, fit.rotation, fit.correlation, fit.offset_sd, fit.drift_sd)
-
-
-class _Fit(NamedTuple):
-    """State of the least-squares fit; the fields of `Alignment`, with the offset in the middle."""
-
-    offset: float
-    """Log's clock minus pose's clock in the middle of the flight [s]."""
-    drift: float
-    rotation: np.ndarray
-    correlation: float
-    offset_sd: float
-    drift_sd: float
+    return replace(fit, offset_s=fit.offset_s - fit.drift * middle)
 
 
 def _refine(
@@ -263,11 +250,11 @@ def _refine(
     pose_rate_b: np.ndarray,
     rate: Signal,
     middle: float,
-    fit: _Fit,
+    fit: Alignment,
     mirrored: bool,
-) -> tuple[_Fit, np.ndarray]:
+) -> tuple[Alignment, np.ndarray]:
     """Return the result of one Gauss-Newton step from `fit`, and the change of offset and drift."""
-    time_s = centre_s + fit.offset + fit.drift * (centre_s - middle)
+    time_s = centre_s + fit.offset_s + fit.drift * (centre_s - middle)
     in_gyro_log = (time_s > rate.time_s[0] + SPAN_S) & (time_s < rate.time_s[-1] - SPAN_S)
     if np.sum(in_gyro_log) < MIN_SAMPLES:
         return fit, np.zeros(2)
@@ -296,9 +283,9 @@ def _refine(
     # Neighbouring body rates share samples, which reduces the number of independent body rates.
     overlap = max(1.0, SPAN_S / median_step(centre_s))
     variance = overlap * noise / np.maximum(np.diag(normal)[:2], 1e-12)
-    offset, drift = fit.offset - change[0], fit.drift - change[1]
+    offset, drift = fit.offset_s - change[0], fit.drift - change[1]
     correlation = _correlation(gyro, rotated)
-    return _Fit(offset, drift, rotation, correlation, *np.sqrt(variance).tolist()), change
+    return Alignment(offset, drift, rotation, correlation, *np.sqrt(variance).tolist()), change
 
 
 def _pose_rates(quat: Signal) -> tuple[np.ndarray, np.ndarray]:

@@ -29,14 +29,11 @@ from eval.vehicles.vehicle import Vehicle
 from eval.worlds import REFERENCE, World, action_argument, compiles, world_class
 from eval.worlds.slots import layout_of, slot_groups
 from eval.worlds.trial import (
-    DIVERGED,
-    ENDINGS,
-    FINISHED,
     FLYING,
-    TIMEOUT,
     Rules,
     TrialResult,
     TrialSpec,
+    result_columns,
     steps_to_next,
     track_of,
 )
@@ -370,29 +367,16 @@ class _Slots:
         """Return the result of the trial in `slot`, which has ended."""
         trial, task = self._trial[slot], self._task
         assert trial is not None
-        progress = self._world.progress
-        ended, step = int(progress.ended[slot]) or TIMEOUT, int(progress.step[slot])
-        ending = ENDINGS[ended - 1]
-        speeds = step + (ended != DIVERGED)  # number of speeds in v_sum
+        columns = result_columns(self._world.progress, slot, self._world.dt)
+        is_collision = columns["ended_by"] == "collision"
         bad, limited, late = map(int, self._faults[slot])
-        x, y, z = map(float, progress.pos_w[slot])
         return TrialResult(
             *trial,
+            **columns,
             policy=self._policy.name,
             vehicle=task.vehicle.name,
             world=self._world.name,
-            success=ended == FINISHED,
-            gates_passed=int(progress.gates[slot]),
-            ended_by=ending,
-            collided_with=self._world.collided_with(slot) if ending == "collision" else None,
-            pos_x=x,
-            pos_y=y,
-            pos_z=z,
-            time_s=step * self._world.dt,
-            v_max=float(progress.v_max[slot]),
-            v_mean=float(progress.v_sum[slot]) / max(speeds, 1),
-            gates_8s=int(progress.gates_8s[slot]),
-            gates_035=int(progress.gates_035[slot]),
+            collided_with=self._world.collided_with(slot) if is_collision else None,
             bad_actions=bad,
             limited_actions=limited,
             late_actions=late,

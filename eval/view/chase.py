@@ -12,6 +12,8 @@ from eval.view.scene3d import Faces, Lines, divide_faces, look_at, paint
 from eval.view.solids import track_solids
 from tracks.track import Track
 
+FOV_DEG = 78.0
+"""Horizontal field of view of pictures and videos [deg]."""
 OVERSAMPLING = 2
 """Factor by which pictures are drawn larger before they are reduced, for smooth edges."""
 ARM_M, ROTOR_RADIUS_M = 0.12, 0.0635
@@ -19,7 +21,7 @@ ARM_M, ROTOR_RADIUS_M = 0.12, 0.0635
 BODY_HALF_SIZE_M = (0.064, 0.064, 0.025)
 """Half extents of the drawn body [m]."""
 BEHIND_M, ABOVE_M, AHEAD_M = 1.5, 0.55, 1.2
-"""Distances of `chase_image`'s camera behind and above the drone, and of its target ahead [m]."""
+"""Distances of the camera behind and above the drone, and of its target ahead [m]."""
 MIN_EYE_HEIGHT_M = 0.15
 """Least height of the camera above the ground [m]."""
 NO_LINES = Lines(np.zeros((0, 2, 3)), np.zeros((0, 3)), 0.0)
@@ -60,7 +62,6 @@ def draw_drone(
     scenery: Scenery,
     drone: Drone,
     eye_to_w: tuple[np.ndarray, np.ndarray],
-    fov_deg: float,
     size: tuple[int, int],
     lines: Lines = NO_LINES,
 ) -> Image.Image:
@@ -70,7 +71,6 @@ def draw_drone(
         scenery: triangles of the track.
         drone: the drone; its number of passed gates determines the gates' colours.
         eye_to_w: the camera's position and its target, (3,) each [m].
-        fov_deg: horizontal field of view [deg].
         size: width and height [pixels].
         lines: additional lines.
     """
@@ -82,11 +82,20 @@ def draw_drone(
         np.concatenate([_track_colour(scenery.gate[visible], drone.gates), body.colour]),
     )
     oversampled = size[0] * OVERSAMPLING, size[1] * OVERSAMPLING
-    return paint(look_at(eye, target, fov_deg, oversampled), faces, lines).reduce(OVERSAMPLING)
+    return paint(look_at(eye, target, FOV_DEG, oversampled), faces, lines).reduce(OVERSAMPLING)
+
+
+def camera_behind(pos_w: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return eye and target (..., 3) [m] of a camera that looks along `direction` (..., 2)."""
+    size = np.linalg.norm(direction, axis=-1, keepdims=True)
+    ahead = np.insert(direction / np.maximum(size, 1e-6), 2, 0.0, axis=-1)
+    eye_w = pos_w - BEHIND_M * ahead + [0.0, 0.0, ABOVE_M]
+    eye_w[..., 2] = np.maximum(eye_w[..., 2], MIN_EYE_HEIGHT_M)
+    return eye_w, pos_w + AHEAD_M * ahead
 
 
 def chase_image(
-    scenery: Scenery, drone: Drone, vel_w: np.ndarray, size: tuple[int, int], fov_deg: float = 78.0
+    scenery: Scenery, drone: Drone, vel_w: np.ndarray, size: tuple[int, int]
 ) -> np.ndarray:
     """Return a picture (height, width, 3) uint8 from behind a drone.
 
@@ -95,15 +104,10 @@ def chase_image(
         drone: the drone.
         vel_w: (3,) velocity of the drone [m/s], along which the camera looks.
         size: width and height [pixels].
-        fov_deg: horizontal field of view [deg].
     """
     # The heading is added, so that the direction is defined for a drone at rest too.
-    direction = vel_w[:2] + 0.5 * drone.rot_w[:2, 0]
-    ahead = np.append(direction / max(float(np.linalg.norm(direction)), 1e-6), 0.0)
-    eye = drone.pos_w - BEHIND_M * ahead + [0.0, 0.0, ABOVE_M]
-    eye[2] = max(eye[2], MIN_EYE_HEIGHT_M)
-    target = drone.pos_w + AHEAD_M * ahead
-    return np.asarray(draw_drone(scenery, drone, (eye, target), fov_deg, size))
+    camera = camera_behind(drone.pos_w, vel_w[:2] + 0.5 * drone.rot_w[:2, 0])
+    return np.asarray(draw_drone(scenery, drone, camera, size))
 
 
 def inset(picture: np.ndarray, depth_m: np.ndarray, range_m: float, share: int) -> np.ndarray:

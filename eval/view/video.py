@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from eval.logs.flight import Flight
 from eval.view import colours
-from eval.view.chase import AHEAD_M, MIN_EYE_HEIGHT_M, Drone, draw_drone, scenery_of
+from eval.view.chase import ABOVE_M, Drone, camera_behind, draw_drone, scenery_of
 from eval.view.scene3d import SKY, Lines
 from eval.view.video_file import write_gif, write_mp4
 from eval.worlds.trial import TrialResult
@@ -39,20 +39,12 @@ HEADING_SMOOTHING_S, POSITION_SMOOTHING_S = 0.25, 0.06
 
 @dataclass(frozen=True)
 class VideoOptions:
-    """Size, speed and camera of a video."""
+    """Size and rate of a video."""
 
     size: tuple[int, int] = (960, 540)
     """Width and height, even numbers [pixels]."""
     fps: int = 30
     """Frames per second of the video."""
-    slowdown: float = 1.0
-    """Duration of the video divided by the duration of the flight; 2 plays at half speed."""
-    fov_deg: float = 78.0
-    """Horizontal field of view [deg]."""
-    behind_m: float = 1.5
-    """Distance of the camera behind the drone [m]."""
-    above_m: float = 0.55
-    """Height of the camera above the drone [m]."""
     hold_s: float = 1.0
     """Duration of the last frame [s]."""
 
@@ -64,7 +56,7 @@ SMALL = VideoOptions(size=(720, 360), fps=12)
 def frame_times(flight: Flight, options: VideoOptions) -> np.ndarray:
     """Return the time in the flight of each frame (F,) [s]; the last frame is repeated."""
     end = float(flight.time_s[-1])
-    times = np.arange(float(flight.time_s[0]), end, 1 / (options.fps * options.slowdown))
+    times = np.arange(float(flight.time_s[0]), end, 1 / options.fps)
     return np.concatenate([times, np.full(max(1, round(options.hold_s * options.fps)), end)])
 
 
@@ -120,7 +112,7 @@ def video_frames(
     segments_w = np.stack([flight.pos_w[:-1], flight.pos_w[1:]], axis=1)
     path_colour = colours.speed_colours(speed[:-1], top)
     rot_w = quat_to_rot(flight.quat_wxyz)
-    eye_w, target_w = _chase_camera(flight, rot_w, options)
+    eye_w, target_w = _chase_camera(flight, rot_w)
     policy_rows = np.flatnonzero(flight.policy_step)
     images = flight.depth_m if flight.depth_m is not None and len(flight.depth_m) else None
     side_width = 0 if images is None else round(options.size[0] * SIDE_SHARE)
@@ -135,7 +127,7 @@ def video_frames(
         lines = Lines(segments_w[trail], path_colour[trail], 0.03)
         drone = Drone(pos, rot_w[row], passed)
         frame = Image.new("RGB", options.size, SKY)
-        frame.paste(draw_drone(scenery, drone, (eye, target), options.fov_deg, size, lines))
+        frame.paste(draw_drone(scenery, drone, (eye, target), size, lines))
         if images is not None:
             number = int(np.searchsorted(policy_rows, row, side="right")) - 1
             _draw_depth(frame, side_width, images[min(max(number, 0), len(images) - 1)])
@@ -166,9 +158,7 @@ def _interpolate(flight: Flight, values: np.ndarray, time: float) -> np.ndarray:
     return np.array([np.interp(time, flight.time_s, column) for column in values.T])
 
 
-def _chase_camera(
-    flight: Flight, rot_w: np.ndarray, options: VideoOptions
-) -> tuple[np.ndarray, np.ndarray]:
+def _chase_camera(flight: Flight, rot_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the camera's position and target for every row, (T, 3) each [m]."""
     step_s = max(float(np.median(np.diff(flight.time_s))), 1e-6)
 
@@ -177,13 +167,8 @@ def _chase_camera(
 
     # The heading is added, so that the direction is defined for a drone at rest too.
     direction = smooth(flight.vel_w[:, :2] + 0.5 * rot_w[:, :2, 0], HEADING_SMOOTHING_S)
-    direction = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-6)
-    ahead = np.insert(direction, 2, 0.0, axis=1)
-    pos_w = smooth(flight.pos_w, POSITION_SMOOTHING_S)
-    up = np.array([0.0, 0.0, options.above_m])
-    eye_w = pos_w - options.behind_m * ahead + up
-    eye_w[:, 2] = np.maximum(eye_w[:, 2], MIN_EYE_HEIGHT_M)
-    return eye_w, pos_w + AHEAD_M * ahead + 0.15 * up
+    eye_w, target_w = camera_behind(smooth(flight.pos_w, POSITION_SMOOTHING_S), direction)
+    return eye_w, target_w + [0.0, 0.0, 0.15 * ABOVE_M]
 
 
 def _draw_depth(frame: Image.Image, width: int, depth_m: np.ndarray) -> None:

@@ -30,9 +30,6 @@ from policies.spec import ActionSpec
 from tracks.geometry.camera import Camera
 from tracks.geometry.rotation import quat_to_rot, to_local
 
-MIN_LAG_STEPS = 1.0
-"""Least time constant of the rotors, in physics steps. RotorPy divides by the time constant, and
-its integrator is inaccurate for a shorter one."""
 XYZW = [1, 2, 3, 0]
 """Indices of x, y, z and w in a quaternion wxyz; RotorPy's are xyzw."""
 
@@ -83,15 +80,8 @@ class RotorpyWorld(SceneSlots):
         """
         rotorpy()
 
-    @staticmethod
-    def differences(vehicle: Vehicle) -> list[str]:
-        """Return a sentence for each deviation of the simulation from `vehicle`."""
-        return rotorpy_vehicle.differences(vehicle, _shortest_lag_s(vehicle))
-
-    @staticmethod
-    def nearest(vehicle: Vehicle) -> Vehicle:
-        """Return the vehicle file that describes the simulation of `vehicle` best."""
-        return rotorpy_vehicle.as_flown(vehicle, _shortest_lag_s(vehicle))
+    differences = staticmethod(rotorpy_vehicle.differences)
+    nearest = staticmethod(rotorpy_vehicle.as_flown)
 
     def _control(
         self,
@@ -128,11 +118,6 @@ class RotorpyWorld(SceneSlots):
         return ~valid
 
 
-def _shortest_lag_s(vehicle: Vehicle) -> float:
-    """Return the least time constant of the rotors that RotorPy simulates for `vehicle` [s]."""
-    return MIN_LAG_STEPS / vehicle.controller.frequency
-
-
 class Multirotor:
     """N independent multirotors of RotorPy with the same vehicle, in double precision."""
 
@@ -145,7 +130,8 @@ class Multirotor:
         import torch
 
         module, cpu = rotorpy(), torch.device("cpu")
-        parameters = rotorpy_vehicle.rotorpy_parameters(vehicle, MIN_LAG_STEPS * dt)
+        parameters = rotorpy_vehicle.rotorpy_parameters(vehicle)
+        parameters["tau_m"] = max(parameters["tau_m"], rotorpy_vehicle.shortest_lag_s(vehicle))
         self._dt, self._rows, self._mass = dt, torch.arange(count), parameters["mass"]
         start = {"x": torch.zeros(count, 3, dtype=torch.float64)}
         self._multirotor = module.BatchedMultirotor(

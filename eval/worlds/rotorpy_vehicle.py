@@ -39,13 +39,16 @@ AT_HOVER = "linear_drag"
 """Effect that is converted at hover, because RotorPy's drag is proportional to the rotor speed."""
 
 
-def rotorpy_parameters(vehicle: Vehicle, shortest_lag_s: float = 0.0) -> dict[str, Any]:
-    """Return RotorPy's parameters of a vehicle, without effects that it does not model.
+def shortest_lag_s(vehicle: Vehicle) -> float:
+    """Return the least time constant of the rotors, one physics step [s].
 
-    Args:
-        vehicle: the vehicle file.
-        shortest_lag_s: least time constant of the rotors [s], because RotorPy divides by it.
+    RotorPy divides by the time constant, and its integrator is inaccurate for a shorter one.
     """
+    return 1.0 / vehicle.controller.frequency
+
+
+def rotorpy_parameters(vehicle: Vehicle) -> dict[str, Any]:
+    """Return RotorPy's parameters of a vehicle, without effects that it does not model."""
     supported = (*ROTORPY_EFFECTS, AT_HOVER)
     effects = {name: value for name, value in vehicle.effects.items() if name in supported}
     modelled = replace(vehicle, effects=effects)
@@ -64,7 +67,7 @@ def rotorpy_parameters(vehicle: Vehicle, shortest_lag_s: float = 0.0) -> dict[st
         "rotor_speed_max": _max_rotor_speed(modelled),
         "k_eta": float(constants.thrust_coefficient[0]),
         "k_m": float(constants.torque_coefficient[0]),
-        "tau_m": max(float(constants.time_constant), shortest_lag_s),
+        "tau_m": float(constants.time_constant),
         "motor_noise_std": 0.0,
     }
     for name, convert in AIR.items():
@@ -94,28 +97,27 @@ def _hover_speed(parameters: Mapping[str, Any]) -> float:
     return float(np.sqrt(parameters["mass"] * GRAVITY / (4.0 * parameters["k_eta"])))
 
 
-def as_flown(vehicle: Vehicle, shortest_lag_s: float = 0.0) -> Vehicle:
+def as_flown(vehicle: Vehicle) -> Vehicle:
     """Return the vehicle file that describes RotorPy's model of `vehicle` best.
 
-    It is `vehicle` itself if there are no `differences`. The arguments are those of
-    `rotorpy_parameters`.
+    It is `vehicle` itself if there are no `differences`.
     """
-    if not differences(vehicle, shortest_lag_s):
+    if not differences(vehicle):
         return vehicle
     supported = (*ROTORPY_EFFECTS, *OUTSIDE)
     effects = {name: value for name, value in vehicle.effects.items() if name in supported}
     parameters = rotorpy_parameters(vehicle)
-    if parameters["tau_m"] < shortest_lag_s:
-        effects["motor_lag"] = EFFECTS["motor_lag"].values(shortest_lag_s)
+    if parameters["tau_m"] < shortest_lag_s(vehicle):
+        effects["motor_lag"] = EFFECTS["motor_lag"].values(shortest_lag_s(vehicle))
     if AT_HOVER in vehicle.effects:
         for name, key in (("rotor_drag", "k_d"), ("inflow", "k_z")):
             effects[name] = EFFECTS[name].values(parameters[key])
     if parameters["k_d"] or parameters["k_z"]:
-        effects["angular_damping"] = EFFECTS["angular_damping"].values(_hub_damping(parameters))
+        effects["angular_damping"] = EFFECTS["angular_damping"].values(damping_at_hover(parameters))
     return replace(vehicle, name=f"{vehicle.name}, as RotorPy flies it", effects=effects)
 
 
-def _hub_damping(parameters: Mapping[str, Any]) -> np.ndarray:
+def damping_at_hover(parameters: Mapping[str, Any]) -> np.ndarray:
     """Return the damping (3,) of rotations by the rotors' drag at their hubs, at hover [1/s].
 
     A rotor at r with the speed W has the force -W diag(k_d, k_d, k_z) (w x r) if the body turns at
@@ -128,11 +130,8 @@ def _hub_damping(parameters: Mapping[str, Any]) -> np.ndarray:
     return _hover_speed(parameters) * torque / inertia
 
 
-def differences(vehicle: Vehicle, shortest_lag_s: float) -> list[str]:
-    """Return a sentence for each deviation of RotorPy's model from `vehicle`.
-
-    The arguments are those of `rotorpy_parameters`.
-    """
+def differences(vehicle: Vehicle) -> list[str]:
+    """Return a sentence for each deviation of RotorPy's model from `vehicle`."""
     deviations = []
     if AT_HOVER in vehicle.effects:
         deviations.append(
@@ -143,10 +142,10 @@ def differences(vehicle: Vehicle, shortest_lag_s: float) -> list[str]:
         if coefficient[0] != coefficient[1]:
             deviations[-1] += ", the mean of x and y along both"
     parameters = rotorpy_parameters(vehicle)
-    if parameters["tau_m"] < shortest_lag_s:
+    if parameters["tau_m"] < shortest_lag_s(vehicle):
         deviations.append(
             f"rotors.time_constant: {parameters['tau_m']:g} s is shorter than RotorPy's steps can "
-            f"follow; flown with {shortest_lag_s:g} s"
+            f"follow; flown with {shortest_lag_s(vehicle):g} s"
         )
     if parameters["k_d"] or parameters["k_z"]:
         deviations.append(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from eval.quadrotor.plant import Motion, Wrench
 from tracks.families import make_track
@@ -253,3 +253,26 @@ def judge_state(
         v_sum=xp.where(live, progress.v_sum + speed, progress.v_sum),
         pos_w=xp.where(live[:, None], pos_w, progress.pos_w),
     )
+
+
+def result_columns(progress: Progress, slot: int, dt: float) -> dict[str, Any]:
+    """Return the columns of `TrialResult` that follow from the progress of the trial in `slot`.
+
+    A trial that has not ended counts as a timeout.
+    """
+    ended, step = int(progress.ended[slot]) or TIMEOUT, int(progress.step[slot])
+    x, y, z = map(float, progress.pos_w[slot])
+    speeds = step + (ended != DIVERGED)  # number of speeds in v_sum
+    return {
+        "success": ended == FINISHED,
+        "gates_passed": int(progress.gates[slot]),
+        "ended_by": ENDINGS[ended - 1],
+        "pos_x": x,
+        "pos_y": y,
+        "pos_z": z,
+        "time_s": step * dt,
+        "v_max": float(progress.v_max[slot]),
+        "v_mean": float(progress.v_sum[slot]) / max(speeds, 1),
+        "gates_8s": int(progress.gates_8s[slot]),
+        "gates_035": int(progress.gates_035[slot]),
+    }

@@ -34,7 +34,7 @@ from suite.blind.oracle.information import (
     log_ratio,
     remaining_ratio,
 )
-from suite.blind.outside import KINDS, changed_values, draw_change, make_outside, true_parameters
+from suite.blind.outside import KINDS, changed_values, draw_change, true_parameters
 from suite.blind.simulators import LogFlights, Simulator, simulator_for
 from suite.common.errors import WorkFailed
 from suite.diagnose.plan import SEPARATIONS
@@ -235,7 +235,7 @@ def _hide_outside(
 
     def fly_at(strength: float) -> tuple[LogFlights, float]:
         """Return flights at a strength, and the log-likelihood ratio that remains after a fit."""
-        extra = make_outside(name, strength, nominal.mass)
+        extra = kind.make(strength, nominal.mass)
         flown = simulator.fly(nominal, trajectories, rng, extra)
         return flown, unexplained_ratio(nominal, flown(None), sensors)
 

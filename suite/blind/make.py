@@ -8,6 +8,7 @@ and `OUT/manifest.json` the hashes of all files.
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -75,11 +76,13 @@ def make_set(
         if not ((out / "cases" / name).is_dir() and (out / "answers" / f"{name}.json").is_file())
     ]
     failed: dict[str, str] = {}
-    with console.progress("cases", len(cases)) as update:
+    made = itertools.count(len(cases) - len(names) + 1)
+    with console.progress("cases", len(cases), begun=len(cases) - len(names)) as update:
 
         def keep(number: int, built: Built | str) -> None:
             """Write the files of a case, or keep the reason why it cannot be made."""
             name = names[number]
+            update(next(made), name)
             if isinstance(built, str):
                 failed[name] = built
                 return
@@ -89,7 +92,6 @@ def make_set(
                 save_vehicle(built.nominal, temporary / "vehicle.toml")
                 for log in built.logs:
                     write_flight(temporary / f"{log.name}.parquet", log)
-            update(len(cases) - len(names) + number + 1, name)
 
         run_pieces(_build, [cases[name] for name in names], workers or 1, keep)
     manifest = Manifest({}, {})

@@ -19,7 +19,6 @@ from eval.effects.interface import GRAVITY
 from eval.quadrotor.plant import Command, Motion, Wrench
 from eval.vehicles.vehicle import Vehicle
 from suite.blind.oracle.strength import columns_in_table, detectable_along
-from tracks.common.names import unknown_name
 from tracks.geometry.rotation import to_local
 
 Law = Callable[[float, float, Motion, Wrench, float], np.ndarray]
@@ -197,17 +196,6 @@ KINDS: dict[str, Kind] = {
 """Name of each kind of physics outside the catalogue -> its description."""
 BOUND_SHARE = 0.98
 """Largest change of a parameter, as a share of the distance to the physical bound of its value."""
-
-
-def make_outside(name: str, strength: float, mass: float) -> Outside:
-    """Return the physics `name` at `strength` for a quadrotor of true `mass` [kg].
-
-    Raises:
-        ValueError: for an unknown name.
-    """
-    if name not in KINDS:
-        raise unknown_name("physics outside the catalogue", name, KINDS)
-    return KINDS[name].make(strength, mass)
 
 
 def draw_change(

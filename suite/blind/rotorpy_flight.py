@@ -18,15 +18,16 @@ from typing import Any
 
 import numpy as np
 
+from eval.effects import EFFECTS
 from eval.effects.interface import GRAVITY
 from eval.flights.follow import Recording, Step, follow, reference_of
 from eval.flights.simulate import FULL_V
 from eval.flights.trajectory import Reference, Trajectory
 from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
 from eval.quadrotor.stepper import wanted_speed
-from eval.vehicles.vehicle import Vehicle
+from eval.vehicles.vehicle import Vehicle, with_effects
 from eval.worlds.rotorpy import Multirotor, StepInput
-from eval.worlds.rotorpy_vehicle import ROTORPY_EFFECTS
+from eval.worlds.rotorpy_vehicle import ROTORPY_EFFECTS, damping_at_hover, rotorpy_parameters
 from tracks.geometry.rotation import quat_to_rot
 
 DAMPING = "angular_damping"
@@ -119,17 +120,12 @@ def hub_damping(effects: Sequence[Mapping[str, Any]], vehicle: Vehicle) -> np.nd
         effects: the true effects of a case, from its answer.
         vehicle: the vehicle file for the diagnosis.
     """
-    hub_b = np.asarray(vehicle.rotors.position)
-    thrust = vehicle.mass * GRAVITY / len(hub_b)
-    speed = np.sqrt(thrust / vehicle.rotors.thrust_coefficient)
-    x_sum, y_sum = (hub_b[:, :2] ** 2).sum(axis=0) * speed
-    torque_per_rate = np.zeros(3)
-    for effect in effects:
-        if effect["name"] == "rotor_drag":
-            torque_per_rate[2] += effect["parameters"]["coefficient"] * (x_sum + y_sum)
-        if effect["name"] == "inflow":
-            torque_per_rate[:2] += effect["parameters"]["coefficient"] * np.array([y_sum, x_sum])
-    return torque_per_rate / np.asarray(vehicle.inertia)
+    drags = {
+        effect["name"]: EFFECTS[effect["name"]].values(effect["parameters"]["coefficient"])
+        for effect in effects
+        if effect["name"] in ("rotor_drag", "inflow")
+    }
+    return damping_at_hover(rotorpy_parameters(with_effects(vehicle, drags)))
 
 
 def is_hub_damping(effect: Mapping[str, Any], damping: np.ndarray) -> bool:

@@ -50,13 +50,14 @@ def run_set(
         for name in names
         if not (results / name / TIMED).is_file()
     ]
-    with console.progress("diagnoses", len(names)) as update:
-        if workers is None or workers == 1:
-            for done, job in enumerate(jobs, len(names) - len(jobs)):
+    if workers is None or workers == 1:
+        before = len(names) - len(jobs)
+        with console.progress("diagnoses", len(names), begun=before) as update:
+            for done, job in enumerate(jobs, before + 1):
                 _diagnose_case(diagnose, job, console)
-                update(done + 1, job.task)
-        else:
-            do_jobs(partial(_diagnose_case, diagnose), jobs, workers, console, "diagnoses")
+                update(done, job.task)
+    else:
+        do_jobs(partial(_diagnose_case, diagnose), jobs, workers, console, "diagnoses")
     return sum((results / name / TIMED).is_file() for name in names)
 
 

@@ -7,10 +7,11 @@ import sys
 from dataclasses import dataclass
 from typing import Any
 
+import psutil
+
 from suite.common.console import Console, size
 from suite.common.options import Command
 from suite.common.provenance import machine, package_versions
-from suite.common.stages import available_memory_bytes
 from tracks.common.provenance import VERSION, git_commit
 
 
@@ -26,7 +27,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         "git_commit": git_commit(),
         "python": f"{platform.python_version()} at {sys.executable}",
         "machine": machine(),
-        "memory_free_bytes": available_memory_bytes(),
+        "memory_free_bytes": psutil.virtual_memory().available,
         "jax_devices": _jax_devices(),
         "packages": package_versions(),
     }

@@ -9,6 +9,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from tracks.common.files import write_json
 from tracks.common.provenance import stamp
 from tracks.common.work import usable_cores
@@ -35,12 +37,11 @@ def package_versions() -> dict[str, str | None]:
 
 def machine() -> dict[str, Any]:
     """Return the system, processor, number of usable cores and memory [bytes] of this machine."""
-    memory_bytes = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     return {
         "system": platform.platform(),
         "processor": _processor(),
         "cores": usable_cores(),
-        "memory_bytes": memory_bytes,
+        "memory_bytes": psutil.virtual_memory().total,
     }
 
 

@@ -6,12 +6,13 @@ starts, it prints an estimate of the time and the memory of the remaining work.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from suite.common.console import Console, duration, size
 from suite.common.provenance import write_run_record
@@ -149,18 +150,9 @@ class Estimate:
     """Memory at its peak [bytes]."""
 
 
-def available_memory_bytes() -> int:
-    """Return the memory that is available without swapping, or all memory if unknown [bytes]."""
-    try:
-        text = Path("/proc/meminfo").read_text(encoding="ascii")
-        return 1024 * int(text.split("MemAvailable:")[1].split()[0])
-    except (OSError, IndexError):
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-
-
 def announce(console: Console, title: str, estimate: Estimate) -> None:
     """Print the estimate of a piece of work, and a warning if it exceeds the free memory."""
-    free = available_memory_bytes()
+    free = psutil.virtual_memory().available
     need = size(estimate.memory_bytes)
     console.note(f"{title}: about {duration(estimate.seconds)} and {need} of memory")
     if estimate.memory_bytes > free:

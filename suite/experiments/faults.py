@@ -207,7 +207,10 @@ def _check_cases(
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
     answers = {k: a for k, a in map(json.loads, lines) if k in keys}
     missing = [key for key in keys if key not in answers]
-    with console.progress("logs", len(cases)) as show, path.open("a", encoding="utf-8") as file:
+    with (
+        console.progress("logs", len(cases), begun=len(answers)) as show,
+        path.open("a", encoding="utf-8") as file,
+    ):
 
         def keep(number: int, answer: Answer) -> None:
             """Store an answer in the file, so that an interrupted run can continue."""
@@ -257,7 +260,7 @@ def _findings(
     """
     if case.format in WRITERS:
         with tempfile.TemporaryDirectory() as folder:
-            written = WRITERS[case.format](Path(folder), signals, vehicle.full_thrust)
+            written = WRITERS[case.format](Path(folder), signals)
             options = replace(written.options, vehicle=vehicle)
             log, findings = import_log(written.path, case.format, options)
         return [*findings, *check_log(log, context)[0], *check_files(context)]

@@ -173,19 +173,10 @@ def _steps(config: Config) -> int:
     return last_phase(config, "quadrotor", 1).episode.steps
 
 
-class Update(NamedTuple):
-    """A compiled gradient step with its worlds."""
-
-    phase: TrainConfig
-    """Settings of the training phase that the step belongs to."""
-    call: Callable[[], Any]
-    """Function that makes the step."""
-
-
 class Compiled(NamedTuple):
     """The compiled programs, and the results of running them once."""
 
-    updates: Mapping[tuple[str, int], Update]
+    updates: Mapping[tuple[str, int], Callable[[], Any]]
     """Gradient steps by model and number of worlds."""
     results: list[TrialResult]
     """Results on this device of the trials that the CPU flies as well."""
@@ -218,12 +209,12 @@ def compile_programs(config: Config, vehicle: Vehicle, console: Console) -> Comp
     return programs
 
 
-def _compile_update(phase: TrainConfig) -> Update:
+def _compile_update(phase: TrainConfig) -> Callable[[], Any]:
     """Return a gradient step of a phase; one call of it is made, which compiles it."""
     update, worlds = make_update(phase), repeated_worlds(phase)
     state = jax.device_put(start_state(phase), jax.devices()[0])
     jax.block_until_ready(update(state, worlds))
-    return Update(phase, lambda: update(state, worlds))
+    return lambda: update(state, worlds)
 
 
 def repeated_worlds(config: TrainConfig) -> Worlds:
@@ -239,13 +230,13 @@ def repeated_worlds(config: TrainConfig) -> Worlds:
 
 
 def trainer_speeds(
-    config: Config, updates: Mapping[tuple[str, int], Update], console: Console
+    config: Config, updates: Mapping[tuple[str, int], Callable[[], Any]], console: Console
 ) -> list[Row]:
     """Return the speed of each gradient step, in the order of the number of worlds."""
     operations = {model: _operations_per_world(config, model) for model in MODELS}
     rows = []
     for (model, worlds), update in sorted(updates.items(), key=lambda entry: entry[0][1]):
-        seconds = best_time(update.call)
+        seconds = best_time(update)
         rows.append(Row(model, worlds, seconds, worlds * operations[model]))
         console.say(f"trainer, {worlds} {MODELS[model]}: {seconds:.3f} s per gradient step")
     return rows

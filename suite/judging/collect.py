@@ -164,7 +164,7 @@ def _fly_missing(
     source, manner = collection.policy or default_policy(), Manner(speed=collection.speed)
     rules = Rules(time_limit_s=collection.time_limit_s)
     options = JudgeOptions(workers=workers, rules=rules, sensors=trial_set.sensors)
-    with console.progress("flights", len(trial_set.trials)) as update:
+    with console.progress("flights", len(trial_set.trials), begun=len(rows)) as update:
 
         def keep(result: TrialResult, flight: Flight | None) -> None:
             name = None

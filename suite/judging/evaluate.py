@@ -273,20 +273,21 @@ def _fly_entry(
     trials = trial_set.trials
     with journal:
         missing = journal.missing(trials)
-        if len(missing) < len(trials):
-            console.note(f"{label}: {len(trials) - len(missing)} trials were flown before")
+        before = len(trials) - len(missing)
+        if before:
+            console.note(f"{label}: {before} trials were flown before")
         if others := journal.others(trials):
             console.note(
                 f"{label}: {others} further trials were flown before, which this command does not "
                 f"request: the table is without them, {journal.path.name} keeps them"
             )
-        with console.progress(label, len(trials)) as update:
+        with console.progress(label, len(trials), begun=before) as update:
 
             def keep(result: TrialResult, flight: object) -> None:
                 journal.append(result._replace(policy=label))
-                done = len(journal.done)
-                share = sum(r.success for r in journal.done.values()) / done
-                update(done, f"{share:.0%} success")
+                done = [journal.done[trial] for trial in trials if trial in journal.done]
+                share = sum(r.success for r in done) / len(done)
+                update(len(done), f"{share:.0%} success")
 
             fly(
                 policy_for_workers(

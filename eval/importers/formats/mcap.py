@@ -117,9 +117,7 @@ def _messages(path: Path) -> dict[tuple[str, str], list[Stamped]]:
         from mcap.reader import make_reader
         from mcap_ros2.decoder import DecoderFactory
     except ModuleNotFoundError as error:
-        reason = (
-            f"the package {error.name!r} is missing; install pip install 'diffracing-suite[mcap]'"
-        )
+        reason = f"the package {error.name!r} is missing; run pip install 'diffracing-suite[mcap]'"
         raise FlightLogError(str(path), None, None, reason) from None
     kind_of = {type_: kind for kind, types in KINDS.items() for type_ in types}
     recorded: dict[tuple[str, str], list[Stamped]] = {}

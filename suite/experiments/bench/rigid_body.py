@@ -8,14 +8,13 @@ parameters that `mujoco.sysid` is made for.
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, replace
-from types import MappingProxyType
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from eval.effects import EFFECTS, all_values
-from eval.vehicles.vehicle import Vehicle
+from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.diagnose.data.windows import FlightWindows, cut
 from suite.diagnose.estimate.parameters import ParameterSpace, make_space
 
@@ -64,7 +63,7 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
     def attempt(number: int) -> Task:
         """Draw a vehicle, fly it and return its windows."""
         rng = np.random.default_rng([seed, number])
-        truth = replace(nominal, effects=MappingProxyType(_draw_effects(nominal, rng)))
+        truth = with_effects(nominal, _draw_effects(nominal, rng))
         flights = fly(nominal, truth, ordinary_flights(rng, duration_s), sensors.rate_hz)
         logs = [
             log_of(flight, truth, sensors, rng, f"flight {i}") for i, flight in enumerate(flights)

@@ -38,7 +38,7 @@ class Written(NamedTuple):
     """Options with which the log must be imported."""
 
 
-def write_ulog(folder: Path, signals: Signals, full_thrust: float) -> Written:
+def write_ulog(folder: Path, signals: Signals) -> Written:
     """Write a ULog of PX4: north-east-down, forward-right-down, motors in PX4's order."""
     # Time in microseconds; the start of the log is not 0 in real logs either.
     stamp = np.round(signals["time"] * 1e6).astype(np.int64) + 5_000_000
@@ -86,7 +86,7 @@ def _message(kind: str, payload: bytes) -> bytes:
     return struct.pack("<HB", len(payload), ord(kind)) + payload
 
 
-def write_usd(folder: Path, signals: Signals, full_thrust: float) -> Written:
+def write_usd(folder: Path, signals: Signals) -> Written:
     """Write a log of the Crazyflie's micro SD card deck."""
     columns = {"controller.cmd_thrust(f)": signals["throttle"][:, 0] * 65535.0}
     for k, axis in enumerate("xyz"):
@@ -115,7 +115,7 @@ def write_usd(folder: Path, signals: Signals, full_thrust: float) -> Written:
     return Written(path, ImportOptions())
 
 
-def write_blackbox(folder: Path, signals: Signals, full_thrust: float) -> Written:
+def write_blackbox(folder: Path, signals: Signals) -> Written:
     """Write a CSV as `blackbox_decode` makes it, and a second file with the pose of motion capture.
 
     The two files have different clocks, as in a real recording.
@@ -148,7 +148,7 @@ column = "t"
 """Beginning of the mapping file, which describes frames, units and columns of the table."""
 
 
-def write_table(folder: Path, signals: Signals, full_thrust: float) -> Written:
+def write_table(folder: Path, signals: Signals) -> Written:
     """Write a table as teams export it from PX4, north-east-down, with its mapping file."""
     converted = {
         "pos": signals["pos"] * FLIP,
@@ -183,7 +183,7 @@ def _csv(path: Path, columns: Mapping[str, np.ndarray]) -> Path:
     return path
 
 
-WRITERS: dict[str, Callable[[Path, Signals, float], Written]] = {
+WRITERS: dict[str, Callable[[Path, Signals], Written]] = {
     "px4": write_ulog,
     "crazyflie": write_usd,
     "betaflight": write_blackbox,

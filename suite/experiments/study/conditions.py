@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from types import MappingProxyType
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from eval.effects import EFFECTS
 from eval.effects.interface import Effect, bound_value, neutral
 from eval.effects.wind import CONSTANT_WIND
 from eval.sensors.sensors_file import PERFECT, SensorSet, sensor_set
-from eval.vehicles.vehicle import Vehicle
+from eval.vehicles.vehicle import Vehicle, with_effects
 
 STATE_UNIT = {"position": 0.03, "velocity": 0.1, "attitude": math.radians(1.0)}
 """Errors of the estimated state at size 1 of its sweep: position [m], velocity [m/s], attitude
@@ -94,13 +93,8 @@ def _effect_condition(vehicle: Vehicle, effect: Effect, sign: int) -> Condition:
     number = "(" + ", ".join(f"{v:.3g}" for v in new) + ")" if new.ndim else f"{value:.3g}"
     unit = "" if parameter.unit == "1" else parameter.unit
     size_text = f"{parameter.name} {number} {unit}".strip()
-    changed = with_effect(vehicle, effect.name, values._replace(**{parameter.name: value}))
+    changed = with_effects(vehicle, {effect.name: values._replace(**{parameter.name: value})})
     return Condition(effect.name, sign * size, size_text, changed)
-
-
-def with_effect(vehicle: Vehicle, name: str, values: Any) -> Vehicle:
-    """Return `vehicle` with `values` for the effect `name`."""
-    return replace(vehicle, effects=MappingProxyType({**vehicle.effects, name: values}))
 
 
 def _plain(value: np.ndarray | np.floating) -> float | tuple[float, ...]:
@@ -130,7 +124,7 @@ def _set_effect(
     def make(vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorSet]:
         """Return `vehicle` with the effect at `size`, and perfect sensors."""
         values = EFFECTS[name].values(**{field: _plain(np.asarray(scale) * size)})
-        return with_effect(vehicle, name, values), PERFECT
+        return with_effects(vehicle, {name: values}), PERFECT
 
     return make
 
@@ -138,7 +132,7 @@ def _set_effect(
 def _add_mass(vehicle: Vehicle, percent: float) -> tuple[Vehicle, SensorSet]:
     """Return `vehicle` with its mass above the nominal one by `percent`, and perfect sensors."""
     values = EFFECTS["mass_offset"].values(offset=percent / 100 * vehicle.mass)
-    return with_effect(vehicle, "mass_offset", values), PERFECT
+    return with_effects(vehicle, {"mass_offset": values}), PERFECT
 
 
 def _scale_drag(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorSet]:
@@ -146,7 +140,7 @@ def _scale_drag(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorSet]:
     for name in _drags(vehicle):
         values = vehicle.effects[name]
         coefficient = _plain(factor * np.asarray(values.coefficient, float))
-        vehicle = with_effect(vehicle, name, values._replace(coefficient=coefficient))
+        vehicle = with_effects(vehicle, {name: values._replace(coefficient=coefficient)})
     return vehicle, PERFECT
 
 

@@ -111,7 +111,7 @@ def fly_trials(
             cost = sum(c * len(trials) for c, trials in zip(costs, missing, strict=True))
             announce(console, f"{title}: {remaining} trials", flying_estimate(cost, workers))
             trial_numbers, all_journals = count(total - remaining + 1), list(journals.values())
-            with console.progress(title, total) as update:
+            with console.progress(title, total, begun=total - remaining) as update:
 
                 def keep(piece: int, answer: tuple[int, TrialResult]) -> None:
                     """Store the result of a trial in the journal of its setup."""

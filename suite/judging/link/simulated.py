@@ -18,9 +18,6 @@ from eval.vehicles.vehicle import Vehicle
 from eval.worlds.engine import DepthCamera, compile_model, contact_name, motion_of, start_state
 from eval.worlds.slots import gust_draws, layout_of
 from eval.worlds.trial import (
-    DIVERGED,
-    ENDINGS,
-    FINISHED,
     FLYING,
     Course,
     Rules,
@@ -29,6 +26,7 @@ from eval.worlds.trial import (
     has_diverged,
     is_wrench,
     judge_state,
+    result_columns,
     start_progress,
 )
 from suite.judging.link.messages import SetPoint, State, Wire, image_packets
@@ -186,30 +184,15 @@ class SimulatedVehicle:
 
     def result(self, policy: str) -> TrialResult:
         """Return the trial's result so far; an unfinished one counts as a timeout."""
-        progress = self._progress
-        ended = int(progress.ended[0])
-        ended_by = ENDINGS[ended - 1] if ended else "timeout"
-        is_collision = ended_by == "collision"
-        step = int(progress.step[0])
-        pos_w = progress.pos_w[0]
+        columns = result_columns(self._progress, 0, self.dt)
+        is_collision = columns["ended_by"] == "collision"
         return TrialResult(
             *self._trial,
+            **columns,
             policy=policy,
             vehicle=self._vehicle.name,
             world="link",
-            success=ended == FINISHED,
-            gates_passed=int(progress.gates[0]),
-            ended_by=ended_by,
             collided_with=contact_name(self._model, self._data) if is_collision else None,
-            pos_x=float(pos_w[0]),
-            pos_y=float(pos_w[1]),
-            pos_z=float(pos_w[2]),
-            time_s=step * self.dt,
-            v_max=float(progress.v_max[0]),
-            # Mean over the start (at rest) and the states after each step, without a diverged one.
-            v_mean=float(progress.v_sum[0]) / max(step + (ended != DIVERGED), 1),
-            gates_8s=int(progress.gates_8s[0]),
-            gates_035=int(progress.gates_035[0]),
             bad_actions=0,
             limited_actions=0,
             late_actions=0,

@@ -24,6 +24,7 @@ from suite.train.ppo.reward import COLLISION, RewardTerms, make_reward
 from suite.train.rollout import make_observer, observed_at_start, queue, world_keys
 from suite.train.step import BODY_RADIUS_M, target_gate
 from suite.train.worlds import Worlds, sample_worlds
+from tracks.common.masks import select
 
 ACTION_LIMIT = 20.0
 """Acceleration that an action of 1 means in `JaxRace`, as in `eval.envs` [m/s^2]."""
@@ -108,11 +109,6 @@ def make_race(config: TrainConfig) -> Race:
         return episode, PeriodResult(terms, clearance < BODY_RADIUS_M, passed)
 
     return Race(start, observe, fly)
-
-
-def choose(where: jax.Array, if_true: Any, if_false: Any) -> Any:
-    """Return the leaves (B, ...) of `if_true` where `where` (B,) is true, else of `if_false`."""
-    return jax.tree.map(lambda a, b: jax.vmap(jnp.where)(where, a, b), if_true, if_false)
 
 
 class RaceState(NamedTuple):
@@ -220,7 +216,7 @@ class JaxRace:
         index = jax.random.randint(pick, (), 0, worlds.pos_w.shape[0])
         index = jnp.where(done, index, state.world)
         world = _batch_of_one(worlds, index)
-        episode = choose(done[None], self._race.start(world), episode)
+        episode = select(done[None], self._race.start(world), episode)
         after = RaceState(index, episode, jnp.where(done, 0, steps))
         observation, after = self._observe(noise, world, after)
         return observation, after, reward, done, info

@@ -14,10 +14,11 @@ import jax.numpy as jnp
 from policies.networks import network
 from suite.train.config import TrainConfig
 from suite.train.ppo import critic
-from suite.train.ppo.environment import Episode, choose, make_race
+from suite.train.ppo.environment import Episode, make_race
 from suite.train.ppo.reward import RewardTerms
 from suite.train.rollout import world_keys
 from suite.train.worlds import Worlds
+from tracks.common.masks import select
 
 
 class Record(NamedTuple):
@@ -93,7 +94,7 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]
                 passed=result.passed,
                 speed=jnp.linalg.norm(after.state.vel_w, axis=-1),
             )
-            return choose(result.collided, start, (after, hidden)), record
+            return select(result.collided, start, (after, hidden)), record
 
         (last, _), records = jax.lax.scan(step, start, jax.random.split(key, config.episode.steps))
         return records, critic.features(worlds, last.state, last.target)

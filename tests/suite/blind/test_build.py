@@ -13,7 +13,7 @@ from suite.blind.cases import Case
 from suite.blind.make import open_answers
 from suite.blind.oracle.strength import columns_in_table, detectable_along, nominal_vehicle
 from suite.blind.outside import KINDS as OUTSIDE
-from suite.blind.outside import changed_values, draw_change, make_outside
+from suite.blind.outside import changed_values, draw_change
 from tests.support.blind import SINGLE
 from tracks.common.files import plain
 
@@ -56,11 +56,11 @@ def test_physics_outside_the_catalogue_moves_the_vehicle_and_a_load_weighs_what_
     way = Trajectory("climb", duration_s=2.0, speed=3.0, size=1.0)
     plain = fly(BARE, BARE, [way])[0]
     for name, kind in OUTSIDE.items():
-        moved = fly(BARE, BARE, [way], extra=make_outside(name, kind.usual, BARE.mass))[0]
+        moved = fly(BARE, BARE, [way], extra=kind.make(kind.usual, BARE.mass))[0]
         acts = np.abs(moved.extra.force_b).max()
         acts += np.abs(moved.acting.thrust - moved.command.thrust).max()
         assert acts > 0.0 and np.abs(moved.motion.pos_w - plain.motion.pos_w).max() > 1e-5, name
-    load = make_outside("slung_load", 0.03, BARE.mass)
+    load = OUTSIDE["slung_load"].make(0.03, BARE.mass)
     flight = fly(BARE, BARE, [Trajectory("hover", 0.2)], extra=load)[0]
     assert flight.extra.force_b[0, 2] == pytest.approx(-0.03 * 9.81, rel=1e-6)
 

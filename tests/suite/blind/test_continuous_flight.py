@@ -10,7 +10,7 @@ from eval.flights.trajectory import Trajectory
 from suite.blind.continuous.body import POS, QUAT
 from suite.blind.continuous.timing import Conditions
 from suite.blind.continuous_flight import fly_continuous, logs_of, with_loop_frequency
-from suite.blind.outside import make_outside
+from suite.blind.outside import KINDS
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 LAGGED = with_lag(PLAIN, 0.02)
@@ -60,14 +60,14 @@ def test_a_flight_that_cannot_be_flown_fails_by_name():
 
 def test_physics_from_outside_acts_and_is_recorded(fifth):
     plain, _ = fifth
-    flown, _ = run(5, extra=make_outside("tether", 0.1, 0.75))
+    flown, _ = run(5, extra=KINDS["tether"].make(0.1, 0.75))
     state = flown.state[:-1].reshape(-1, 13)
     turn = Rotation.from_quat(state[:, QUAT], scalar_first=True)
     # A spring of 0.1 1/s^2 x 0.75 kg to (1, -1, 0), held for a step at a time.
     pull_w = turn.apply(flown.push_b.reshape(-1, 3))
     np.testing.assert_allclose(pull_w, -0.075 * (state[:, POS] - [1.0, -1.0, 0.0]), atol=1e-9)
     assert np.abs(flown.state[-1] - plain.state[-1]).max() > 1e-3
-    bent, _ = run(5, extra=make_outside("bent_thrust", 0.2, 0.75))
+    bent, _ = run(5, extra=KINDS["bent_thrust"].make(0.2, 0.75))
     given = bent.command[..., 0]
     np.testing.assert_allclose(bent.acting[..., 0], given + 0.2 * (given - 9.81) ** 2 / 9.81)
 

@@ -31,7 +31,7 @@ def judged(tmp_path_factory):
 def test_a_written_flight_comes_back(tmp_path, judged, format):
     _, log, truth = judged
     parts = flight_signals(log, PLAIN, np.random.default_rng(0))
-    written = WRITERS[format](tmp_path, parts, PLAIN.full_thrust)
+    written = WRITERS[format](tmp_path, parts)
     back, findings = import_log(written.path, format, written.options)
     assert not [f for f in findings if f.fault and f.status in ("corrected", "doubt")]
     rows = known_flight.fly(truth.time[0] + back.time_s)
@@ -48,7 +48,7 @@ def test_a_wrong_order_of_motors_holds_for_speeds_and_commands_and_the_printed_o
     for name in ("motor", "pwm"):
         np.testing.assert_array_equal(faulty[name], parts[name][:, [0, 1, 3, 2]])
     parts["motor"] = parts["motor"][:, [1, 3, 2, 0]]
-    written = WRITERS["px4"](tmp_path, parts, PLAIN.full_thrust)
+    written = WRITERS["px4"](tmp_path, parts)
     options = replace(written.options, vehicle=PLAIN, fix=False)
     _, findings = import_log(written.path, "px4", options)
     (found,) = (f for f in findings if f.fault == "motor_order")

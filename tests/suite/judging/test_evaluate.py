@@ -1,12 +1,14 @@
 """suite eval, flown by pilots that need no training."""
 
 import json
+from contextlib import contextmanager
 
 import pyarrow.parquet as pq
 import pytest
 
 import eval.judging.judge
 from eval.judging.results import read_trials
+from suite.common.console import Console
 from suite.judging.flying import Manner, load_in_manner, policy_for_workers
 from tests.support.commands import answer, evaluate, refused, run
 
@@ -158,11 +160,20 @@ def test_trials_that_are_not_asked_for_again_are_kept_and_said(pilots, tmp_path,
         interrupt_after(patch, 3)
         assert evaluate(tmp_path, *asked, 4) == 130
     capsys.readouterr()
-    assert evaluate(tmp_path, *asked, 1) == 0
+    shown = []
+
+    @contextmanager
+    def progress(self, label, total, begun=0.0):
+        yield lambda done, note: shown.append((begun, done, total, note))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Console, "progress", progress)
+        assert evaluate(tmp_path, *asked, 2, "--seed", 2) == 0
     said = "2 further trials were flown before, which this command does not request"
     assert said in printed(capsys)
-    assert len(read_trials(tmp_path / "trials.parquet")) == 1
+    assert shown == [(1, 2, 2, "0% success")]
+    assert [row.seed for row in read_trials(tmp_path / "trials.parquet")] == [2, 3]
     assert evaluate(tmp_path, *asked, 4) == 0
-    assert "3 trials were flown before" in printed(capsys)
+    assert "4 trials were flown before" in printed(capsys)
     seeds = [row.seed for row in read_trials(tmp_path / "trials.parquet")]
     assert seeds == [0, 1, 2, 3] and not list(tmp_path.glob("journal*"))
