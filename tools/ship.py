@@ -18,9 +18,8 @@ from pathlib import Path
 from policies.formats.checkpoint import CONFIG, WEIGHTS
 from policies.formats.policy_file import load_policy_checkpoint
 from suite.common import curve
+from suite.common.charts import curves_chart
 from suite.common.console import duration
-from suite.loop.charts import training_chart
-from suite.loop.compare import BEFORE
 from tracks.common.files import replacing_folder, write_json
 
 SHELF = Path(__file__).resolve().parent.parent / "policies" / "shipped"
@@ -90,7 +89,7 @@ def main() -> None:
         if options.speed is not None:
             config["spec"]["speed"] = options.speed
         write_json(new / CONFIG, config)
-        (new / "curve.png").write_bytes(training_chart({BEFORE: curve.read(options.run)}))
+        (new / "curve.png").write_bytes(curves_chart({"training": curve.read(options.run)}))
         text = card(options.name, options.run, options.eval)
         (new / "card.md").write_text(text, encoding="utf-8")
     print(f"shipped {SHELF / options.name}")

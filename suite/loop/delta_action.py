@@ -13,17 +13,23 @@ from pathlib import Path
 
 from eval.worlds.trial import TrialResult
 from suite.common import curve
+from suite.common.charts import curves_chart
 from suite.common.report import Picture, Section
 from suite.delta.run import errors_by_name
 from suite.judging.trials import parse_tracks
-from suite.loop.charts import comparison_chart, delta_chart, training_chart
-from suite.loop.compare import BEFORE, WITH, WITHOUT, compare
+from suite.loop.charts import COLOURS, delta_chart, success_chart
+from suite.loop.compare import BEFORE, PolicyResult, policy_results
 from suite.loop.config import DeltaLoopConfig, LoopConfig
 from suite.loop.report import errors_row
-from suite.loop.tables import CAVEAT, comparison_grids, verdict
+from suite.loop.tables import cell_grid, overall_grid, points, significance
 from suite.loop.variants import DeltaModel, Findings, Loop, ShownPolicy, Variant
 from tracks.common.grid import table
 
+WITHOUT, WITH = "without", "with"
+LABELS = {BEFORE: "before", WITHOUT: "tuned without delta", WITH: "tuned with delta"}
+"""Labels of the policies in tables."""
+REFERENCES = (BEFORE, WITHOUT)
+"""Policies with which the others are compared."""
 JUDGED = "judging the one fine-tuned {} the Delta Action Model, on the same seeds"
 """Description of the judging of a fine-tuned policy."""
 
@@ -33,14 +39,14 @@ def summarise(
 ) -> Findings:
     """Return the results of the finished loop in `out`."""
     assert isinstance(config, DeltaLoopConfig)
-    comparison = compare(results)
+    policies, trials = policy_results(results, REFERENCES), config.trials * config.cells
     fitted = json.loads((out / "delta" / "delta.json").read_text(encoding="utf-8"))
     return Findings(
-        verdict=verdict(comparison[-1]),
-        tables=comparison_grids(comparison),
+        verdict=verdict(policies, trials),
+        tables=[overall_grid(policies, REFERENCES, LABELS, trials), cell_grid(policies, LABELS)],
         errors=[(out / "delta" / "table.md").read_text(encoding="utf-8")],
         numbers={
-            "comparison": comparison,
+            "standings": policies,
             "delta": {key: value for key, value in fitted.items() if key != "curve"},
         },
         facts={
@@ -48,8 +54,23 @@ def summarise(
             "levels": config.difficulty,
             "vehicle": config.vehicle,
         },
-        chart=Picture(comparison_chart(comparison), "Bars: 95 % intervals over trials."),
+        chart=Picture(success_chart(policies, LABELS), "Bars: 95 % intervals over trials."),
         sections=[_delta_section(fitted), _training_section(out, config)],
+    )
+
+
+def verdict(policies: Sequence[PolicyResult], trials: int) -> str:
+    """Return a sentence on the effect of fine-tuning with the Delta Action Model."""
+    by_name = {policy.name: policy for policy in policies}
+    to_control = {other.against: other.success for other in by_name[WITH].differences}[WITHOUT]
+
+    def percent(name: str) -> str:
+        return f"{100 * by_name[name].success.value:.0f} %"
+
+    return (
+        f"Fine-tuned with the Delta Action Model, {percent(WITH)} of {trials} trials succeed: "
+        f"{significance(to_control)} the same fine-tuning without it ({percent(WITHOUT)}; "
+        f"difference {points(to_control)}); before, {percent(BEFORE)}."
     )
 
 
@@ -76,7 +97,9 @@ def _delta_section(fitted: Mapping) -> Section:
 def _training_section(out: Path, config: DeltaLoopConfig) -> Section:
     """Return the section with the learning curves of the training and the fine-tunings."""
     folders = {BEFORE: "train", WITHOUT: "tuned-without", WITH: "tuned-with"}
-    chart = training_chart({name: curve.read(out / folder) for name, folder in folders.items()})
+    labels = {**LABELS, BEFORE: "training"}
+    curves = {labels[name]: curve.read(out / folder) for name, folder in folders.items()}
+    chart = curves_chart(curves, COLOURS, follow=True)
     first = f"{config.training.optimizer.iterations} iterations of training, then "
     if config.policy:
         first = f"From {config.policy}: "
@@ -106,7 +129,6 @@ LOOP = Loop(
     "Action Model (delta). The policy tuned without delta is the control: it has the same number "
     "of iterations on the same tracks, in the uncorrected dynamics. A difference is coloured if "
     "its interval excludes zero.",
-    caveat=CAVEAT,
     advice="if the policy crashes within a second or two, train it for longer (--iterations), "
     "or record more flights (--flights), with another --out",
     files=(

@@ -28,7 +28,7 @@ from suite.common import curve
 from suite.common.charts import curves_chart
 from suite.common.report import Links, Picture, Section
 from suite.diagnose.report.summary import components, grid
-from suite.loop.charts import SEVERAL, success_chart
+from suite.loop.charts import COLOURS, success_chart
 from suite.loop.compare import BEFORE, PolicyResult, policy_results
 from suite.loop.config import EXACT_SIMULATORS, HiddenLoopConfig, LoopConfig
 from suite.loop.report import errors_row
@@ -204,7 +204,7 @@ def _training_section(out: Path, config: LoopConfig) -> Section:
     assert isinstance(config, HiddenLoopConfig)
     tuned = (CONTROL, DELTA, NAMED, BOTH) if config.delta else (CONTROL, NAMED)
     curves = {LABELS[name]: curve.read(out / f"tuned-{name}") for name in tuned}
-    chart = curves_chart(curves, SEVERAL[2:])
+    chart = curves_chart(curves, COLOURS[2:])
     text = (
         f"{config.tuning.optimizer.iterations} iterations each, from {config.policy}. Each policy "
         "was trained with another vehicle, so the levels of the curves are not comparable."
@@ -268,8 +268,6 @@ LOOP = Loop(
     reading=f"{READING}quadrotor; the others through it with its Delta Action Model, through the "
     "quadrotor corrected by the named effect, and through the latter with a Delta Action Model of "
     "its remaining error. The judge flies the policies without a Delta Action Model.",
-    caveat="Intervals are 95 % over trials, for these policies: another seed of the fine-tuning "
-    "gives other policies. Differences are paired by trial.",
     advice="record more (--flights), with another --out",
     files=(
         ("table.md", "the tables on this page"),

@@ -12,6 +12,7 @@ from pathlib import Path
 from suite.common.console import duration
 from suite.common.report import Details, Links, Picture, Report, Section, write_report
 from suite.loop.config import LoopConfig
+from suite.loop.tables import CAVEAT
 from suite.loop.variants import Findings, Loop
 from tracks.common.files import to_json
 from tracks.common.grid import table
@@ -33,9 +34,7 @@ def write_loop_report(
             "version": f"{VERSION}, {(git_commit() or 'no commit')[:10]}",
         },
         sections=[
-            Section(
-                "On the same seeds", [loop.reading, findings.chart, *findings.tables, loop.caveat]
-            ),
+            Section("On the same seeds", [loop.reading, findings.chart, *findings.tables, CAVEAT]),
             *findings.sections,
             *_flight_sections(out, loop),
             _files_section(out, loop, config, seconds),

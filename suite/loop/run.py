@@ -17,6 +17,7 @@ from suite.common.stages import claim, run_stages
 from suite.loop import delta_action, hidden_effect
 from suite.loop.config import HiddenLoopConfig, LoopConfig, loop_by_content
 from suite.loop.report import write_loop_report
+from suite.loop.tables import CAVEAT
 from suite.loop.work import LoopRun, plan
 from tracks.common.files import plain, write_json, write_text
 from tracks.common.grid import markdown, rich_table
@@ -66,7 +67,7 @@ def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any
     header = stamp(1, config.seed)
     comment = "; ".join(f"{key}: {value}" for key, value in header.items())
     tables = map(markdown, findings.tables)
-    texts = [findings.verdict, *tables, loop.caveat, *findings.errors, f"<!-- {comment} -->\n"]
+    texts = [findings.verdict, *tables, CAVEAT, *findings.errors, f"<!-- {comment} -->\n"]
     write_text(out / "table.md", "\n\n".join(text.strip("\n") for text in texts) + "\n")
     answer = {
         **header,
@@ -83,7 +84,7 @@ def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any
     for table in findings.tables:
         console.show(rich_table(table))
     errors = [] if loop.hidden else [text.strip("\n") for text in findings.errors]
-    console.say("\n\n".join([loop.caveat, *errors, findings.verdict]) + "\n")
+    console.say("\n\n".join([CAVEAT, *errors, findings.verdict]) + "\n")
     console.say(f"table:     {out / 'table.md'}")
     console.say(f"report:    {out / 'report.html'}")
     if loop.hidden:

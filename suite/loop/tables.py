@@ -9,46 +9,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from eval.judging.statistics import Interval, PairedDifference
-from suite.loop.compare import CellComparison, Measure, PolicyResult
+from suite.loop.compare import PolicyResult
 from tracks.common.grid import Cell, Grid, table
 
 CAVEAT = (
-    "Intervals are 95 % over trials, for these three policies: another training seed gives other "
-    "policies. The intervals of single rows are not corrected for multiple comparisons."
+    "Intervals are 95 % over trials, for these policies: another training seed gives other "
+    "policies. Differences are paired by trial. The intervals of single rows are not corrected for "
+    "multiple comparisons."
 )
 """Note on the intervals, for the text below the tables."""
-
-
-def comparison_grids(rows: Sequence[CellComparison]) -> list[Grid]:
-    """Return tables of success, gates, mean speed and largest speed, each with a row per cell."""
-    return [
-        _grid("Success, all gates without a collision [%]", rows, "success", 100, 0),
-        _grid("Gates passed, mean", rows, "gates", 1, 2),
-        _grid("Mean speed of a trial, median [m/s]", rows, "v_mean", 1, 2),
-        _grid("Largest speed of a trial, median [m/s]", rows, "v_max", 1, 2),
-    ]
-
-
-def _grid(
-    title: str, rows: Sequence[CellComparison], field: str, scale: float, digits: int
-) -> Grid:
-    """Return the table of the measure `field`; the table of success has p-values as well.
-
-    Numbers are multiplied by `scale` and have `digits` decimals.
-    """
-    has_test = field == "success"
-    headers = ["track", "level", "trials", "before", "tuned without delta", "tuned with delta"]
-    headers += ["with - without", *(["p (McNemar)"] if has_test else []), "with - before"]
-    lines = []
-    for row in rows:
-        measure: Measure = getattr(row, field)
-        level = "all" if row.difficulty is None else str(row.difficulty)
-        # A measure has three values, then two differences.
-        to_control, to_before = (difference_cell(d, scale, digits) for d in measure[3:])
-        values = [value_text(interval, scale, digits) for interval in measure[:3]]
-        p_value = [f"{row.p_value:.2g}"] if has_test else []
-        lines.append([row.track, level, str(row.trials), *values, to_control, *p_value, to_before])
-    return table(headers, lines, title, strong_last=True)
 
 
 def overall_grid(
@@ -126,15 +95,3 @@ def points(difference: Interval) -> str:
     """Return a difference of success rates with its interval, in percentage points."""
     value, interval = difference_cell(difference).text.split(" ", 1)
     return f"{value} points {interval}"
-
-
-def verdict(overall: CellComparison) -> str:
-    """Return a sentence on the effect of fine-tuning with the Delta Action Model."""
-    success = overall.success
-    return (
-        f"Fine-tuned with the Delta Action Model, {100 * success.with_delta.value:.0f} % of "
-        f"{overall.trials} trials succeed: {significance(success.with_minus_without)} the same "
-        f"fine-tuning without it ({100 * success.without.value:.0f} %; "
-        f"difference {points(success.with_minus_without)}); before, "
-        f"{100 * success.before.value:.0f} %."
-    )

@@ -107,8 +107,6 @@ class Loop:
     """(settings, folder of the loop, results by variant) -> the findings."""
     reading: str
     """Explanation of the tables, for the report."""
-    caveat: str
-    """Note on what the intervals do not include."""
     advice: str
     """Advice if the flights are too short for a fit."""
     files: Sequence[tuple[str, str]]

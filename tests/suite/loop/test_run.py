@@ -95,8 +95,8 @@ def test_the_loop_leaves_tables_report_and_recording_and_its_control_sees_the_sa
     out, _ = whole
     stages = ["train", "eval-before", "flights", "delta", "tuned-without", "tuned-with"]
     found, table, _ = finished(out, [*stages, "eval-without", "eval-with", "replays"], 5)
-    assert set(found) >= {"schema", "suite_version", "git_commit", "seed", "comparison", "delta"}
-    assert [line["track"] for line in found["comparison"]] == ["zigzag", "all"]
+    assert set(found) >= {"schema", "suite_version", "git_commit", "seed", "standings", "delta"}
+    assert [policy["name"] for policy in found["standings"]] == ["before", "without", "with"]
     assert CAVEAT in table and "point mass, lag, drag and delay fitted" in table
     recording = (out / "recording.rrd").read_bytes()
     assert b"before, zigzag level 0 seed 4" in recording
