@@ -25,7 +25,7 @@ class Thresholds:
     """Largest number of windows if measured rotor speeds are the input. Their errors within a
     window are estimated too, which takes twice as long."""
     most_rows: int = 100_000
-    """Largest number of rows of all flights for force and torque; longer logs are thinned."""
+    """Number of rows of all flights for force and torque above which logs are thinned."""
     longest_hole_s: float = 0.1
     """Rows further apart are a hole. No window and no fit of a rotor lag reaches across it [s]."""
     fitted_loop_share: float = 0.5
@@ -228,7 +228,8 @@ class Thresholds:
     bootstrap_draws: int = 1000
     """Number of draws for the 95 % interval of a gap."""
     bootstrap_block: int = 4
-    """Neighbouring windows that are drawn together, since they overlap (1 s long, 0.25 s apart)."""
+    """Neighbouring stretches that a bootstrap draws together, since they overlap; of few stretches
+    a quarter."""
     gap_stride_s: float = 0.25
     """Time between the starts of the rollouts that measure the gap [s]."""
     refuting_chi2: float = 25.0

@@ -25,7 +25,13 @@ from eval.quadrotor.plant import make_plant, nominal_quadrotor
 from eval.vehicles.vehicle import Vehicle, motor_speed
 from suite.diagnose.data.inertial import InertialLog, is_inertial, posed
 from suite.diagnose.data.noise import noise_like
-from suite.diagnose.data.sampling import interpolate, on_every_row, with_fewer_rows
+from suite.diagnose.data.sampling import (
+    HOLE_STEPS,
+    interpolate,
+    on_every_row,
+    own_spacing_s,
+    with_fewer_rows,
+)
 from suite.diagnose.data.steps import LONGEST_S, torque_between_rows
 from suite.diagnose.data.view import (
     FORCE,
@@ -84,7 +90,8 @@ def ready(
     """
     logs, notes = with_fewer_rows(logs, limits)
     rotors = [acting_rotors(log, vehicle, limits) for log in logs]
-    filled = [on_every_row(completed(log), limits) for log in posed(logs)]
+    complete = [completed(log) for log in posed(logs)]
+    filled = [on_every_row(log, limits) for log in complete]
     rows = [
         rows_of(log, vehicle, one.speed, limits) for log, one in zip(filled, rotors, strict=True)
     ]
@@ -133,8 +140,8 @@ def ready(
         tuple(views),
         names,
         parts,
-        {view.name: _floor(view, parts[view.name]) for view in views},
-        rotors[0].source,
+        {view.name: _floor(view, parts[view.name], [complete[k] for k in kept]) for view in views},
+        " and ".join(sorted({rotors[k].source for k in kept})),
         tuple(kept),
         tuple(notes),
     )
@@ -150,12 +157,12 @@ def _calibrated(
     calibration; Carroll et al. 2006, Measurement Error in Nonlinear Models, Ch. 4). The torque
     between the rows of the log is added (see `torque_between_rows`).
     """
-    if view.in_world or rotors.noise is None:
+    if view.in_world or rotors.noise is None or not len(flight.form.middle_s):
         return flight
     speed, noise = np.nan_to_num(rotors.speed), np.nan_to_num(rotors.noise)
     _, turned = wrench_difference(speed, np.zeros_like(speed), vehicle)
     _, noisy = wrench_difference(speed + noise, speed, vehicle)
-    reliability = 1.0 + torque_between_rows(vehicle, float(np.median(np.diff(flight.rows.time_s))))
+    reliability = 1.0 + torque_between_rows(vehicle, rotors.spacing_s)
     mean = flight.form.mean
     if len(flight.form.middle_s) > 1:
         variance = np.maximum(np.var(mean @ turned, axis=0), 1e-12)
@@ -199,19 +206,26 @@ def parted(
     return fitted_part, held_part
 
 
-def _floor(view: View, flights: Sequence[SmoothedFlight]) -> np.ndarray:
-    """Return the noise (3,) of the mean accelerations, from differences of neighbouring rows."""
+def _floor(view: View, flights: Sequence[SmoothedFlight], logs: Sequence[FlightLog]) -> np.ndarray:
+    """Return the noise (3,) of the mean accelerations, from differences of neighbouring rows.
+
+    Only rows in which the signal was measured count: an interpolated row has no noise of its own.
+    `logs` are the flights before the interpolation.
+    """
     power = []
-    for flight in flights:
+    for flight, log in zip(flights, logs, strict=True):
         imu_acc_w = flight.rows.imu_acc_w if view.in_world else None
         path = flight.rows.vel_w if view.in_world else flight.rows.rate_b
-        series = np.asarray(path if imu_acc_w is None else imu_acc_w)[np.asarray(flight.rows.good)]
+        good = np.asarray(flight.rows.good)
+        own = good & np.isfinite(log.vel_w if view.in_world else log.rate_b).all(axis=1)
+        series = np.asarray(path if imu_acc_w is None else imu_acc_w)[own]
         bend = series[2:] - 2.0 * series[1:-1] + series[:-2]
         # The median ignores the occasional steps of a filter or an estimator. It is 0.6745 standard
         # deviations of a normal variable; a second difference has 6 times the variance of a row.
         sigma = np.median(np.abs(bend), axis=0) / 0.6745 / np.sqrt(6.0)
         weights = flight.form.change if imu_acc_w is None else flight.form.mean
-        gain = weights.power(2).sum(axis=1).mean()
+        # Each measured value stands for several rows.
+        gain = weights.power(2).sum(axis=1).mean() * good.sum() / max(own.sum(), 1)
         power.append(sigma**2 * gain)
     floor = np.sqrt(np.mean(power, axis=0))
     return np.full(3, floor.mean()) if view.in_world else floor
@@ -261,17 +275,17 @@ def leaning(log: FlightLog) -> np.ndarray:
 def turning_of(time_s: np.ndarray, quat_wxyz: np.ndarray) -> np.ndarray:
     """Return the body rates (T, 3) of attitudes (T, 4), from each row's two neighbours [rad/s].
 
-    NaN where a neighbour is missing, and so in the first and the last row.
+    Rows without an attitude are left out before. NaN in these, in the first and the last row, and
+    next to a hole.
     """
     rate_b = np.full((len(quat_wxyz), 3), np.nan)
-    complete = np.asarray(np.isfinite(quat_wxyz).all(axis=1))
-    rows = 1 + np.flatnonzero(complete[:-2] & complete[2:])
-    if len(rows):
-        before, after = (
-            Rotation.from_quat(quat_wxyz[rows + d], scalar_first=True) for d in (-1, 1)
-        )
-        step_s = (time_s[rows + 1] - time_s[rows - 1])[:, None]
-        rate_b[rows] = (before.inv() * after).as_rotvec() / step_s
+    own = np.flatnonzero(np.isfinite(quat_wxyz).all(axis=1))
+    if len(own) > 2:
+        attitude = Rotation.from_quat(quat_wxyz[own], scalar_first=True)
+        step_s = time_s[own[2:]] - time_s[own[:-2]]
+        dense = step_s <= HOLE_STEPS * np.median(np.diff(time_s[own]))
+        rates_b = (attitude[:-2].inv() * attitude[2:]).as_rotvec() / step_s[:, None]
+        rate_b[own[1:-1][dense]] = rates_b[dense]
     return rate_b
 
 
@@ -321,6 +335,8 @@ class ActingRotors(NamedTuple):
     noise: np.ndarray | None = None
     """(N, 4) simulated noise of the same size as that of the measured speeds [rad/s]; None if the
     speeds were not measured."""
+    spacing_s: float = 0.0
+    """Time between the rows of the measured speeds [s]."""
 
 
 def acting_rotors(
@@ -334,13 +350,14 @@ def acting_rotors(
     Raises:
         ValueError: if no signal gives the rotor speeds.
     """
-    noise = None
+    noise, spacing_s = None, 0.0
     if log.rotor_speed is not None:
+        spacing_s = own_spacing_s(log.time_s, log.rotor_speed)
         drawn = replace(log, rotor_speed=noise_like(log.rotor_speed, limits))
         noise = on_every_row(drawn, limits).rotor_speed
     log = on_every_row(log, limits)
     if log.rotor_speed is not None:
-        return ActingRotors(log.rotor_speed, "measured rotor speeds", True, noise)
+        return ActingRotors(log.rotor_speed, "measured rotor speeds", True, noise, spacing_s)
     if log.rotor_speed_cmd is not None:
         return ActingRotors(_lagged(log, vehicle, log.rotor_speed_cmd), "motor commands", True)
     if log.pwm is not None and vehicle.motors is not None:

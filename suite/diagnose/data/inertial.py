@@ -269,7 +269,8 @@ class _Piece:
         columns[:, [0, 1], [count, count + 1]] = -vel_b
         columns[..., -1] = -speed * vel_b
         design = self.means(columns).reshape(-1, count + 3) / noise
-        residual = self.off(drag).reshape(-1) / noise
+        off = self.means(self.acc_b[:, :2] - self.numbers[9:11] + drag_xy * vel_b)
+        residual = off.reshape(-1) / noise
         prior = np.eye(count, count + 3) / self.prior[:, None]
         return np.concatenate([design, prior]), np.append(residual, -self.numbers / self.prior)
 

@@ -24,6 +24,8 @@ MEASURED = ("pos_w", "quat_wxyz", "vel_w", "rate_b", "rotor_speed")
 """Signals of a log that are interpolated between their rows."""
 HELD = ("thrust_cmd", "rate_cmd_b", "torque_cmd_b", "pwm", "rotor_speed_cmd")
 """Signals of a log that are held until their next row."""
+SPARSEST_S = 0.02
+"""Longest time between rows of a thinned signal: the windows of a view need several rows [s]."""
 HOLE_STEPS = 4.0
 """Rows of a signal further apart than this many median steps are a hole on a grid of times."""
 
@@ -74,10 +76,11 @@ def without_slow_rotors(
 def with_fewer_rows(
     logs: Sequence[FlightLog], limits: Thresholds = THRESHOLDS
 ) -> tuple[list[FlightLog], list[str]]:
-    """Return `logs` with at most `limits.most_rows` rows, and a note if rows were left out.
+    """Return `logs` with about `limits.most_rows` rows, and a note if rows were left out.
 
-    Of each signal every n-th value is used. The signals are thinned one by one, because each may
-    have values in other rows.
+    Of each signal every n-th value is used, and more of a slow signal, so that its values are at
+    most `SPARSEST_S` apart. The signals are thinned one by one, because each may have values in
+    other rows.
     """
     count = sum(len(log.time_s) for log in logs)
     # -(-a // b) is a / b, rounded up.
@@ -92,13 +95,18 @@ def with_fewer_rows(
             if values is None:
                 continue
             signals[name] = np.full_like(values, np.nan)
-            own_rows = np.flatnonzero(np.isfinite(values.reshape(len(values), -1)).all(axis=1))[
-                ::stride
-            ]
-            signals[name][own_rows] = values[own_rows]
+            table, thinned_table = (x.reshape(len(x), -1) for x in (values, signals[name]))
+            # Motors may be read one after another, so that no row has the speeds of all.
+            columns = np.arange(table.shape[1])
+            parts = columns[:, None] if name == "rotor_speed" else columns[None]
+            for part in parts:
+                own_rows = np.flatnonzero(np.isfinite(table[:, part]).all(axis=1))
+                spacing_s = np.median(np.diff(log.time_s[own_rows])) if len(own_rows) > 1 else 1.0
+                own_rows = own_rows[:: min(stride, max(1, int(SPARSEST_S / spacing_s + 1e-6)))]
+                thinned_table[np.ix_(own_rows, part)] = table[np.ix_(own_rows, part)]
         rows = np.zeros(len(log.time_s), bool)
         for values in signals.values():
-            rows |= np.isfinite(values.reshape(len(rows), -1)).all(axis=1)
+            rows |= np.isfinite(values.reshape(len(rows), -1)).any(axis=1)
         signals = {name: values[rows] for name, values in signals.items()}
         thinned_logs.append(replace(log, time_s=log.time_s[rows], **signals))
     return thinned_logs, [
@@ -181,7 +189,7 @@ def in_hole(at_s: np.ndarray, time_s: np.ndarray, hole_s: float | None = None) -
     if hole_s is None:
         hole_s = HOLE_STEPS * float(np.median(step_s))
     row = np.clip(np.searchsorted(time_s, at_s, side="right") - 1, 0, len(time_s) - 2)
-    return (step_s > hole_s)[row] | (at_s < time_s[0]) | (at_s > time_s[-1])
+    return (step_s > hole_s + 1e-9)[row] | (at_s < time_s[0]) | (at_s > time_s[-1])
 
 
 def sign_continuous(quat: np.ndarray) -> np.ndarray:

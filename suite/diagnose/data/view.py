@@ -199,6 +199,9 @@ def weak_form(
         first, last = np.searchsorted(middle, (centre - 0.5 * width_s, centre + 0.5 * width_s))
         if last - first < LEAST_ROWS or not usable[first:last].all():
             continue
+        # A hole may begin or end in the bump, with its middle outside.
+        if (span[max(first - 1, 0) : last + 1] > hole_s).any():
+            continue
         from_centre = middle[first:last] - centre
         # Normalised over the rows: the bump to an integral of 1; its slope so that it is exact for
         # accelerations that are constant or linear in time.

@@ -362,7 +362,8 @@ def _window(
     rotor_error = 0.0
     if not rotor_input:
         burn_in = (time_s > begin_s - BURN_IN_S - 1e-9) & (time_s <= begin_s + 1e-9)
-        rotor_error = start_rotor_error(time_s[burn_in], state.rate_b[burn_in], vehicle)
+        burn_in &= np.isfinite(log.rate_b).all(axis=1)  # not where rates are interpolated
+        rotor_error = start_rotor_error(time_s[burn_in], log.rate_b[burn_in], vehicle)
     return FlightWindows(
         np.asarray(number),
         np.asarray(begin_s - time_s[0]),

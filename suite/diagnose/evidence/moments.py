@@ -200,8 +200,10 @@ def whitened(data: ViewData, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
         residual[rows] -= share * residual[rows].mean(axis=0)
         slope[rows] -= share[:, None] * slope[rows].mean(axis=0)
         if data.pose_slope.any():
+            pose_slope = data.pose_slope[rows]
+            pose_slope = pose_slope - share[:, None] * pose_slope.mean(axis=0)
             residual[rows], slope[rows] = _pose_whitened(
-                residual[rows], slope[rows], data.pose_slope[rows], unit
+                residual[rows], slope[rows], pose_slope, unit
             )
     if weights.base is not None:
         # Subtract a share of the mean of all flights. Where the trim is infinite the share is 0, as

@@ -240,6 +240,8 @@ COMPILED = {"xla_cpu_use_fusion_emitters": False}
 class KnotResponse(NamedTuple):
     """Response of W windows to a disturbance (force and torque) at each knot, and states there."""
 
+    residual: np.ndarray
+    """(W, N, 19) measured - simulated, without a disturbance."""
     slope: np.ndarray
     """(W, N, 19, KNOTS * 6) change of the simulated values per m/s^2 and rad/s^2 in body axes."""
     knot: Flown
@@ -338,10 +340,10 @@ def compiled(
         def along(direction: Any) -> Any:
             tangent = jnp.broadcast_to(direction.reshape(KNOTS, 6), none.shape)
             pushed = partial(fly, given, theta, offset, windows)
-            return jax.jvp(pushed, (none,), (tangent,), has_aux=True)[1:]
+            return jax.jvp(pushed, (none,), (tangent,), has_aux=True)
 
-        slopes, flown = jax.vmap(along, out_axes=(-1, None))(jnp.eye(KNOTS * 6))
-        return KnotResponse(slopes, at_knots(flown, windows))
+        error, slopes, flown = jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(KNOTS * 6))
+        return KnotResponse(-error, slopes, at_knots(flown, windows))
 
     linear = slopes_along(lambda *inputs: fly(*inputs)[0])
     return fly, *(jax.jit(each, compiler_options=COMPILED) for each in (linear, respond))

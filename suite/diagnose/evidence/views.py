@@ -134,7 +134,7 @@ class ViewEvidence(Evidence):
         """Return the fold of each stretch: its flight, or parts of all flights if they are few."""
         if len(np.unique(block.flight)) >= 3:
             return block.flight
-        return folds_of(block.flight, np.arange(len(block.flight), dtype=float))
+        return folds_of(block.flight, np.arange(len(block.flight), dtype=float), self.limits.folds)
 
     def groups(self, block: Block) -> np.ndarray:
         """Return the group of each stretch: its flight, or its third of a single flight."""

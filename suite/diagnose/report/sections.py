@@ -155,11 +155,15 @@ def candidates_section(diagnosis: Diagnosis) -> Section:
 def rivals_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section:
     """Return a table of other effects that were fitted in place of each named one."""
     rows = []
-    for _, named in diagnosis.named:
+    for finding, named in diagnosis.named:
         ordered = sorted(named.worse_by.items(), key=lambda item: item[1])
         for label, worse_by in ordered[:RIVALS]:
-            is_rival = label.rstrip(" 1234") in named.rivals  # a label may end in a motor's number
-            verdict = Cell("not separable", "bad") if is_rival else Cell("ruled out")
+            name = label.rstrip(" 1234")  # a label may end in a motor's number
+            # Another motor is no other effect, so it is not among the rivals.
+            is_motor = name == named.candidate.name
+            is_open = is_motor and worse_by <= finding.source.limits.rival_chi2
+            is_open |= name in named.rivals
+            verdict = Cell("not separable", "bad") if is_open else Cell("ruled out")
             rows.append([*cells(named.candidate.label, label, f"{worse_by:.1f}"), verdict])
     headers = ["named", "alternative", "worse by", ""]
     note = (

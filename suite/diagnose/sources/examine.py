@@ -77,6 +77,8 @@ def examine(
     # computed with them (`small_explains`).
     explained = found, (before, after)
     found, after, sizes, too_small = relevant_part(source, found, (before, after))
+    if too_small:
+        without = _without_each(source, found)
     for name, size in too_small:
         is_relevant = size.relevant(source.limits)
         reason = "no larger than the model's own error" if is_relevant else "too small to matter"

@@ -110,7 +110,7 @@ class RolloutSource(Source):
 
     def is_worse(self, before: Gap, after: Gap) -> bool:
         """Return whether the gap has grown by more than chance, see `Source`."""
-        return after.exceeds(before, overlap(self.limits), 0, self.limits)
+        return after.exceeds(before, overlap(self.held), self.limits)
 
     def would_show(self, found: SearchResult, candidate: Candidate) -> bool:
         """Return whether held-out flights are sensitive to `candidate`, see `Source`.
@@ -123,7 +123,7 @@ class RolloutSource(Source):
         slope = block_of(whitening, linear, indices, self.held).slope
         change = (theta - self.start.theta)[indices]
         # Windows overlap, and `overlap` makes each row count once.
-        expected_chi2 = float(((slope @ change) ** 2).sum()) * overlap(self.limits)
+        expected_chi2 = float(((slope @ change) ** 2).sum()) * overlap(self.held)
         return bool(expected_chi2 > self.limits.shown_chi2)
 
     def is_relevant(self, gap: Gap) -> bool:
@@ -133,7 +133,7 @@ class RolloutSource(Source):
         in time. The number of independent rollouts is therefore the held-out time in seconds.
         """
         force, torque, drift = self.limits.relevance
-        independent = max(len(self.held.flight) * self.limits.gap_stride_s, 1.0)
+        independent = max(len(self.held.flight) * overlap(self.held), 1.0)
         # A standard deviation of n normal errors has the relative standard error 1 / sqrt(2 n).
         upper = 1.0 + Z95 / np.sqrt(2.0 * independent)
 

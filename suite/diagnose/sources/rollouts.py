@@ -71,6 +71,8 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
         ValueError: if no flight can be used, or none with the chosen drive (model input).
     """
     logs, vehicle, limits = given.logs, given.vehicle, given.limits
+    if given.chosen and given.references:
+        raise ValueError("rollouts cannot find a change since reference flights; views can")
     if before or given.references or not (given.chosen or can_fly(logs, vehicle)):
         return None
     # Choose the input of the model: commands or measured rotor speeds.
@@ -141,6 +143,12 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
     held_flights = np.unique(not_fitted.flight).tolist()
     held, _ = windows_of(stride_s=limits.gap_stride_s, only=held_flights)
     assert held is not None
+    held = take(held, held.start_s >= since_s - ROUNDING_S)
+    begin = start_estimate(model, held)
+    flies = _finite(model.linearise(begin.theta, begin.free, held, []), limits)
+    if not flies.all():
+        held = take(held, flies)
+        warnings.append(f"{(~flies).sum()} held-out stretches left out: the model diverges there")
     # Effects on a signal that the logs lack, or that the model does not use, are not candidates.
     signals = {"acc_b"} if any(log.acc_b is not None for log in logs) else set()
     single = candidates(model.space, voltage, signals if rotor_input else signals | {"command"})
@@ -160,7 +168,7 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
         logs=logs,
         vehicle=vehicle,
         rotor_input=rotor_input,
-        held=take(held, held.start_s >= since_s - ROUNDING_S),
+        held=held,
         # Of a lone flight the end is held out.
         since_s=since_s if np.isin(not_fitted.flight, fitted.flight).any() else 0.0,
         coarser=take(coarser, is_fitted) if coarser_share else None,

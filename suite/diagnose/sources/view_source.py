@@ -57,7 +57,7 @@ class ViewSource(Source):
             (data.residual**2).sum(axis=1),
             (within**2).sum(axis=1),
             {self.name: channels},
-            float(np.sqrt((self.floor**2).sum())),
+            float(np.sqrt(self._noise_power)),
         )
 
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:

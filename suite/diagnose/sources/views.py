@@ -82,8 +82,8 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
     block = first.estimate_noise(first.start)[1]
     information = (block.slope**2).sum(axis=1)
     start_s = np.zeros(len(information))
-    _, held_names = choose_held_out(logs, block.flight, start_s, information, limits)
-    held_numbers = [k for k, log in enumerate(logs) if log.name in held_names]
+    is_fitted, held_names = choose_held_out(logs, block.flight, start_s, information, limits)
+    held_numbers = sorted({*block.flight.tolist()} - {*block.flight[is_fitted].tolist()})
     fitted, held = parted(flights, held_numbers, limits)
     # Make one source for each view.
     sources = []

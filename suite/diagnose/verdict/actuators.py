@@ -174,7 +174,7 @@ def _mismatch(
     dt, nominal_lag, stretches = step_s(vehicle), vehicle.rotors.time_constant, list[_Stretch]()
     plant = make_plant(vehicle, dt, {})
     for log in logs:
-        if sum(len(stretch.row) for stretch in stretches) * dt < limits.actuator_flight_s:
+        if sum(int(np.ptp(one.row)) for one in stretches) * dt < limits.actuator_flight_s:
             stretches += _stretches(log, plant, commanded_by, limits)
     if not stretches:
         return None

@@ -84,7 +84,7 @@ class Gap(NamedTuple):
         """Return the lower end of the 95 % interval of the mean `energy`."""
         return float(np.quantile(_bootstrap_means(self.energy, seed, limits), 0.025))
 
-    def exceeds(self, before: Gap, weight: float, seed: int, limits: Thresholds) -> bool:
+    def exceeds(self, before: Gap, weight: float, limits: Thresholds) -> bool:
         """Return whether the energy is significantly larger than that of `before`.
 
         A parameter that was fitted to other flights raises the squared error by about one, even if
@@ -93,11 +93,10 @@ class Gap(NamedTuple):
         Args:
             before: gap of another model on the same stretches.
             weight: factor on sums over stretches, so that rows in overlapping ones count once.
-            seed: seed of the bootstrap.
             limits: least significant rise.
         """
         rise = self.energy - before.energy
-        rise_low = np.quantile(_bootstrap_means(rise, seed, limits), 0.025)
+        rise_low = np.quantile(_bootstrap_means(rise, 0, limits), 0.025)
         return bool(rise_low > 0.0 and rise.sum() * weight > limits.refuting_chi2)
 
 
@@ -110,13 +109,14 @@ def remaining_share(before: Gap, after: Gap) -> float:
 def _bootstrap_means(values: np.ndarray, seed: int, limits: Thresholds) -> np.ndarray:
     """Return the means (D,) of D draws of `values` (W,), in blocks of neighbouring stretches.
 
-    Blocks keep the correlation between neighbours. `-(-a // b)` is a / b, rounded up.
+    Blocks keep the correlation between neighbours. The values form a circle, so that each of them
+    is drawn equally often. With few values, blocks are shorter, so that draws differ.
     """
-    rng, block = np.random.default_rng(seed), limits.bootstrap_block
-    blocks = max(1, -(-len(values) // block))
-    block_start = rng.integers(0, max(len(values) - block + 1, 1), (limits.bootstrap_draws, blocks))
-    rows = np.minimum(block_start[..., None] + np.arange(block), len(values) - 1)
-    return values[rows.reshape(limits.bootstrap_draws, -1)].mean(axis=1)
+    rng, count, draws = np.random.default_rng(seed), len(values), limits.bootstrap_draws
+    block = max(1, min(limits.bootstrap_block, count // 4))
+    block_start = rng.integers(0, count, (draws, -(-count // block), 1))
+    rows = (block_start + np.arange(block)).reshape(draws, -1)[:, :count] % count
+    return values[rows].mean(axis=1)
 
 
 def measure(
@@ -157,22 +157,27 @@ def gap_of(
     slow = slow_energy(whitening, residual)
     score = slow[:, :STATE].sum(axis=1) / whitening.slow_freedom[:, :STATE].sum(axis=1)
     free_noise = start_noise(noise.sigma, windows, linear.offset.shape[1], limits)
-    channels = {}
+    channels: dict[str, dict[str, Channel]] = {}
     for horizon_s in HORIZONS_S:
-        nearest = np.abs(np.asarray(windows.row_s) - horizon_s).argmin(axis=1)
-        rows = (np.arange(len(nearest)), nearest)
-        error = linear.residual[rows][:, :STATE]
-        floor = np.maximum(noise_floor(linear.slope[rows][:, :STATE], free_noise), 1e-12)
-        channels[f"{horizon_s:g} s"] = {
-            name: Channel(*(rms_length(part[:, SLICES[name]]) for part in (error, floor)))
-            for name in STATE_GROUPS
-        }
+        channels[f"{horizon_s:g} s"] = {}
+        distance_s = np.abs(np.asarray(windows.row_s) - horizon_s)
+        for name in STATE_GROUPS:
+            # A signal that is slower than the rows was not measured in each of them.
+            measured = np.all(np.asarray(windows.valid)[..., SLICES[name]], axis=-1)
+            stretch = np.flatnonzero(measured.any(axis=1))
+            nearest = np.where(measured, distance_s, np.inf)[stretch].argmin(axis=1)
+            rows = (stretch, nearest)
+            error = linear.residual[rows][:, SLICES[name]]
+            floor = noise_floor(linear.slope[rows][:, :STATE], free_noise)[:, SLICES[name]]
+            parts = (error, np.maximum(floor, 1e-12)) if len(stretch) else (np.zeros((1, 3)),) * 2
+            channels[f"{horizon_s:g} s"][name] = Channel(*map(rms_length, parts))
     return Gap(score, slow.sum(axis=1), channels)
 
 
-def overlap(limits: Thresholds) -> float:
+def overlap(windows: FlightWindows) -> float:
     """Return the weight of a window in sums, so that rows in several windows count once."""
-    return limits.gap_stride_s / LENGTH_S
+    step_s = np.diff(windows.start_s)[np.diff(windows.flight) == 0]
+    return float(np.minimum(step_s / LENGTH_S, 1.0).mean()) if len(step_s) else 1.0
 
 
 def true_starts(model: RolloutModel, theta: np.ndarray, windows: FlightWindows) -> np.ndarray:

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import gamma
 
 from eval.effects.interface import GRAVITY
-from suite.diagnose.data.whitening import Whitening, block_of
+from suite.diagnose.data.whitening import Linearisation, Whitening, block_of
 from suite.diagnose.data.windows import KNOTS, FlightWindows
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.gauss_newton import Z95
@@ -82,9 +82,8 @@ def disturbance_equations(
         limits: numbers of pieces and cells of the shapes.
     """
     response = model.respond(estimate.theta, estimate.free, windows)
-    linear = model.linearise(estimate.theta, estimate.free, windows, [])
     columns = range(response.slope.shape[-1])
-    disturbed = linear._replace(slope=response.slope)
+    disturbed = Linearisation(response.residual, response.slope, estimate.free)
     equations = block_of(whitening, disturbed, columns, windows).equations
     shapes = shape_library(response.knot, np.asarray(windows.start_s), limits)
     return DisturbanceEquations(equations.hessian, equations.gradient, response.knot, shapes)

@@ -50,16 +50,25 @@ def test_slow_rotor_speeds_are_left_out_and_of_too_many_rows_a_share_of_each_sig
     kept, (note,) = without_slow_rotors([log, slow])
     assert kept[0] is log and kept[1].rotor_speed is None
     assert "3.3 Hz" in note and "at least 10 Hz" in note
-    sparse = replace(log, rate_b=on_rows(log.rate_b, row % 3 == 1))
+    # 500 rows a second, and rotor speeds that are read one after another.
+    in_turn = np.where(row[:, None] % 4 == np.arange(4), log.rotor_speed, np.nan)
+    rate_b = on_rows(log.rate_b, row % 3 == 1)
+    sparse = replace(log, time_s=0.2 * log.time_s, rate_b=rate_b, rotor_speed=in_turn)
     (same,), notes = with_fewer_rows([sparse], Thresholds(most_rows=len(row)))
     assert same is sparse and notes == []
     (few,), (note,) = with_fewer_rows([sparse], Thresholds(most_rows=len(row) // 2))
     assert "every 3. row" in note
     position = np.isfinite(few.pos_w).all(axis=1)
-    np.testing.assert_array_equal(few.time_s[position], log.time_s[::3])
+    np.testing.assert_array_equal(few.time_s[position], sparse.time_s[::3])
     turning = np.isfinite(few.rate_b).all(axis=1)
     np.testing.assert_array_equal(few.rate_b[turning], log.rate_b[row % 3 == 1][::3])
+    for motor in range(4):
+        kept_speed = few.rotor_speed[np.isfinite(few.rotor_speed[:, motor]), motor]
+        np.testing.assert_array_equal(kept_speed, log.rotor_speed[row % 4 == motor, motor][::2])
     assert len(few.rotor_speed) == len(few.time_s) < len(row)
+    # At 100 rows a second, every third row would leave too few for a window of torque.
+    (few,), _ = with_fewer_rows([log], Thresholds(most_rows=len(row) // 2))
+    np.testing.assert_array_equal(few.time_s, log.time_s[::2])
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.sources.source import Remaining, Source, SourceSet
 from suite.diagnose.thresholds import THRESHOLDS
-from suite.diagnose.verdict.gap import Channel, Gap, remaining_share
+from suite.diagnose.verdict.gap import Channel, EffectSize, Gap, remaining_share
 from tests.support.vehicles import PLAIN
 from tracks.common.files import plain
 
@@ -76,24 +76,50 @@ class ThermometerSource(Source):
         return Remaining(gaps[1].rms > 1.5, remaining_share(*gaps), "the air's temperature")
 
 
-def sources(wind):
-    """Return a source of four flights whose readings depend on `wind` times the second column."""
+class SizedSource(ThermometerSource):
+    """The same, where only a wind is large enough to matter."""
+
+    def sizes(self, found):
+        sizes = {named.candidate.name: 0.01 for named in found.named} | {"constant_wind": 1.0}
+        return {name: (EffectSize(size, 0.0, None),) * 2 for name, size in sizes.items()}
+
+
+def sources(wind, drag=0.0, alike=0.0, rows=100, kind=ThermometerSource):
+    """Return a source of four flights whose readings depend on `wind` times the second column.
+
+    They depend on `drag` times the first one, which is `alike` the second.
+    """
     rng = np.random.default_rng(0)
-    does, flight = rng.standard_normal((400, len(NAMES))), np.repeat(np.arange(4), 100)
+    does, flight = rng.standard_normal((4 * rows, len(NAMES))), np.repeat(np.arange(4), rows)
+    does[:, 0] = alike * does[:, 1] + np.sqrt(1.0 - alike**2) * does[:, 0]
     level = 10.0 * rng.standard_normal(4)
-    reading = does @ [0.0, wind, 0.0] + level[flight] + rng.standard_normal(400)
+    reading = does @ [drag, wind, 0.0] + level[flight] + rng.standard_normal(4 * rows)
 
     def part(rows):
         day = np.unique(flight[rows], return_inverse=True)[1]
         return Thermometer(reading[rows], does[rows], day)
 
-    source = ThermometerSource(
+    source = kind(
         name="air", about="temperatures", subject="temperature", unit="K off", measure="RMS [K]",
         horizon_s=1.0, weighed=part(flight < 3).estimate_noise(START), start=START,
         candidates=[Candidate(name, (p,), name) for name, p in zip(NAMES, PLACES, strict=True)],
         limits=THRESHOLDS, held=part(flight == 3),
     )  # fmt: skip
     return SourceSet((source,), ("flight 4",), "the weather")
+
+
+def test_rollouts_find_no_change(log):
+    with pytest.raises(ValueError, match="rollouts cannot find a change since reference flights"):
+        diagnose([], PLAIN, [log], by="rollouts")
+
+
+def test_what_a_name_explains_is_computed_without_names_that_are_too_small(monkeypatch):
+    given = sources(1.0, drag=0.5, alike=0.95, rows=300, kind=SizedSource)
+    monkeypatch.setitem(SOURCES, "air", lambda *_: given)
+    (finding,) = diagnose([], PLAIN, by="air").findings
+    assert [named.candidate.label for named in finding.names] == ["constant_wind"]
+    # Nothing else remains, so without the wind the gap is as it was before.
+    assert finding.without["constant_wind"].rms == pytest.approx(finding.before.rms, rel=1e-6)
 
 
 @pytest.mark.parametrize(("size", "label"), [(0.8, "named"), (0.0, "no_gap")])

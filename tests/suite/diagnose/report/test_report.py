@@ -1,17 +1,19 @@
 """A diagnosis as JSON, tables and charts: what they show is what was found."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from suite.common.report import html
-from suite.diagnose.estimate.parameters import make_space
+from suite.diagnose.estimate.parameters import Candidate, make_space
 from suite.diagnose.report import charts, sections
 from suite.diagnose.report.charts import series_chart
 from suite.diagnose.report.diagnosis_json import actuators_json, diagnosis_json, parameters_json
 from suite.diagnose.report.page import channels_grid, page
 from suite.diagnose.report.summary import NOT_IDENTIFIABLE, answer, components, in_digits
+from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.verdict.actuators import actuator_mismatches
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN
@@ -27,6 +29,14 @@ def found(drag, flown):
 
 def texts(table):
     return [[cell.text for cell in row] for row in table.rows]
+
+
+def test_another_motor_that_fits_as_well_is_not_ruled_out(drag):
+    motor = Candidate("weak_motor", (0,), "weak_motor 1")
+    named = NamedEffect(motor, 0.001, 100.0, (), {"weak_motor 2": 1.0, "weak_motor 3": 500.0})
+    shown = SimpleNamespace(named=[(drag.main, named)])
+    (table,) = sections.rivals_section(shown, {"separate_with": ["a"]}).parts
+    assert [row[-1] for row in texts(table)] == ["not separable", "ruled out"]
 
 
 def test_the_json_has_what_was_found(drag, found):

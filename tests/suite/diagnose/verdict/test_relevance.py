@@ -107,7 +107,7 @@ def test_one_threshold_is_enough_and_none_at_all_keeps_everything(size):
 
 def test_a_gap_matters_beyond_its_noise_by_more_than_the_thresholds(found_drag):
     def matters(error, floor, count=400, limits=LIMITS):
-        held = SimpleNamespace(flight=np.zeros(count))
+        held = SimpleNamespace(flight=np.zeros(count), start_s=0.25 * np.arange(count))
         source = replace(found_drag.source, held=held, limits=limits)
         groups = dict.fromkeys(("position", "velocity", "rates"), Channel(error, floor))
         return source.is_relevant(found_drag.before._replace(
@@ -124,7 +124,7 @@ def test_where_rollouts_as_given_are_near_enough_no_name_matters(found_drag):
         for horizon, groups in found_drag.before.channels.items()
     }
     near, source = found_drag.before._replace(channels=none), found_drag.source
-    held = source.held._replace(flight=np.zeros(400, int))
+    held = source.held._replace(flight=np.zeros(400, int), start_s=0.25 * np.arange(400))
     source = replace(source, held=held)
     found, after, _, out = relevant_part(source, found_drag.search, (near, found_drag.after))
     assert found.named == () and after is near

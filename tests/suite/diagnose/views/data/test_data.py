@@ -46,6 +46,11 @@ def test_a_bump_has_the_mean_acceleration_and_reaches_across_no_hole_or_bad_row(
     form = weak_form(time_s, good, 0.2, 0.1)
     assert np.abs(form.middle_s - 1.0).min() > 0.095
     assert np.abs(form.middle_s - 3.1).min() > 0.095
+    # A hole that is longer than a bump: none reaches into it from either side.
+    time_s = np.concatenate([np.arange(0.0, 1.0, 0.001), np.arange(1.156, 2.0, 0.001)])
+    form = weak_form(time_s, np.ones(len(time_s), bool), 0.1, 0.1)
+    gain = form.change.power(2).sum(axis=1)
+    assert gain.max() < 1.1 * gain.min()
 
 
 def test_motor_commands_give_the_speeds_of_the_vehicles_map_with_its_delay_and_lag():
@@ -96,6 +101,11 @@ def test_a_missing_attitude_follows_from_the_path():
     whole = completed(lacks)
     up, leaned = log.rot_w[50:-50, :, 2], whole.rot_w[50:-50, :, 2]
     assert np.degrees(np.arccos(np.clip((up * leaned).sum(1), -1, 1))).mean() < 3.0
+    slow = np.where(np.arange(len(log.time_s))[:, None] % 3 == 0, log.quat_wxyz, np.nan)
+    turning_b = completed(replace(lacks, quat_wxyz=slow, about={"partial": ["rate"]})).rate_b
+    known = np.isfinite(turning_b).all(axis=1)
+    assert known.sum() > 0.3 * len(known)
+    assert np.abs(turning_b[known] - log.rate_b[known]).mean() < 0.2
     views = ready([lacks], VEHICLE).views
     assert views[0].axes == (2,) and views[1].width_s > TORQUE.width_s
     assert ready([log], VEHICLE, others=[lacks]).views == views, "both sets are judged alike"
@@ -104,6 +114,20 @@ def test_a_missing_attitude_follows_from_the_path():
 @pytest.fixture(scope="module")
 def pair():
     return flights(2, 0, 5.0)
+
+
+def test_the_noise_of_a_slow_signal_is_that_of_its_own_rows(pair):
+    def floor(every):
+        slow = [
+            replace(
+                log, vel_w=np.where(np.arange(len(log.time_s))[:, None] % every, np.nan, log.vel_w)
+            )
+            for log in pair
+        ]
+        return ready(slow, VEHICLE).floor["force"][0]
+
+    # Fewer values of the same noise make a mean acceleration less certain.
+    assert 1.0 < floor(3) / floor(1) < 2.5
 
 
 def on_the_ground(log, before_s, after_s):

@@ -74,6 +74,21 @@ def test_trims_of_flights_are_separated_from_scatter_and_weighed_moments_are_ind
     assert np.mean(within, axis=0) == pytest.approx([1.0, 1.0, 1.0], rel=0.05)
 
 
+def test_errors_of_a_reconstructed_pose_are_whitened_with_the_trim():
+    """The noise that remains is independent and of unit size, by its exact covariance."""
+    count, unit, trim = 40, 0.2, np.array([1.0, 0.5, 2.0])
+    pose_slope = 0.5 + 0.15 * np.random.default_rng(0).standard_normal((count, 3, 2))
+    flat = pose_slope.reshape(3 * count, 2)
+    covariance = np.kron(np.ones((count, count)), np.diag(trim**2)) + flat @ flat.T
+    covariance += unit**2 * np.eye(3 * count)
+    # Whitening is linear: slopes that are the columns of the identity give its matrix.
+    columns = np.eye(3 * count).reshape(count, 3, 3 * count)
+    none, flight = np.zeros((count, 3)), np.zeros(count, int)
+    data = ViewData(flight, 0.1 * np.arange(count), none, none, columns, pose_slope)
+    matrix = whitened(data, Weights(np.full(3, unit), np.ones(3), trim))[1].reshape(3 * count, -1)
+    np.testing.assert_allclose(matrix @ covariance @ matrix.T, np.eye(3 * count), atol=1e-9)
+
+
 def test_sizes_beyond_three_times_the_usual_are_implausible():
     at = [i for i, entry in enumerate(SPACE.entries) if entry.effect == "frame_tilt"]
     tilt = Candidate("frame_tilt", tuple(at), "frame_tilt")
