@@ -86,9 +86,10 @@ def _check_rotors(vehicle: Vehicle) -> None:
         limits[f"motors.thrust = {list(vehicle.motors.thrust)}"] = full
     for entry, limit in limits.items():
         if hover.max() >= limit:
+            unit = "; a mass in grams?" if hover.max() > 30.0 * limit else ""
             raise ValueError(
-                f"{entry}: too weak to hover; a rotor gives {limit:.3g} N and {hover.max():.3g} N "
-                "are needed"
+                f"{entry}: too weak to hover with mass = {vehicle.mass:g} kg{unit}; a rotor gives "
+                f"{limit:.3g} N and {hover.max():.3g} N are needed"
             )
 
 

@@ -9,6 +9,7 @@ from eval.logs.faults.check import CheckContext, check_before_diagnosis, lines_o
 from eval.logs.flight_log import FlightLog, read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console
+from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.report import write_report
 from suite.delta.run import flight_files
 from suite.diagnose.config import Config
@@ -16,7 +17,7 @@ from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import refuse_own_motion
 from suite.diagnose.identify.run import is_identified
-from suite.diagnose.plan import trajectories_for, write_plan
+from suite.diagnose.plan import remove_plan, trajectories_for, write_plan
 from suite.diagnose.report.charts import write_rollouts
 from suite.diagnose.report.diagnosis_json import actuators_json, diagnosis_json
 from suite.diagnose.report.page import page
@@ -39,6 +40,7 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
         ValueError: if flights or vehicle file cannot be used.
     """
     out = config.out
+    refuse_other_run(out, config)
     check_no_input(out / "vehicle.toml", [config.vehicle], "--out")
     vehicle = load_vehicle(config.vehicle)
     refuse_own_motion(vehicle)
@@ -101,5 +103,11 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
         console.note(f"warning: {warning}")
     if result["verdict"] == "no_gap" and result["not_examined"]:
         console.note(f"not examined: {', '.join(result['not_examined'])}")
+    # Nothing of an earlier diagnosis stays beside this one.
+    if "recording.rrd" not in files:
+        (out / "recording.rrd").unlink(missing_ok=True)
+    if not config.plan:
+        remove_plan(out / "plan")
     write_json(out / "diagnosis.json", result)
+    write_run_record(out, config, config.seed)
     return result

@@ -93,6 +93,10 @@ SIGNALS = {
 """Subject of a finding (`Finding.signal`) -> name of the signal in the rows."""
 
 
+OF_VEHICLE_FILE = ("motor_map", "thrust_scale")
+"""Faults of the vehicle file, not of the log: with a vehicle file, only its own ones count."""
+
+
 def run_checks(
     rows: Rows,
     checks: Sequence[Check],
@@ -157,7 +161,8 @@ def check_log(
 ) -> tuple[list[Finding], Readings]:
     """Return the faults of a flight log, and the readings that correct them.
 
-    Stored findings of an import are repeated, unless a check finds the same fault again.
+    Stored findings of an import are repeated, unless a check finds the same fault again, or they
+    are of the import's vehicle file and `against` has one.
     """
     checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
     findings, readings, _ = run_checks(rows_of(log), checks, against, fix)
@@ -165,6 +170,8 @@ def check_log(
     findings += check_controller_rate(rates, against.policy_hz, "the policy")
     again = {finding.fault for finding in findings if finding.fault}
     stored = [f for f in findings_of(log.about) if f.status in ("doubt", "corrected")]
+    if against.vehicle is not None:
+        stored = [f for f in stored if f.fault not in OF_VEHICLE_FILE]
     return [*(f for f in stored if f.fault not in again or not f.fault), *findings], readings
 
 

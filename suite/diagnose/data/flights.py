@@ -209,8 +209,7 @@ def parted(
 def _floor(view: View, flights: Sequence[SmoothedFlight], logs: Sequence[FlightLog]) -> np.ndarray:
     """Return the noise (3,) of the mean accelerations, from differences of neighbouring rows.
 
-    Only rows in which the signal was measured count: an interpolated row has no noise of its own.
-    `logs` are the flights before the interpolation.
+    Only rows of the signal itself count, by `logs`, the flights before the interpolation.
     """
     power = []
     for flight, log in zip(flights, logs, strict=True):

@@ -74,7 +74,8 @@ REFUSED = [
     ("rotors.spin", [1, 1, -1, 2], r"rotors\.spin.*1 .*or -1"),
     ("rotors.spin", [1, 1, 1, 1], "independently"),
     ("rotors.position", [[0.2, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [0.2, 0.1, 0]], "between"),
-    ("rotors.speed_max", 1000.0, "too weak to hover"),
+    ("rotors.speed_max", 1000.0, "too weak to hover with mass = 0.75 kg; a rotor"),
+    ("mass", 750.0, r"too weak to hover with mass = 750 kg; a mass in grams\?"),
     ("rotors.time_constant", -0.1, r"rotors\.time_constant = -0\.1.*from 0"),
     ("controller.frequency", 10.0, r"controller\.frequency.*from 50"),
     ("controller.rate_gain", [20.0, 20.0, 0.0], r"controller\.rate_gain"),
@@ -157,7 +158,7 @@ def test_motors_come_back_from_a_file_and_wrong_ones_are_refused():
         ({"thrust": [0.1, 0.1]}, r"\[motors\] has no 'voltage'"),
         (
             {**table["motors"], "thrust": [0.0, 0.05]},
-            r"motors.thrust = .*too weak to hover; .* gives 0.05",
+            r"motors.thrust = .*too weak to hover .* gives 0.05",
         ),
         ({"thrust": [0.1, -0.1], "voltage": 4.0}, "must grow"),
         ({"thrust": [0.1, 0.1], "voltage": 4.0, "volts": 1.0}, "Did you mean 'voltage'"),

@@ -88,6 +88,10 @@ def test_what_is_read_is_not_written_over_and_flights_too_short_or_missing_are_r
     assert main(["diagnose", str(tmp_path), "--vehicle", own, *out]) == 2
     assert "vehicle.toml is also an input and would be overwritten" in capsys.readouterr().err
     assert main(["diagnose", str(tmp_path / "none.csv"), "--vehicle", "reference"]) == 2
+    record = {"config_type": "suite.loop.config.LoopConfig", "command": ["suite", "loop"]}
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    assert main(["diagnose", str(tmp_path), "--vehicle", "reference", *out]) == 2
+    assert "holds a run of another kind (made by suite loop)" in capsys.readouterr().err
     path = write_flight(tmp_path / "short.parquet", fly(PLAIN, 0, duration_s=1.2))
     assert main(["diagnose", str(path), "--vehicle", "reference"]) == 2
     assert "1.3 s" in capsys.readouterr().err
@@ -113,7 +117,11 @@ def test_a_change_is_written_as_every_diagnosis_is(tmp_path, capsys):
     words = ["diagnose", str(tmp_path / "new"), "--reference", str(tmp_path / "old"), "--plan",
              "--drive", "motors", "--vehicle", str(tmp_path / "v.toml"),
              "--out", str(tmp_path / "out")]  # fmt: skip
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/recording.rrd").touch()
     assert main([*words, "--json"]) == 0
+    kept = {"diagnosis.json", "vehicle.toml", "report.html", "run.json"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} - {"plan"} == kept
     said = capsys.readouterr()
     told = json.loads(said.out)
     names = {name for e in told["effects"] for name in (e["name"], *e["alternatives"])}
