@@ -14,7 +14,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -133,7 +133,9 @@ def train_in_folder(
     if not hosts.is_writer():
         return Outcome(folder / "policy", int(_iterate(phases, run, state, console).iteration), {})
     if done < total or _is_missing(watch, folder, done, total):
-        announce(console, f"training to {folder}", run.estimate)
+        title = f"training to {folder}" + (f" from step {done} of {total} on" if done else "")
+        seconds = run.estimate.seconds * (total - done) / total
+        announce(console, title, replace(run.estimate, seconds=seconds))
         if done < total:
             write_run_record(folder, run.config, run.seed, resumed=done > 0)
         state = _iterate(phases, run, state, console, watch)

@@ -118,6 +118,14 @@ def test_a_run_on_several_threads_does_not_go_on_with_one_and_goes_on_with_more(
     assert train(tmp_path, counting(4)).iterations == 4
 
 
+def test_a_run_that_goes_on_says_from_where_and_how_long(tmp_path, capsys):
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path, counting(8, stop=6))
+    capsys.readouterr()
+    train(tmp_path, counting(8))
+    assert "from step 6 of 8 on" in capsys.readouterr().err
+
+
 def test_a_folder_of_another_run_is_refused_by_what_differs(tmp_path):
     train(tmp_path, counting(2))
     changed = replace(CONFIG, loss=replace(CONFIG.loss, progress=9.0))
