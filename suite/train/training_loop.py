@@ -320,7 +320,8 @@ def _resume(run: Run, fresh: Any) -> Any:
         curve.cut(folder, 0, curve.WATCHED)
         return fresh
     stored = read_config(saved)["training"]
-    options = [f"another --{key}" for key in ("from", "delta") if stored.get(key) != origin[key]]
+    flags = {"from": "--init-from", "delta": "--delta"}
+    options = [f"another {flag}" for key, flag in flags.items() if stored.get(key) != origin[key]]
     changes = options + differences(stored["config"], origin["config"])
     if changes:
         raise ValueError(

@@ -132,7 +132,7 @@ def test_a_folder_of_another_run_is_refused_by_what_differs(tmp_path):
     for other, words in (
         ({"config": replace(CONFIG, seed=9)}, r"another run \(seed is 0 there, 9 here\); repeat"),
         ({"config": changed}, r"\(loss\.progress is 1\.2 there, 9\.0 here\)"),
-        ({"start": "a digest"}, "another --from"),
+        ({"start": "a digest"}, "another --init-from"),
     ):
         with pytest.raises(ValueError, match=words):
             train(tmp_path, counting(2), **other)
