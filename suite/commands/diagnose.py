@@ -33,6 +33,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             console.say(f"    {component.label}: {value}{suffix}")
     if result["warnings"]:
         console.say(f"warnings: {len(result['warnings'])}, printed above and in the report")
+    if result["not_examined"]:
+        console.say(f"not examined: {', '.join(result['not_examined'])}")
     for step in next_steps(result):
         console.say(f"next: {step}")
     if "plan" in result:

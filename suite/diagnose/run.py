@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from eval.logs.faults.check import CheckContext, check_before_diagnosis, lines_of, not_examined
+from eval.logs.faults.check import CheckContext, check_before_diagnosis, lines_of
 from eval.logs.flight_log import FlightLog, read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console
@@ -90,7 +90,7 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
         result["plan"] = write_plan(out / "plan", *trajectories_for(result))
         files |= {"plan/plan.json"} if result["plan"]["flights"] else set()
     # Write the results.
-    result["findings"], result["not_examined"] = findings, not_examined(logs)
+    result["findings"] = findings
     result["identified"] = is_identified(config.vehicle)
     result = {**plain(result), **stamp(SCHEMA, config.seed)}
     names = ", ".join(effect["name"] for effect in result["effects"]) or "none"
@@ -101,8 +101,6 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     write_report(out / "report.html", page(diagnosis, result, toml, files))
     for warning in result["warnings"][shown_count:]:
         console.note(f"warning: {warning}")
-    if result["verdict"] == "no_gap" and result["not_examined"]:
-        console.note(f"not examined: {', '.join(result['not_examined'])}")
     # Nothing of an earlier diagnosis stays beside this one.
     if "recording.rrd" not in files:
         (out / "recording.rrd").unlink(missing_ok=True)

@@ -264,6 +264,9 @@ class Thresholds:
     structure_rotor_input: float = 1.3
     """The same if measured rotor speeds are the input, or if the log lacks commands; the noise is
     then less certain."""
+    above_noise: float = 1.5
+    """Remaining errors above this many noise floors are reported, even if they show no structure.
+    Errors of unknown rotor speeds alone may reach 1.3."""
     unexplained_share: float = 0.7
     """Largest remaining share of the gap for the verdict `partly`; above it, it is `unknown`."""
     wind_lengths_m: tuple[float, float, int] = (0.5, 40.0, 25)

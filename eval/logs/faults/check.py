@@ -227,22 +227,6 @@ def check_before_diagnosis(
     return [{**f._asdict(), "flight": name} for f, name in found if f.status != "ok"]
 
 
-def not_examined(logs: Sequence[FlightLog]) -> list[str]:
-    """Return the views (parts of the dynamics) that no log allows to test: `force`, `torque`."""
-    drives = ("rotor_speed", "pwm")
-    force = any(
-        (not {"pos", "quat"} & set(log.partial) or (log.acc_b is not None and "pos" in log.partial))
-        and any(getattr(log, name) is not None for name in (*drives, "thrust_cmd"))
-        for log in logs
-    )
-    torque = any(
-        "rate" not in log.partial
-        and any(getattr(log, n) is not None for n in (*drives, "torque_cmd_b", "rate_cmd_b"))
-        for log in logs
-    )
-    return [name for name, seen in (("force", force), ("torque", torque)) if not seen]
-
-
 def lines_of(records: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return lines of text for the records with a fault and status doubt or note.
 

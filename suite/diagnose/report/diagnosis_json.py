@@ -9,13 +9,16 @@ import numpy as np
 
 from eval.effects import EFFECTS
 from suite.diagnose.diagnose import Diagnosis
-from suite.diagnose.estimate.parameters import ParameterSpace
+from suite.diagnose.estimate.parameters import ParameterSpace, effects_in
 from suite.diagnose.plan import advice
 from suite.diagnose.report.summary import headline, short_name
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.source import Finding
 from suite.diagnose.verdict.actuators import ActuatorMismatch
-from suite.diagnose.verdict.gap import EffectSize
+from suite.diagnose.verdict.gap import EffectSize, remaining_share
+
+NO_EFFECT = "that no effect of the catalogue explains"
+"""Reason of a remaining error that has structure."""
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -48,14 +51,49 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "after_ci95": control[1].ci95(diagnosis.seed, limits),
         },
         "unexplained": {
-            "share": diagnosis.verdict.share_left,
+            "share": remaining_share(main.before, main.after) if named else 1.0,
+            "judged": diagnosis.verdict.share_left,
             "where": diagnosis.verdict.where,
+            "above_noise": above_noise(diagnosis),
             "swing": swing and {"period_s": swing.period_s, "length_m": swing.length_m},
             **main.remaining.details,
         },
         "reference": list(diagnosis.references),
+        "not_examined": not_examined(diagnosis),
     }
     return {"headline": headline(entries), **entries}
+
+
+def above_noise(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """Return an entry for each source whose remaining error is clearly above the noise floor."""
+    return [
+        {
+            "view": one.source.name,
+            "error": one.after.rms,
+            "noise_floor": one.after.floor,
+            "unit": one.source.unit,
+            "reason": NO_EFFECT if one.remaining.structured else one.remaining.reason,
+        }
+        for one in diagnosis.findings
+        if one.after.rms > diagnosis.limits.above_noise * one.after.floor
+    ]
+
+
+def not_examined(diagnosis: Diagnosis) -> list[str]:
+    """Return the parts of the dynamics that no source tests: `force`, `torque`, `rate loop`.
+
+    The rate loop is tested if effects that need commands as the model's input are candidates.
+    """
+    views = {one.source.name for one in diagnosis.findings}
+    tried = {
+        effect
+        for one in diagnosis.findings
+        for candidate in one.source.candidates
+        for effect in effects_in(candidate.name)
+    }
+    parts = [] if "whole" in views else [name for name in ("force", "torque") if name not in views]
+    by_command = any("command" in EFFECTS[name].needs for name in tried if name in EFFECTS)
+    return [*parts, *([] if by_command else ["rate loop"])]
 
 
 def gap_json(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -68,6 +106,15 @@ def gap_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "before": main.before.rms,
         "after": main.after.rms,
         "noise_floor": main.before.floor,
+        "offset": {
+            one.source.name: {
+                "before": one.before.offset,
+                "after": one.after.offset,
+                "unit": one.source.unit,
+            }
+            for one in diagnosis.findings
+            if one.before.offset > 0.0
+        },
         "model_error": main.source.model_error(main.search),
         "before_ci95": main.before.ci95(seed, limits),
         "after_ci95": main.after.ci95(seed, limits),

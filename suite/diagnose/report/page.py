@@ -56,7 +56,8 @@ TOTALS = (
 )
 CHANNELS = (
     "RMS errors on held-out flights. Noise floor: the error by measurement noise alone (in "
-    "rollouts, noise of the start and of the compared row). Repeatability: the spread of the means "
+    "rollouts, noise of the start and of the compared row). Errors of force and torque are "
+    "those within a flight, without its constant offset. Repeatability: the spread of the means "
     "of flights of the unchanged vehicle. Closed: the share of the variance within a flight that "
     "the named effects explain. Black box: the share that a regression without physics "
     "explains; it is fitted to the same flights."
@@ -80,6 +81,8 @@ def page(diagnosis: Diagnosis, result: Mapping[str, Any], toml: str, files: set[
         "held out": _few(gap["held_out"]),
         "driven by": result["driven_by"],
     }
+    if result["not_examined"]:
+        facts["not examined"] = ", ".join(result["not_examined"])
     if diagnosis.references:
         facts["reference"] = f"{len(diagnosis.references)} flights"
     details = [

@@ -14,7 +14,13 @@ from eval.logs.flight_log import FlightLog
 from suite.common.report import Part, Section
 from suite.diagnose.data.windows import SLICES, UNITS
 from suite.diagnose.diagnose import Diagnosis
-from suite.diagnose.report.summary import cells, grid, short_name, superscripts
+from suite.diagnose.report.summary import (
+    cells,
+    grid,
+    remaining_words,
+    short_name,
+    superscripts,
+)
 from suite.diagnose.sources.rollout_source import of_rollouts
 from tracks.common.grid import Cell, Grid
 
@@ -178,14 +184,36 @@ def rivals_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section:
     return Section("Alternatives to the named effects", parts)
 
 
+ABOVE_NOISE = (
+    "The noise floor of force and torque contains the noise of the measured motion, but no errors "
+    "of rotor speeds or attitude. Such errors may cause what logged signals hardly predict."
+)
+"""Explanation of the table of errors above the noise floor."""
+
+
 def residual_section(result: Mapping[str, Any]) -> Section:
     """Return the error that remains with the named effects, and its structure."""
     remaining = result["unexplained"]
     words = "No structure beyond the measurement noise remains."
+    if remaining["above_noise"]:
+        words = f"Above the noise floor remains {remaining_words(result)}."
     if remaining["where"]:
         share, where = 100 * remaining["share"], superscripts(remaining["where"])
-        words = f"{share:.0f} % of the gap remains: {where}."
+        of = f"{result['gap']['of']} above the noise floor"
+        words = f"{share:.0f} % of the {of} remains. Unexplained: {where}."
     parts: list[Part] = [words]
+    if remaining["above_noise"]:
+        rows = [
+            (
+                one["view"],
+                superscripts(f"{one['error']:.3g} {one['unit']}"),
+                f"{one['noise_floor']:.3g}",
+                f"an error {one['reason']}",
+            )
+            for one in remaining["above_noise"]
+        ]
+        headers = ["view", "remaining error", "noise floor", ""]
+        parts.append(grid("Errors above the noise floor", headers, rows, ABOVE_NOISE))
     if remaining.get("shapes"):
         shapes = remaining["shapes"]
         rows = [(s["label"], f"{s['gain']:.1f}", f"{s['p_value']:.3f}") for s in shapes]

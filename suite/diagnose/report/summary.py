@@ -30,7 +30,10 @@ CHANGES = {
     "explains it.",
 }
 """A sentence for each verdict, if a change since reference flights was searched for."""
-USE = "Use the corrected vehicle: give vehicle.toml to suite eval, train and loop (--vehicle)."
+USE = (
+    "Use the corrected vehicle: give vehicle.toml of the folder --out to suite eval, train and loop "
+    "(--vehicle)."
+)
 CHECK = "Run suite check on these logs: a wrong unit, sign, order or clock resembles physics."
 
 
@@ -41,10 +44,22 @@ def headline(result: Mapping[str, Any]) -> str:
         result: content of diagnosis.json.
     """
     words, gap = [answer(result)], result["gap"]
+    # The unit of rollouts is the noise floor itself.
+    floor = "" if gap["noise_floor"] == 1.0 else f" (noise floor {_figure(gap['noise_floor'])})"
+    before, after = f"{_figure(gap['before'])} to ", f"{_figure(gap['after'])} {gap['unit']}"
     if gap["after"] < gap["before"]:
+        words.append(f"On held-out flights the {gap['of']} falls from {before}{after}{floor}.")
+    elif not result["effects"]:
+        words.append(f"On held-out flights the {gap['of']} is {after}{floor}.")
+    offsets = [
+        f"{_figure(offset['after'])} {offset['unit']} ({view})"
+        for view, offset in gap["offset"].items()
+        if offset["after"] >= result["relevance"].get(view, 0.0)
+    ]
+    if offsets:
         words.append(
-            f"On held-out flights the {gap['of']} falls from {_figure(gap['before'])} to "
-            f"{_figure(gap['after'])} {gap['unit']}."
+            "A constant offset of each flight remains, which does not count as a gap: "
+            f"{', '.join(offsets)}."
         )
     if result["unexplained"]["where"]:
         words.append(f"Unexplained: {result['unexplained']['where']}.")
@@ -69,11 +84,27 @@ def answer(result: Mapping[str, Any]) -> str:
         words.insert(
             0, "Changed in the vehicle:" if is_change else "Wrong or missing in the vehicle file:"
         )
-    words.append((CHANGES if result["reference"] else VERDICTS)[result["verdict"]])
+    words.append(_verdict_words(result))
     if result["verdict"] == "no_gap" and result["negligible"]:
         names = ", ".join(entry["name"] for entry in result["negligible"])
         words.append(f"Significant but too small to matter: {names}.")
     return " ".join(words)
+
+
+def _verdict_words(result: Mapping[str, Any]) -> str:
+    """Return a sentence for the verdict, with the errors that it excludes."""
+    words = (CHANGES if result["reference"] else VERDICTS)[result["verdict"]]
+    rest, noise = remaining_words(result), " within the measurement noise"
+    is_no_change = bool(result["reference"]) and result["verdict"] == "no_gap"
+    if not rest or is_no_change or result["verdict"] not in ("no_gap", "named"):
+        return words
+    return f"{words.removesuffix('.').removesuffix(noise)}, except for {rest}."
+
+
+def remaining_words(result: Mapping[str, Any]) -> str:
+    """Return words for the errors that remain clearly above the noise floor; empty without any."""
+    reasons = [entry["reason"] for entry in result["unexplained"]["above_noise"]]
+    return " and ".join(f"an error {reason}" for reason in dict.fromkeys(reasons))
 
 
 def _effect_words(effect: Mapping[str, Any]) -> str:
@@ -103,8 +134,6 @@ def next_steps(result: Mapping[str, Any]) -> list[str]:
 def _no_gap(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the advice for the verdict `no_gap`."""
     yield "Use the vehicle file as it is."
-    if result.get("not_examined"):
-        yield f"These logs do not show: {', '.join(result['not_examined'])}. Log that as well."
     yield "If your task is faster than these flights, fly faster or turn harder, and repeat this."
 
 

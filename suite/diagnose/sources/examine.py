@@ -19,7 +19,7 @@ from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.gauss_newton import TINY, fit, intervals95
 from suite.diagnose.estimate.parameters import Candidate, effects_in, indices_of
 from suite.diagnose.search.evaluation import NamedEffect, SearchResult
-from suite.diagnose.sources.source import Finding, Source
+from suite.diagnose.sources.source import TOO_SMALL, Finding, Source
 from suite.diagnose.verdict.gap import EffectSize, Gap
 
 CONTRADICTION = 1.5
@@ -87,6 +87,8 @@ def examine(
         explained = found, (before, after)
     # Analyse the remaining error.
     remaining = source.remaining(*explained, seed)
+    if too_small and source.small_explains and not remaining.wind:
+        remaining = remaining._replace(reason=TOO_SMALL)
     if remaining.wind and found.named and not source.is_worse(after, before):
         # Several constant effects together can imitate a wind that is correlated over seconds. If
         # held-out flights are no worse without these effects, the wind is the simpler cause.

@@ -35,7 +35,14 @@ from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.rollouts import RolloutEvidence, RolloutModel, rollout_evidence
 from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.search.evaluation import Evaluation, SearchResult
-from suite.diagnose.sources.source import Finding, Remaining, Series, Source, sizes_by_effect
+from suite.diagnose.sources.source import (
+    TOO_SMALL,
+    Finding,
+    Remaining,
+    Series,
+    Source,
+    sizes_by_effect,
+)
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.actuators import TestedEffect
 from suite.diagnose.verdict.disturbances import Swing, find_turbulence, residual_swing
@@ -190,7 +197,7 @@ class RolloutSource(Source):
         }
         share = remaining_share(*gaps) if found.named else 0.0
         if not self.is_relevant(gaps[1]):
-            return Remaining(False, share, details=details)
+            return Remaining(False, share, reason=TOO_SMALL, details=details)
         # Slow errors are those that a low polynomial over a window describes: noise has few.
         slow = of_rollouts(found.last).slow_errors(found.last.block)
         is_uncertain = self.rotor_input or self.coarser is not None
@@ -198,7 +205,8 @@ class RolloutSource(Source):
         swing = self._swing(found.estimate.theta) if wind or where else None
         # Wind explains the structure, unless the force oscillates regularly.
         if wind and not swing:
-            return Remaining(False, remaining_share(*gaps), wind=wind, details=details)
+            share, reason = remaining_share(*gaps), "by the random course of the wind"
+            return Remaining(False, share, reason=reason, wind=wind, details=details)
         if (where or swing) and not found.named:
             share = 1.0
         return Remaining(bool(where or swing), share, where, swing=swing, details=details)

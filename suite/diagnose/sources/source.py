@@ -33,6 +33,8 @@ from suite.diagnose.verdict.model_error import beyond_error
 
 LEAST_GAP = 1e-9
 """Lower limit of a gap minus its noise floor in a division, in the gap's unit."""
+TOO_SMALL = "that is too small to matter"
+"""Reason of an error below the thresholds of relevance, see `Remaining.reason`."""
 
 
 class Remaining(NamedTuple):
@@ -44,6 +46,8 @@ class Remaining(NamedTuple):
     """Share of the gap above the noise floor that remains."""
     where: str | None = None
     """Quantity that the error depends on, in words."""
+    reason: str = "that depends on no tested quantity"
+    """Words after "an error": why an error above the noise floor does not count as structure."""
     explainable: float = 0.0
     """Share of the gap that a black box (a regression without physics) explains; 0 if none was
     fitted."""
@@ -145,7 +149,8 @@ class Source(ABC):
         have to grow: a held-out flight with another trim (constant offset) may raise the total
         alone.
         """
-        return after.rms >= before.rms and float(after.energy.sum()) >= float(before.energy.sum())
+        rise = float(after.energy.sum()) - float(before.energy.sum())
+        return after.total >= before.total and rise >= 0.0
 
     def would_show(self, found: SearchResult, candidate: Candidate) -> bool:
         """Return whether held-out flights are sensitive to `candidate` at its fitted size."""

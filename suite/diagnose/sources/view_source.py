@@ -22,12 +22,15 @@ from suite.diagnose.search.change import search_motion_change
 from suite.diagnose.search.evaluation import Evaluation, SearchResult
 from suite.diagnose.sources.source import Remaining, Series, Source, sizes_by_effect
 from suite.diagnose.verdict.disturbances import residual_swing
-from suite.diagnose.verdict.gap import Channel, EffectSize, Gap, view_size
+from suite.diagnose.verdict.gap import Channel, EffectSize, Gap, rms_length, view_size
 
 STRETCH_S = 10.0
 """Length of the stretch in a chart [s]."""
 QUANTITIES = {"force": "acceleration", "torque": "angular acceleration"}
 """Compared quantity, by the name of a view."""
+UNPREDICTED = "that logged signals hardly predict"
+NO_AGREEMENT = "on which the flights do not agree"
+"""Reasons why an error of a view does not count as structure, see `Remaining.reason`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,16 +52,13 @@ class ViewSource(Source):
         # A flight's mean error (its trim) is no error within the flight, and is subtracted. Where
         # only means of flights are compared, there is nothing to subtract.
         within = data.residual if self.held.means else centred(data.residual, data.flight)
-        error = np.sqrt((data.residual**2).mean(axis=0))
+        error = np.sqrt((within**2).mean(axis=0))
+        energy = (within**2).sum(axis=1)
         channels = {
             "xyz"[k]: Channel(float(error[k]), float(self.floor[k])) for k in self.view.axes
         }
-        return Gap(
-            (data.residual**2).sum(axis=1),
-            (within**2).sum(axis=1),
-            {self.name: channels},
-            float(np.sqrt(self._noise_power)),
-        )
+        floor = float(np.sqrt(self._noise_power))
+        return Gap(energy, energy, {self.name: channels}, floor, rms_length(data.residual - within))
 
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
         """Return the sizes of the named effects on the fitted flights, see `Source`."""
@@ -101,6 +101,7 @@ class ViewSource(Source):
             structured,
             beyond,
             where,
+            NO_AGREEMENT if self.held.means else UNPREDICTED,
             explainable,
             swing=swing,
             gap_details={"closed": closed, "explainable": explainable},
@@ -194,7 +195,7 @@ class ViewSource(Source):
             measured,
             lines,
             f"{quantity} along body {'xyz'[axis]} [{self.unit}]",
-            "A stretch of a held-out flight.",
+            "A stretch of a held-out flight, with its constant offset.",
         )
 
 

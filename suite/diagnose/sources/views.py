@@ -37,6 +37,8 @@ MEASURE = (
     "RMS over the axes of the residual of {about} on held-out flights [{unit}], both "
     "sides smoothed over {width:g} s"
 )
+OFFSETS = ", without each flight's constant offset"
+"""End of the definition, except where means of flights are compared."""
 
 
 def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | None:
@@ -124,7 +126,7 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
 def _descriptions(view: View) -> dict[str, Any]:
     """Return the fields of a source that depend only on its view, by name."""
     about = {"about": view.about, "unit": view.unit}
-    measure = MEASURE.format(**about, width=view.width_s)
+    measure = MEASURE.format(**about, width=view.width_s) + OFFSETS
     return {
         **about, "name": view.name, "view": view, "horizon_s": view.width_s, "measure": measure,
         "subject": f"error of the {view.name}",
@@ -162,6 +164,7 @@ def _since_reference(
     )
     means = replace(less_reference_residual(reference, start.theta, held.flights), means=True)
     compared = view_candidates(allowed, weighed[1])
+    shared["measure"] = shared["measure"].removesuffix(OFFSETS)
     fallback = None if means_only else in_motion
     return ViewSource(candidates=compared, held=means, fallback=fallback, **shared)
 

@@ -2,13 +2,13 @@
 
 The gap is the RMS error of a model on held-out flights, which took no part in any fit. It is
 compared with the error that measurement noise alone gives (the noise floor). That of force or
-torque is the error of mean accelerations. That of rollouts, which simulate 1 s from a measured
-start state, is the slow part of their errors, divided by the slow errors that noise alone gives; so
-1 means noise only. "Slow" errors are the projections of a rollout's errors on Legendre polynomials
-of time, in which a wrong model shows more than white noise; the start state is free within its
-noise. The plain errors from the measured start states are reported as well, in metres and so on.
-Their noise floor is the noise of the start states, carried through the rollout by the model's
-Jacobian.
+torque is the error of mean accelerations, without each flight's constant offset (trim). That of
+rollouts, which simulate 1 s from a measured start state, is the slow part of their errors, divided
+by the slow errors that noise alone gives; so 1 means noise only. "Slow" errors are the projections
+of a rollout's errors on Legendre polynomials of time, in which a wrong model shows more than white
+noise; the start state is free within its noise. The plain errors from the measured start states are
+reported as well, in metres and so on. Their noise floor is the noise of the start states, carried
+through the rollout by the model's Jacobian.
 
 The size of an effect is how much it changes these flights. With little noise every difference is
 significant, even the model's numerical errors. So an effect is not named, however small its
@@ -61,7 +61,7 @@ class Gap(NamedTuple):
     """Errors of a model on W held-out stretches of flight."""
 
     score: np.ndarray
-    """(W,) mean squared error of each stretch, in the squared unit of `floor`."""
+    """(W,) mean squared error of each stretch, without trims, in the squared unit of `floor`."""
     energy: np.ndarray
     """(W,) squared error of each stretch, by which models are compared. Errors that belong to one
     flight or stretch alone are subtracted: its trim (constant force or torque) or start state."""
@@ -69,11 +69,18 @@ class Gap(NamedTuple):
     """Error of each channel, by group (such as the time since the start) and channel."""
     floor: float = 1.0
     """RMS error that measurement noise alone gives."""
+    offset: float = 0.0
+    """RMS of the flights' trims, which are no part of `score`; 0 if none are subtracted."""
 
     @property
     def rms(self) -> float:
         """RMS error over all stretches: the root of the mean score."""
         return float(np.sqrt(self.score.mean()))
+
+    @property
+    def total(self) -> float:
+        """RMS error over all stretches, with the flights' trims."""
+        return float(np.hypot(self.rms, self.offset))
 
     def ci95(self, seed: int, limits: Thresholds = THRESHOLDS) -> tuple[float, float]:
         """Return the 95 % interval of `rms` by a block bootstrap over stretches."""

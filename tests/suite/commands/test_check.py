@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from eval.logs.columns import FlightLogError
-from eval.logs.faults.check import not_examined
 from eval.logs.faults.finding import Finding, findings_of
 from eval.logs.files import write_columns
 from eval.logs.flight_log import columns_from_log, read_flight, write_flight
@@ -89,12 +88,3 @@ def test_what_an_import_left_open_is_repeated_and_findings_of_earlier_versions_a
     assert "6 motors turn" in refused(capsys, *line, lines=3)
     old = {"level": "doubt", "subject": "attitude", "text": "39 % off"}
     assert findings_of({"findings": [old, "odd"]}) == (Finding("doubt", "attitude", "39 % off"),)
-
-
-def test_what_no_log_allows_to_examine_is_listed():
-    parts = good(end=2.0)
-    whole = as_log(parts, "whole")
-    assert not_examined([whole]) == []
-    thrust = {n: parts[n] for n in ("time", "pos", "quat", "vel", "cmd_thrust", "cmd_rate")}
-    lone = replace(as_log({**thrust, "rate": parts["rate"]}, "thrust"), rate_cmd_b=None)
-    assert not_examined([lone]) == ["torque"] and not_examined([lone, whole]) == []

@@ -1,16 +1,27 @@
 """A diagnosis as JSON, tables and charts: what they show is what was found."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from suite.commands.diagnose import run as command
+from suite.common.console import Console
 from suite.common.report import html
+from suite.diagnose import run
+from suite.diagnose.config import Config
 from suite.diagnose.estimate.parameters import Candidate, make_space
+from suite.diagnose.evidence.moments import centred
 from suite.diagnose.report import charts, sections
 from suite.diagnose.report.charts import series_chart
-from suite.diagnose.report.diagnosis_json import actuators_json, diagnosis_json, parameters_json
+from suite.diagnose.report.diagnosis_json import (
+    actuators_json,
+    diagnosis_json,
+    not_examined,
+    parameters_json,
+)
 from suite.diagnose.report.page import channels_grid, page
 from suite.diagnose.report.summary import NOT_IDENTIFIABLE, answer, components, in_digits
 from suite.diagnose.search.evaluation import NamedEffect
@@ -66,6 +77,50 @@ def test_each_view_names_its_own_effect_and_the_page_has_its_headline_first(by_v
     assert "What was written" in text and "mass = 1" in text and "black box" in text
 
 
+def test_numbers_of_views_are_those_that_are_judged_and_the_rest_has_its_reason(by_views):
+    main, found = by_views.main, plain(diagnosis_json(by_views))
+    gap, rest = found["gap"], found["unexplained"]
+    # The error is that within flights; their constant offsets are apart.
+    for name, theta in (("before", main.search.start.theta), ("after", main.theta)):
+        data = main.source.held.residuals(theta)
+        within = centred(data.residual, data.flight)
+        assert gap[name] == pytest.approx(np.sqrt((within**2).sum(axis=1).mean()))
+        offset = gap["offset"][main.source.name][name]
+        total = np.sqrt((data.residual**2).sum(axis=1).mean())
+        assert total == pytest.approx(np.hypot(gap[name], offset))
+    # Share, table and reasons agree with the error and the noise floor.
+    left = (gap["after"] - gap["noise_floor"]) / (gap["before"] - gap["noise_floor"])
+    assert rest["share"] == pytest.approx(left) and rest["judged"] == by_views.verdict.share_left
+    held = sections.evidence_section(by_views, found).parts[-1]
+    assert isinstance(held, Grid) and texts(held)[-1][3] == f"{100 * (1 - left):.0f} %"
+    above = {one["view"] for one in rest["above_noise"]}
+    assert above == {
+        one.source.name for one in by_views.findings if one.after.rms > 1.5 * one.after.floor
+    }
+    loud = {**rest, "where": None, "above_noise": [
+        {"view": "torque", "error": 4.78, "noise_floor": 0.15, "unit": "rad/s^2",
+         "reason": "that logged signals hardly predict"}]}  # fmt: skip
+    words, table = sections.residual_section({**found, "unexplained": loud}).parts[:2]
+    assert words == "Above the noise floor remains an error that logged signals hardly predict."
+    assert isinstance(table, Grid) and texts(table)[0][:3] == ["torque", "4.78 rad/s²", "0.15"]
+
+
+def test_parts_of_the_dynamics_that_no_source_tests_are_listed(
+    by_views, drag, monkeypatch, capsys, tmp_path
+):
+    assert not_examined(drag) == []
+    assert not_examined(by_views) == ["rate loop"]
+    force = replace(by_views, findings=by_views.findings[:1])
+    found = plain(diagnosis_json(force))
+    assert found["not_examined"] == ["torque", "rate loop"] and found["verdict"] == "named"
+    assert "torque, rate loop" in html(page(force, found, "", set()))
+    # The console prints them under each verdict.
+    monkeypatch.setattr(run, "diagnose_files", lambda *_: {**found, "warnings": []})
+    command(Config(flights=(tmp_path,), vehicle="v", out=tmp_path), Console())
+    said = capsys.readouterr().out
+    assert "verdict: named" in said and said.count("not examined: torque, rate loop\n") == 1
+
+
 def test_components_are_named_by_axis_and_shown_in_digits_that_the_interval_supports():
     entry = {"value": [0.012, 0.0004, None], "ci95": [[0.0119, 0.0121], [-0.001, 0.0018], None],
              "unit": "m"}  # fmt: skip
@@ -97,8 +152,10 @@ def test_sections_show_the_numbers(drag, found):
     assert isinstance(noise, Grid) and texts(noise)[0][0] == "position [m]"
     assert len(sections.actuators_section(found)) == 1
     assert sections.actuators_section({**found, "actuators": []}) == []
-    rest = {**found, "unexplained": {"where": "a shape", "share": 0.25}}
-    assert sections.residual_section(rest).parts[0] == "25 % of the gap remains: a shape."
+    rest = {**found, "unexplained": {"where": "a shape", "share": 0.25, "above_noise": []}}
+    words = str(sections.residual_section(rest).parts[0])
+    assert words.startswith("25 % of the error of rollouts") and words.endswith(": a shape.")
+    assert "No structure beyond" in str(sections.residual_section(found).parts[0])
     held = sections.evidence_section(drag, found).parts[-1]
     assert isinstance(held, Grid) and texts(held)[-1][0] == "with the named effects"
     tried = sections.candidates_section(drag).parts[0]

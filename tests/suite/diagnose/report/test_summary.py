@@ -3,7 +3,7 @@
 import pytest
 
 from suite.diagnose.identify.run import is_identified
-from suite.diagnose.report.summary import answer, next_steps
+from suite.diagnose.report.summary import answer, headline, next_steps
 
 DRAG = {
     "name": "linear_drag",
@@ -16,7 +16,7 @@ DRAG = {
 
 def found(verdict, effects=(), where=None, **more):
     base = {"verdict": verdict, "effects": list(effects), "reference": [], "negligible": []}
-    base |= {"unexplained": {"where": where}, "not_examined": [], "identified": False}
+    base |= {"unexplained": {"where": where, "above_noise": []}, "identified": False}
     advice = ["linear_drag from rotor_drag: bob up and down on a circle"]
     base["separate_with"] = advice if effects else []
     return {**base, **more}
@@ -33,10 +33,37 @@ def test_an_answer_has_the_effect_its_values_and_its_size_or_what_is_too_small()
     partly = answer(found("partly", [by_force]))
     assert "causes 0.8 m/s² (RMS). This explains a part" in partly
     assert "has changed since the reference" in answer(found("named", [DRAG], reference=["a"]))
-    small = found("no_gap", negligible=[{"name": "torque_trim"}], not_examined=["torque"])
+    small = found("no_gap", negligible=[{"name": "torque_trim"}])
     assert answer(small).endswith("Significant but too small to matter: torque_trim.")
-    assert any("These logs do not show: torque." in step for step in next_steps(small))
-    assert not any("do not show" in step for step in next_steps(found("no_gap")))
+
+
+def measured(verdict, after, effects=(), reason=None, floor=0.15, offset=7.9, **more):
+    gap = {"of": "error of the torque", "unit": "rad/s^2", "before": 17.3, "after": after}
+    gap |= {"noise_floor": floor, "offset": {"torque": {"after": offset, "unit": "rad/s^2"}}}
+    rest = [{"reason": reason}] if reason else []
+    more |= {"relevance": {"torque": 0.5}, "unexplained": {"where": None, "above_noise": rest}}
+    return headline(found(verdict, effects, gap=gap, **more))
+
+
+def test_a_headline_states_the_floor_the_errors_that_remain_and_offsets_that_do_not_count():
+    text = measured("named", 4.78, [DRAG], "that logged signals hardly predict")
+    assert text.endswith(
+        "This explains the gap between simulation and flights, except for an error that logged "
+        "signals hardly predict. On held-out flights the error of the torque falls from 17.3 to "
+        "4.78 rad/s² (noise floor 0.15). A constant offset of each flight remains, which does not "
+        "count as a gap: 7.9 rad/s² (torque)."
+    )
+    # An offset below the threshold of relevance does not matter.
+    assert "offset" not in measured("named", 0.16, [DRAG], offset=0.4)
+    none = measured("no_gap", 17.3, (), "that is too small to matter", offset=0.4)
+    assert none == (
+        "Simulation and flights agree, except for an error that is too small to matter. On "
+        "held-out flights the error of the torque is 17.3 rad/s² (noise floor 0.15)."
+    )
+    assert "within the measurement noise." in measured("no_gap", 17.3)
+    assert "error" not in answer(found("no_gap", reference=["a"]))
+    # The unit of rollouts is the noise floor.
+    assert "floor" not in measured("unknown", 17.3, floor=1.0)
 
 
 @pytest.mark.parametrize(

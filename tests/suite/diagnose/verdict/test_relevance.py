@@ -9,7 +9,7 @@ import pytest
 
 from suite.diagnose.data.windows import SLICES
 from suite.diagnose.sources.examine import relevant_part
-from suite.diagnose.sources.source import sizes_by_effect
+from suite.diagnose.sources.source import TOO_SMALL, sizes_by_effect
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.gap import Channel, EffectSize, rollout_size, upper_size, view_size
 from suite.diagnose.verdict.model_error import beyond_error
@@ -130,3 +130,5 @@ def test_where_rollouts_as_given_are_near_enough_no_name_matters(found_drag):
     assert found.named == () and after is near
     ((name, size),) = out
     assert name == "linear_drag" and size.force > 0.05
+    rest = source.remaining(found, (near, near), 0)
+    assert not rest.structured and rest.reason == TOO_SMALL

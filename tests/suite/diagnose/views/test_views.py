@@ -57,7 +57,8 @@ def test_an_inertia_is_named_though_the_trim_of_each_flight_is_larger():
     found = diagnose(logs, VEHICLE, by="views")
     assert [name.candidate.name for _, name in found.named] == ["inertia_scale"]
     assert found.vehicle.effects["inertia_scale"].scale == pytest.approx((0.8, 0.8, 0.8), abs=0.02)
-    assert found.main.after.rms > found.main.before.rms  # of means of flights
+    assert found.main.after.total > found.main.before.total  # with the flights' trims
+    assert found.main.after.rms < found.main.before.rms  # without them
     assert found.main.after.energy.sum() < found.main.before.energy.sum()
 
 
