@@ -31,7 +31,7 @@ CHANGES = {
 }
 """A sentence for each verdict, if a change since reference flights was searched for."""
 USE = (
-    "Use the corrected vehicle: give vehicle.toml of the folder --out to suite eval, train and loop "
+    "Use the corrected vehicle: give the new vehicle.toml, in --out, to suite eval, train and loop "
     "(--vehicle)."
 )
 CHECK = "Run suite check on these logs: a wrong unit, sign, order or clock resembles physics."
