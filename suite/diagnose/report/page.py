@@ -169,18 +169,15 @@ def _answer(result: Mapping[str, Any]) -> list[Section]:
     effects = result["effects"]
     if not effects:
         return []
-    rows = [
-        (
-            effect["name"],
-            ", ".join(effect["alternatives"]) or "none",
-            effect["view"],
-            component.label,
-            *component.texts(),
-            "exempt" if effect["gap_removed"] is None else f"{100 * effect['gap_removed']:.0f} %",
-        )
-        for effect in effects
-        for component in components(effect)
-    ]
+    rows = []
+    for effect in effects:
+        removed = effect["gap_removed"]
+        share = "exempt" if removed is None else f"{100 * removed:.0f} %"
+        first = [effect["name"], ", ".join(effect["alternatives"]) or "none", effect["view"]]
+        for component in components(effect):
+            rows.append((*first, component.label, *component.texts(), share))
+            # What holds for the whole effect is in its first row only.
+            first, share = ["", "", ""], ""
     names = [effect["name"] for effect in effects]
     words: list[Part] = [f"{name}: {EFFECTS[name].equation}." for name in names]
     words += in_words([(e["name"], *e["alternatives"]) for e in effects])

@@ -261,8 +261,9 @@ def evidence_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section
 
 
 AGREEMENT = (
-    "The fall of the squared error of each flight with parameters that were fitted to the others, "
-    "in units of independent noise. An effect is named only if all flights but one agree."
+    "The fall of the squared error of each flight (of a single flight: of each third) with "
+    "parameters that were fitted to the others, in units of independent noise. An effect is named "
+    "only if all flights but one agree."
 )
 """Explanation of the table of flights."""
 
@@ -278,5 +279,5 @@ def agreement_section(diagnosis: Diagnosis) -> Section:
         if named.gains:
             rows = [(f"{k + 1}", f"{gain:.1f}") for k, gain in enumerate(named.gains)]
             title = f"{finding.source.name}: {named.candidate.label}"
-            parts.append(grid(title, ["fitted flight", "gain"], rows, AGREEMENT))
+            parts.append(grid(title, ["fitted flight or third", "gain"], rows, AGREEMENT))
     return Section("Do the flights agree", [*parts, *diagnosis.flights.compares])
