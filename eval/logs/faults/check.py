@@ -23,6 +23,7 @@ from eval.logs.faults.drive.commands import (
 from eval.logs.faults.drive.motor_map import check_motor_map
 from eval.logs.faults.drive.motors import check_lift, check_motors
 from eval.logs.faults.finding import Finding, findings_of, line
+from eval.logs.faults.height import check_height_sign
 from eval.logs.faults.pose import Rows, check_pose, fit_pose_readings
 from eval.logs.faults.reading import Readings, read_rows, readings_in
 from eval.logs.faults.sensors import check_accelerometer_bias, check_barometer, check_voltage
@@ -55,6 +56,7 @@ CLOCK: tuple[Check, ...] = (lambda rows, _: check_time(rows),)
 """The unit of the time, which all other checks need."""
 POSE: tuple[Check, ...] = (
     lambda rows, _: check_pose(rows, fit_pose_readings(rows)),
+    lambda rows, against: [] if "attitude" in against.found else check_height_sign(rows),
     lambda rows, _: check_gyro(rows),
     lambda rows, _: check_velocity(rows),
     lambda rows, against: check_accelerometer(rows, "body_frame" in against.found),

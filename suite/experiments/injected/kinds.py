@@ -237,6 +237,7 @@ KINDS: dict[str, Kind] = {
     "position in cm": Kind(("position_unit",), ("pos=100",)),
     "position north-east-down": Kind(("world_frame",), ("pos=x,-y,-z",)),
     "position's y inverted": Kind(("position_axes",), ("pos=x,-y,z",)),
+    "position's z inverted": Kind(("position_axes",), ("pos=x,y,-z",)),
     "velocity north-east-down": Kind(("velocity_frame",), ("vel=x,-y,-z",)),
     "velocity in body axes": Kind(("velocity_frame",), ("vel=from-world",)),
     "velocity turned twice": Kind(("velocity_frame",), ("vel=from-body",)),

@@ -5,14 +5,27 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from eval.logs.faults.catalogue import FAULTS
-from eval.logs.faults.check import CLOCK, DRIVE, POSE, CheckContext, check_files, run_checks
+from eval.logs.faults.check import (
+    CLOCK,
+    DRIVE,
+    POSE,
+    CheckContext,
+    check_files,
+    check_log,
+    run_checks,
+    with_fixes,
+)
 from eval.logs.faults.clock import check_clock
 from eval.logs.faults.drive import commands
 from eval.logs.faults.drive.commands import check_controller_rate
+from eval.logs.faults.height import check_height_sign
 from eval.logs.faults.reading import parse_readings, read_rows
+from eval.logs.flight_log import read_flight
+from suite.diagnose.example.flights import FOLDER
 from suite.experiments.injected.flights import with_linear_motors
 from suite.experiments.injected.kinds import KINDS, inject
 from tests.support import known_flight
@@ -150,6 +163,39 @@ def test_without_a_pose_a_rate_loops_gain_shows_a_wrong_scale(wrong, lost, name,
     (finding,) = (f for f in findings if f.fault == name and f.status == "doubt")
     assert finding.is_open
     assert float(finding.fix.split("=")[-1]) == pytest.approx(fix, rel=0.03)
+
+
+@pytest.mark.parametrize("late_s", [-0.15, 0.0, 0.06])
+@pytest.mark.parametrize("source", ["acc", "cmd_thrust", "motor"])
+def test_each_measure_of_the_force_shows_that_z_of_the_position_is_inverted(source, late_s):
+    right = {name: good()[name] for name in ("time", "pos", "quat", "rate", source)}
+    right[source] = np.roll(right[source], round(HZ * late_s), axis=0)
+    inverted = read_rows(right, parse_readings(("pos=x,y,-z",)))
+    findings, readings = checked(inverted)
+    assert "position_axes" in named(findings) and ("pos", "x,y,-z") in readings
+    np.testing.assert_array_equal(read_rows(inverted, readings)["pos"], right["pos"])
+    findings, _ = checked(right)
+    assert "position_axes" not in {f.fault for f in findings}
+
+
+@pytest.mark.parametrize("name", ["flight_1", "flight_2", "flight_3"])
+def test_the_examples_flights_show_that_z_of_the_position_is_inverted(name):
+    log = read_flight(FOLDER / f"{name}.parquet")
+    assert "position_axes" not in {f.fault for f in check_log(log)[0]}
+    findings, readings = check_log(with_fixes(log, (("pos", "x,y,-z"),)), fix=True)
+    assert named(findings) == {"position_axes"} and readings == (("pos", "x,y,-z"),)
+
+
+def test_a_force_that_is_unrelated_to_the_path_does_not_show_the_sign_of_z():
+    rng, count = np.random.default_rng(2), 0
+    time_s = np.arange(0.0, 8.0, 0.02)
+    quat = np.tile([1.0, 0.0, 0.0, 0.0], (len(time_s), 1))
+    for _ in range(200):  # both change within half a second
+        pos, force = gaussian_filter1d(rng.normal(size=(2, len(time_s), 3)), 12.0, axis=1)
+        rows = {"time": time_s, "pos": pos, "quat": quat, "acc": force + [0.0, 0.0, 9.81]}
+        (finding,) = check_height_sign(rows)
+        count += finding.status != "not identifiable"
+    assert count <= 1
 
 
 def test_a_calm_flight_says_what_it_does_not_show():

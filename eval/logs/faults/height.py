@@ -1,0 +1,125 @@
+"""Check of the sign of the position's z, by the vertical force.
+
+Gravity dominates the force, so `pose.check_pose` hardly depends on this sign: with z inverted, the
+force still points along body z. But the vertical acceleration of the path then has the wrong sign.
+Its *slope* is the ratio of that acceleration to the one from a measured or commanded force: 1 for
+the right sign, -1 for the wrong one and 0 where both are unrelated. Attitude errors hardly change
+it, as they hardly change the vertical part of the force.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from eval.effects.interface import GRAVITY
+from eval.importers.frames import rotate
+from eval.logs.faults.finding import Finding, unseen
+from eval.logs.faults.pose import Rows
+from eval.logs.faults.reading import option
+from eval.logs.faults.relation import jackknife_error, smooth
+from eval.logs.velocity import velocity_from_position
+
+WIDTH_S = 0.4
+"""Averaging time of both accelerations [s]. It leaves little above 1.5 Hz, so that a delay of up to
+0.15 s between them does not change the slope's sign."""
+BLOCK_S, BLOCKS = 1.0, 12
+"""Least duration of a block of the jackknife [s], longer than errors are correlated, and largest
+number of blocks."""
+NEARER = 0.5
+"""Least size of the slope: above it, a slope of 1 or -1 fits the flight better than 0."""
+CHANCE = 1e-4
+"""Largest probability of such a slope where both accelerations are unrelated."""
+FLYING = 0.3
+"""Rows with less than this share of the median force are not used: on the ground or in a fall."""
+
+
+class Slope(NamedTuple):
+    """Ratio of the path's vertical acceleration to that of a force."""
+
+    source: str
+    """What measures or commands the force, in words."""
+    value: float
+    """The ratio: 1 for the right sign of z, -1 for the wrong one, 0 for no relation."""
+    error: float
+    """Standard error of `value`, by jackknife."""
+    blocks: int
+    """Number of blocks of the jackknife."""
+
+    def shows(self, sign: float) -> bool:
+        """Return whether the slope has this sign (1 or -1), by Student's t for the blocks."""
+        from scipy.special import stdtrit
+
+        least = float(stdtrit(self.blocks - 1, 1.0 - CHANCE)) * self.error
+        return sign * self.value > max(NEARER, least)
+
+
+def check_height_sign(rows: Rows) -> list[Finding]:
+    """Return the finding on the sign of the position's z."""
+    if not {"pos", "quat"} <= rows.keys():
+        return []
+    vel = velocity_from_position(rows["time"], rows["pos"])
+    acc = velocity_from_position(rows["time"], vel)[:, 2]
+    found = [_slope(name, rows["time"], acc, force) for name, force in _forces(rows)]
+    slopes = [slope for slope in found if slope is not None]
+    if not slopes:
+        text = "no accelerometer, thrust command or rotor speed shows the sign of z"
+        return unseen("position", text, "position_axes")
+    text = "its vertical acceleration is " + " and ".join(
+        f"{s.value:.2f} (± {s.error:.2f}) times that of the {s.source}" for s in slopes
+    )
+    right, inverted = (any(slope.shows(sign) for slope in slopes) for sign in (1.0, -1.0))
+    if right == inverted:
+        return unseen("position", f"{text}: too uncertain for the sign of z", "position_axes")
+    if right:
+        return [Finding("ok", "position", text)]
+    text = f"{text}: z has the other sign"
+    fix = option(("pos", "x,y,-z"))
+    return [Finding("corrected", "position", text, "position_axes", None, 0.98, fix)]
+
+
+def _forces(rows: Rows) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield each source of the force in words, and its vertical part (T,) in the world, any unit.
+
+    Up is positive in the world. The thrust of rotors grows with the square of their speeds.
+    """
+    quat = rows["quat"]
+    up = rotate(quat, np.array([0.0, 0.0, 1.0]))[:, 2]
+    if "acc" in rows:
+        yield "accelerometer", rotate(quat, rows["acc"])[:, 2]
+    if "cmd_thrust" in rows:
+        yield "thrust command", up * rows["cmd_thrust"][:, 0]
+    if "motor" in rows:
+        yield "rotor speeds", up * np.sum(rows["motor"] ** 2, axis=1)
+
+
+def _slope(source: str, time_s: np.ndarray, acc: np.ndarray, force: np.ndarray) -> Slope | None:
+    """Return the slope of the path's vertical acceleration, None where too little is known.
+
+    Over a flight the mean force balances gravity. This gives the force's unit and sign.
+
+    Args:
+        source: the force in words.
+        time_s: (T,) time [s].
+        acc: (T,) vertical acceleration of the path [m/s^2].
+        force: (T,) vertical force, in any unit.
+    """
+    count = min(int((time_s[-1] - time_s[0]) / BLOCK_S), BLOCKS)
+    acc, force = (smooth(time_s, value[:, None], WIDTH_S)[:, 0] for value in (acc, force))
+    good = np.isfinite(acc) & np.isfinite(force)
+    if count < 2 or not np.any(force[good]):
+        return None
+    good &= np.abs(force) >= FLYING * abs(np.median(force[good]))
+    good &= np.abs(acc) < 4.0 * np.median(np.abs(acc[good])) + 1.0
+    block = (count * np.arange(len(time_s)) // len(time_s))[good]
+    change, path = force[good] - force[good].mean(), acc[good] - acc[good].mean()
+    product = np.bincount(block, change * path, count)
+    square = np.bincount(block, change**2, count)
+    if not np.min(square.sum() - square) > 0.0:
+        return None
+    unit = float(force[good].mean()) / GRAVITY
+    without_block = unit * (product.sum() - product) / (square.sum() - square)
+    value = unit * float(product.sum() / square.sum())
+    return Slope(source, value, jackknife_error(without_block), count)
