@@ -155,7 +155,7 @@ def test_a_policy_is_trained_under_a_delta_action_that_is_no_part_of_its_state(
     assert abs(corrected - plain) > 1e-3 * abs(plain), "as much as no rounding"
     ours, theirs = (load_arrays(f / "state", kind="training").arrays for f in (tmp_path, whole))
     assert ours.keys() == theirs.keys()
-    with pytest.raises(ValueError, match="another --from; another --delta"):
+    with pytest.raises(ValueError, match="another --init-from; another --delta"):
         run.train(NOISY, whole, Console(), fresh_params(), delta)
 
 

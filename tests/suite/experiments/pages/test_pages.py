@@ -135,7 +135,7 @@ def test_the_field_and_other_ways_to_learn():
     text = (ROOT / "docs" / "results.md").read_text("utf-8")
     rows = rows_of("ablation", "setting", "field 0.4", "progress 0.4")
     shares = (percent(row["over"]["success_cross"]["mean"]) for row in rows)
-    assert "| the paper's | {} % | {} % |".format(*shares) in text
+    assert "| the paper's | 200 | {} % | {} % |".format(*shares) in text
     rows = rows_of("schemes", "scheme", "ours", "ppo")
     ours, ppo = (row["curves"]["gates"][-1]["mean"] for row in rows)
     assert f"| ours, with the field | {ours:.2f} |" in text
