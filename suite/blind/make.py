@@ -76,13 +76,14 @@ def make_set(
         if not ((out / "cases" / name).is_dir() and (out / "answers" / f"{name}.json").is_file())
     ]
     failed: dict[str, str] = {}
-    made = itertools.count(len(cases) - len(names) + 1)
-    with console.progress("cases", len(cases), begun=len(cases) - len(names)) as update:
+    before = len(cases) - len(names)
+    numbers = itertools.count(before + 1)
+    with console.progress("cases", len(cases), begun=before) as update:
 
         def keep(number: int, built: Built | str) -> None:
             """Write the files of a case, or keep the reason why it cannot be made."""
             name = names[number]
-            update(next(made), name)
+            update(next(numbers), name)
             if isinstance(built, str):
                 failed[name] = built
                 return

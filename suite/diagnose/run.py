@@ -101,7 +101,7 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     write_report(out / "report.html", page(diagnosis, result, toml, files))
     for warning in result["warnings"][shown_count:]:
         console.note(f"warning: {warning}")
-    # Nothing of an earlier diagnosis stays beside this one.
+    # Remove what only an earlier diagnosis in this folder has written.
     if "recording.rrd" not in files:
         (out / "recording.rrd").unlink(missing_ok=True)
     if not config.plan:

@@ -101,7 +101,8 @@ def with_fewer_rows(
             parts = columns[:, None] if name == "rotor_speed" else columns[None]
             for part in parts:
                 own_rows = np.flatnonzero(np.isfinite(table[:, part]).all(axis=1))
-                spacing_s = np.median(np.diff(log.time_s[own_rows])) if len(own_rows) > 1 else 1.0
+                own = np.ix_(own_rows, part)
+                spacing_s = own_spacing_s(log.time_s[own_rows], table[own])
                 own_rows = own_rows[:: min(stride, max(1, int(SPARSEST_S / spacing_s + 1e-6)))]
                 thinned_table[np.ix_(own_rows, part)] = table[np.ix_(own_rows, part)]
         rows = np.zeros(len(log.time_s), bool)

@@ -167,8 +167,8 @@ def rivals_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section:
             name = label.rstrip(" 1234")  # a label may end in a motor's number
             # Another motor is no other effect, so it is not among the rivals.
             is_motor = name == named.candidate.name
-            is_open = is_motor and worse_by <= finding.source.limits.rival_chi2
-            is_open |= name in named.rivals
+            fits_as_well = is_motor and worse_by <= finding.source.limits.rival_chi2
+            is_open = fits_as_well or name in named.rivals
             verdict = Cell("not separable", "bad") if is_open else Cell("ruled out")
             rows.append([*cells(named.candidate.label, label, f"{worse_by:.1f}"), verdict])
     headers = ["named", "alternative", "worse by", ""]
