@@ -163,8 +163,13 @@ class Thresholds:
     """Thrust, as a share of the weight, below which a vehicle at rest is on the ground."""
     ground_speed: float = 0.3
     """Speed below which a vehicle is at rest [m/s]."""
+    ground_rate: float = 0.3
+    """Body rate below which a vehicle is at rest, if its speed is unknown [rad/s]."""
     ground_margin_s: float = 1.0
-    """Time before and after rest on the ground that counts as take-off and landing [s]."""
+    """Time before and after rest on the ground that counts as take-off and landing [s]. If the
+    speed is unknown, it is also the shortest rest."""
+    least_view_s: float = 1.0
+    """Least flight time to fit, and least flight time to hold out, for force and torque [s]."""
     least_flights: int = 3
     """Least number of flights from which the spread of trims between flights is estimated."""
     longest_memory: int = 40
@@ -228,8 +233,8 @@ class Thresholds:
     bootstrap_draws: int = 1000
     """Number of draws for the 95 % interval of a gap."""
     bootstrap_block: int = 4
-    """Neighbouring stretches that a bootstrap draws together, since they overlap; of few stretches
-    a quarter."""
+    """Neighbouring rollouts that a bootstrap draws together, since they overlap; of few rollouts a
+    quarter."""
     gap_stride_s: float = 0.25
     """Time between the starts of the rollouts that measure the gap [s]."""
     refuting_chi2: float = 25.0

@@ -43,7 +43,6 @@ from suite.diagnose.data.view import (
     rows_of,
     smoothed,
 )
-from suite.diagnose.data.windows import LENGTH_S
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.actuators import wrench_difference
 from tracks.geometry.rotation import rot_to_quat
@@ -170,42 +169,6 @@ def _calibrated(
     return flight._replace(reliability=reliability)
 
 
-def parted(
-    flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRESHOLDS
-) -> tuple[dict[str, list[SmoothedFlight]], dict[str, list[SmoothedFlight]]]:
-    """Return the fitted flights and the `held` out ones, each by view; split a single one in time.
-
-    `held` are numbers of flights.
-
-    Raises:
-        ValueError: for a single flight that is too short to be split.
-    """
-    count = len(flights.names)
-    if count > 1:
-        inside = [number for number in range(count) if number not in held]
-        fitted_part, held_part = (
-            {name: [part[k] for k in numbers] for name, part in flights.smoothed.items()}
-            for numbers in (inside, held)
-        )
-        return fitted_part, held_part
-    fitted_part, held_part = {}, {}
-    # The share is of the time in flight, since a log may begin or end on the ground.
-    flown_s = flights.smoothed[flights.views[0].name][0].form.middle_s
-    until_s = float(np.quantile(flown_s, limits.lone_fitted_share))
-    for view in flights.views:
-        (single,) = flights.smoothed[view.name]
-        early = single.rows.time_s <= until_s
-        for part, chosen in ((fitted_part, early), (held_part, ~early)):
-            rows = single.rows._replace(good=np.asarray(single.rows.good) & chosen)
-            split = smoothed(view, rows, limits)._replace(reliability=single.reliability)
-            if not len(split.form.middle_s):
-                raise ValueError(
-                    f"{flights.names[0]}: too short to hold a part of it out; fly longer"
-                )
-            part[view.name] = [split]
-    return fitted_part, held_part
-
-
 def _floor(view: View, flights: Sequence[SmoothedFlight], logs: Sequence[FlightLog]) -> np.ndarray:
     """Return the noise (3,) of the mean accelerations, from differences of neighbouring rows.
 
@@ -286,40 +249,6 @@ def turning_of(time_s: np.ndarray, quat_wxyz: np.ndarray) -> np.ndarray:
         rates_b = (attitude[:-2].inv() * attitude[2:]).as_rotvec() / step_s[:, None]
         rate_b[own[1:-1][dense]] = rates_b[dense]
     return rate_b
-
-
-def choose_held_out(
-    logs: Sequence[FlightLog],
-    flight: np.ndarray,
-    start_s: np.ndarray,
-    information: np.ndarray,
-    limits: Thresholds = THRESHOLDS,
-) -> tuple[np.ndarray, list[str]]:
-    """Return for each window (W,) whether it is fitted, and the names of the held-out flights.
-
-    `flight` (W,) is the number of each window's flight, `start_s` (W,) the window's start in it.
-    `information` (W, K) is the information of each window on each of K parameters.
-
-    Held out are the flights whose information the others contain, too. So a flight with the only
-    chirp (a command of rising frequency) or the only pass near the ground is fitted. The choice
-    does not depend on the errors. Of a single flight, the end is held out.
-    """
-    flight = np.asarray(flight)
-    numbers = list(np.unique(flight))
-    if len(numbers) == 1:
-        log = logs[int(numbers[0])]
-        cut_s = limits.lone_fitted_share * log.duration_s
-        return np.asarray(start_s) + LENGTH_S <= cut_s, [f"{log.name} from {cut_s:.1f} s"]
-    by_flight = {k: information[flight == k].sum(axis=0) for k in numbers}
-    held: list[int] = []
-    for _ in range(max(1, round(limits.held_out_share * len(numbers)))):
-        kept = [k for k in numbers if k not in held]
-        total = np.sum([by_flight[k] for k in kept], axis=0)
-        informed = total > 0.0
-        # The largest share of the information on any parameter that is lost without the flight.
-        lost = {k: (by_flight[k][informed] / total[informed]).max(initial=0.0) for k in kept}
-        held.append(min(reversed(kept), key=lambda k: lost[k]))
-    return ~np.isin(flight, held), [logs[int(k)].name for k in sorted(held)]
 
 
 class ActingRotors(NamedTuple):

@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter
 
 from eval.importers.rows import continuous
@@ -78,9 +79,10 @@ def with_fewer_rows(
 ) -> tuple[list[FlightLog], list[str]]:
     """Return `logs` with about `limits.most_rows` rows, and a note if rows were left out.
 
-    Of each signal every n-th value is used, and more of a slow signal, so that its values are at
-    most `SPARSEST_S` apart. The signals are thinned one by one, because each may have values in
-    other rows.
+    Of each signal the first value of every n rows is used, and more of a slow signal, so that its
+    values are at most `SPARSEST_S` apart. The signals are thinned one by one, because each may have
+    values in other rows. Rates and accelerations are averaged about the rows that remain, because
+    vibrations would otherwise alias (look like slow motion).
     """
     count = sum(len(log.time_s) for log in logs)
     # -(-a // b) is a / b, rounded up.
@@ -102,9 +104,17 @@ def with_fewer_rows(
             for part in parts:
                 own_rows = np.flatnonzero(np.isfinite(table[:, part]).all(axis=1))
                 own = np.ix_(own_rows, part)
+                if not len(own_rows):
+                    continue
                 spacing_s = own_spacing_s(log.time_s[own_rows], table[own])
-                own_rows = own_rows[:: min(stride, max(1, int(SPARSEST_S / spacing_s + 1e-6)))]
-                thinned_table[np.ix_(own_rows, part)] = table[np.ix_(own_rows, part)]
+                step = min(stride, max(1, int(SPARSEST_S / spacing_s + 1e-6)))
+                series = table[own]
+                if name in ("rate_b", "acc_b"):
+                    series = uniform_filter1d(series, 2 * (step // 2) + 1, axis=0)
+                # The first value of every `width` rows of the log: so all signals keep one row.
+                width = step * max(1, round(float(np.median(np.diff(own_rows, prepend=-1)))))
+                first = np.unique(own_rows // width, return_index=True)[1]
+                thinned_table[np.ix_(own_rows[first], part)] = series[first]
         rows = np.zeros(len(log.time_s), bool)
         for values in signals.values():
             rows |= np.isfinite(values.reshape(len(rows), -1)).any(axis=1)

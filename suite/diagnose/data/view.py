@@ -65,7 +65,8 @@ def rows_of(
     """Return the rows of `log` with rotor speeds `rotor_speed` (N, 4) [rad/s].
 
     A row is on the ground if the vehicle is at rest with too little thrust to fly. Such rows, and
-    rows near them in time, are not `good`.
+    rows near them in time, are not `good`. Without a position the speed is unknown. Then a vehicle
+    is at rest if it does not turn and has too little thrust for longer than a cut of the throttle.
     """
     rot_w = log.rot_w
     signals = (log.pos_w, log.vel_w, log.rate_b, rotor_speed)
@@ -77,9 +78,15 @@ def rows_of(
         imu_acc_w = np.nan_to_num(imu_acc_w)
     pose_slope_b = log.pose_slope_b if isinstance(log, InertialLog) else None
     thrust = vehicle.rotors.thrust_coefficient * (rotor_speed**2).sum(axis=1)
-    grounded = (thrust < limits.ground_thrust * vehicle.mass * GRAVITY) & (
-        np.linalg.norm(log.vel_w, axis=1) < limits.ground_speed
+    speed_known = "pos" not in log.partial or isinstance(log, InertialLog)
+    motion, least = (
+        (log.vel_w, limits.ground_speed) if speed_known else (log.rate_b, limits.ground_rate)
     )
+    grounded = thrust < limits.ground_thrust * vehicle.mass * GRAVITY
+    grounded &= np.linalg.norm(motion, axis=1) < least
+    if not speed_known:
+        half_s = 0.5 * limits.ground_margin_s
+        grounded = _near(log.time_s, ~_near(log.time_s, ~grounded, half_s), half_s)
     good &= ~_near(log.time_s, grounded, limits.ground_margin_s)
     pos_w, vel_w, rate_b, speed = (np.nan_to_num(signal) for signal in signals)
     return FlightRows(

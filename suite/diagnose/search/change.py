@@ -9,7 +9,8 @@ spread; all candidates are tested together (`estimate/permutation.py`).
 Some effects, such as a drag, only act in motion, and hardly change the mean of a flight. So where
 no mean has changed, each candidate is fitted to each flight alone. The fitted values of the
 reference flights and of the later ones are compared by Welch's test (Welch 1947, doi
-10.1093/biomet/34.1-2.28), with a Bonferroni correction over all candidates and their parameters.
+10.1093/biomet/34.1-2.28), with a Bonferroni correction over all candidates, their parameters, and
+both views.
 """
 
 from __future__ import annotations
@@ -307,7 +308,7 @@ def fit_each_flight(equations: NormalEquations) -> np.ndarray:
 
 
 def search_motion_change(
-    reference: ViewEvidence, task: ViewEvidence, among: Sequence[Candidate]
+    reference: ViewEvidence, task: ViewEvidence, among: Sequence[Candidate], views: int
 ) -> SearchResult | None:
     """Return the candidate that has changed since `reference`; None where none is significant.
 
@@ -318,6 +319,7 @@ def search_motion_change(
         reference: evidence of the flights before a change.
         task: evidence of the flights after it.
         among: the candidates.
+        views: number of views that are searched, for Bonferroni's correction.
     """
     start, limits, space = fit_balance(reference), task.limits, task.space
     sets = [within_flights(one.residuals(start, None)) for one in (reference, task)]
@@ -326,7 +328,7 @@ def search_motion_change(
     weights = weights_of(sets[1], limits)
     evidence = replace(task, weights=weights)
     acting = view_candidates(among, evidence.linearise(Estimate(start)))
-    tests = sum(len(one.indices) for one in acting)
+    tests = views * sum(len(one.indices) for one in acting)
     equations = [equations_by_flight(one, weights.scatter) for one in sets]
     # Names with the parameters (P,) of the later flights and of the reference flights.
     changes = list[tuple[NamedEffect, np.ndarray, np.ndarray]]()

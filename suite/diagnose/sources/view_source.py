@@ -58,7 +58,10 @@ class ViewSource(Source):
             "xyz"[k]: Channel(float(error[k]), float(self.floor[k])) for k in self.view.axes
         }
         floor = float(np.sqrt(self._noise_power))
-        return Gap(energy, energy, {self.name: channels}, floor, rms_length(data.residual - within))
+        offset = rms_length(data.residual - within)
+        # Means of flights are independent. Moments are half a width apart.
+        block = 1 if self.held.means else round(2.0 * self.limits.view_block_s / self.view.width_s)
+        return Gap(energy, energy, {self.name: channels}, floor, offset, block)
 
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
         """Return the sizes of the named effects on the fitted flights, see `Source`."""
@@ -211,10 +214,12 @@ class MotionSource(ViewSource):
     """The reference flights, before the change."""
     fitted: ViewEvidence
     """The flights after the change."""
+    views: int
+    """Number of views that are searched; the search corrects for it."""
 
     def search(self, say: Callable[[str], None], seed: int) -> SearchResult:
         """Search for an effect that has changed since the reference flights, see `Source`."""
-        found = search_motion_change(self.reference, self.fitted, self.candidates)
+        found = search_motion_change(self.reference, self.fitted, self.candidates, self.views)
         evidence, block = self.weighed
         unchanged = Evaluation(evidence, self.start, block)
         return found or SearchResult((), self.start, unchanged, unchanged, [])

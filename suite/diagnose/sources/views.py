@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from eval.effects import EFFECTS
-from suite.diagnose.data.flights import ViewFlights, choose_held_out, parted, ready
+from suite.diagnose.data.flights import ViewFlights, ready
+from suite.diagnose.data.hold_out import choose_held_out, parted
 from suite.diagnose.data.inertial import UNSEEN, is_inertial
 from suite.diagnose.data.view import View
 from suite.diagnose.estimate.composites import composites
@@ -84,9 +85,9 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
     block = first.estimate_noise(first.start)[1]
     information = (block.slope**2).sum(axis=1)
     start_s = np.zeros(len(information))
-    is_fitted, held_names = choose_held_out(logs, block.flight, start_s, information, limits)
+    is_fitted, _ = choose_held_out(logs, block.flight, start_s, information, limits)
     held_numbers = sorted({*block.flight.tolist()} - {*block.flight[is_fitted].tolist()})
-    fitted, held = parted(flights, held_numbers, limits)
+    fitted, held, held_names = parted(flights, held_numbers, limits)
     # Make one source for each view.
     sources = []
     for name, one in evidence.items():
@@ -160,8 +161,9 @@ def _since_reference(
     weighed = difference.relinearise(start)
     shared = {**shared, "weighed": weighed, "start": start, "names_small": True}
     in_motion = MotionSource(
-        candidates=allowed, held=held, reference=reference, fitted=evidence, **shared
-    )
+        candidates=allowed, held=held, reference=reference, fitted=evidence,
+        views=len(spread.along), **shared,
+    )  # fmt: skip
     means = replace(less_reference_residual(reference, start.theta, held.flights), means=True)
     compared = view_candidates(allowed, weighed[1])
     shared["measure"] = shared["measure"].removesuffix(OFFSETS)

@@ -71,6 +71,9 @@ class Gap(NamedTuple):
     """RMS error that measurement noise alone gives."""
     offset: float = 0.0
     """RMS of the flights' trims, which are no part of `score`; 0 if none are subtracted."""
+    together: int = THRESHOLDS.bootstrap_block
+    """Number of neighbouring stretches whose errors are correlated: a bootstrap draws them
+    together."""
 
     @property
     def rms(self) -> float:
@@ -84,12 +87,12 @@ class Gap(NamedTuple):
 
     def ci95(self, seed: int, limits: Thresholds = THRESHOLDS) -> tuple[float, float]:
         """Return the 95 % interval of `rms` by a block bootstrap over stretches."""
-        low, high = np.quantile(np.sqrt(_bootstrap_means(self.score, seed, limits)), [0.025, 0.975])
+        low, high = np.quantile(np.sqrt(self._means(self.score, seed, limits)), [0.025, 0.975])
         return float(low), float(high)
 
     def energy_low95(self, seed: int, limits: Thresholds = THRESHOLDS) -> float:
         """Return the lower end of the 95 % interval of the mean `energy`."""
-        return float(np.quantile(_bootstrap_means(self.energy, seed, limits), 0.025))
+        return float(np.quantile(self._means(self.energy, seed, limits), 0.025))
 
     def exceeds(self, before: Gap, weight: float, limits: Thresholds) -> bool:
         """Return whether the energy is significantly larger than that of `before`.
@@ -103,27 +106,26 @@ class Gap(NamedTuple):
             limits: least significant rise.
         """
         rise = self.energy - before.energy
-        rise_low = np.quantile(_bootstrap_means(rise, 0, limits), 0.025)
+        rise_low = np.quantile(self._means(rise, 0, limits), 0.025)
         return bool(rise_low > 0.0 and rise.sum() * weight > limits.refuting_chi2)
+
+    def _means(self, values: np.ndarray, seed: int, limits: Thresholds) -> np.ndarray:
+        """Return the means (D,) of D bootstrap draws of `values` (W,), one of each stretch.
+
+        The values form a circle, so that each of them is drawn equally often. With few values,
+        fewer are drawn together, so that draws differ.
+        """
+        rng, count, draws = np.random.default_rng(seed), len(values), limits.bootstrap_draws
+        block = max(1, min(self.together, count // 4))
+        block_start = rng.integers(0, count, (draws, -(-count // block), 1))
+        rows = (block_start + np.arange(block)).reshape(draws, -1)[:, :count] % count
+        return values[rows].mean(axis=1)
 
 
 def remaining_share(before: Gap, after: Gap) -> float:
     """Return the share (0 to 1) of the gap `before` above the noise floor that remains `after`."""
     remaining = max(after.rms - after.floor, 0.0)
     return remaining / max(before.rms - before.floor, remaining, 1e-9)
-
-
-def _bootstrap_means(values: np.ndarray, seed: int, limits: Thresholds) -> np.ndarray:
-    """Return the means (D,) of D draws of `values` (W,), in blocks of neighbouring stretches.
-
-    Blocks keep the correlation between neighbours. The values form a circle, so that each of them
-    is drawn equally often. With few values, blocks are shorter, so that draws differ.
-    """
-    rng, count, draws = np.random.default_rng(seed), len(values), limits.bootstrap_draws
-    block = max(1, min(limits.bootstrap_block, count // 4))
-    block_start = rng.integers(0, count, (draws, -(-count // block), 1))
-    rows = (block_start + np.arange(block)).reshape(draws, -1)[:, :count] % count
-    return values[rows].mean(axis=1)
 
 
 def measure(
@@ -178,7 +180,7 @@ def gap_of(
             floor = noise_floor(linear.slope[rows][:, :STATE], free_noise)[:, SLICES[name]]
             parts = (error, np.maximum(floor, 1e-12)) if len(stretch) else (np.zeros((1, 3)),) * 2
             channels[f"{horizon_s:g} s"][name] = Channel(*map(rms_length, parts))
-    return Gap(score, slow.sum(axis=1), channels)
+    return Gap(score, slow.sum(axis=1), channels, together=limits.bootstrap_block)
 
 
 def overlap(windows: FlightWindows) -> float:

@@ -27,6 +27,17 @@ def test_the_interval_of_few_stretches_is_no_point_and_one_of_three_decides_noth
     assert covered > 0.7 * 200
 
 
+def test_errors_that_last_are_drawn_together():
+    # 30 independent errors, each of 20 neighbouring moments.
+    covered = dict.fromkeys((4, 20), 0)
+    for seed in range(100):
+        score = np.repeat(np.random.default_rng(seed).chisquare(4, 30) / 4, 20)
+        for together in covered:
+            low, high = Gap(score, score, {}, together=together).ci95(seed)
+            covered[together] += low <= 1.0 <= high
+    assert covered[4] < 75 and covered[20] > 85
+
+
 def test_a_stretch_counts_by_how_much_it_overlaps_the_next():
     def weight(start_s, flight):
         return overlap(SimpleNamespace(start_s=np.asarray(start_s), flight=np.asarray(flight)))

@@ -103,14 +103,15 @@ def test_more_drag_is_named_with_its_whole_size_and_other_speeds_are_no_change(m
     monkeypatch.setattr(change, "ttest_ind", spy)
     more, dragged = (0.6, 0.5, 0.2), task_of(flights(3, 5, 5.0, linear_drag=(DRAG,)))
     after = task_of(flights(3, 6, 5.0, 2.5, linear_drag=(more,)))
-    found = change.search_motion_change(dragged, after, candidates(SPACE, False, ()))
+    found = change.search_motion_change(dragged, after, candidates(SPACE, False, ()), 2)
     assert found is not None and named(found) == ["linear_drag"]
-    # Bonferroni: the least p-value, which is the drag's, times the number of all of them.
-    assert found.named[0].p_value == pytest.approx(len(p_values) * min(p_values))
+    # Bonferroni: the least p-value, which is the drag's, times the number of all of them, for
+    # two views.
+    assert found.named[0].p_value == pytest.approx(2 * len(p_values) * min(p_values))
     np.testing.assert_allclose(found.estimate.theta[found.indices], more, atol=0.06)
     np.testing.assert_allclose(found.start.theta[found.indices], DRAG, atol=0.06)
     after = task_of(flights(3, 7, 5.0, 2.0, linear_drag=(DRAG,)))
-    assert change.search_motion_change(dragged, after, candidates(SPACE, False, ())) is None
+    assert change.search_motion_change(dragged, after, candidates(SPACE, False, ()), 2) is None
 
 
 def test_the_fit_of_each_flight_ignores_its_trim():

@@ -8,7 +8,8 @@ import pytest
 
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import MotorMap
-from suite.diagnose.data.flights import acting_rotors, completed, parted, ready
+from suite.diagnose.data.flights import acting_rotors, completed, ready
+from suite.diagnose.data.hold_out import parted
 from suite.diagnose.data.view import FORCE, TORQUE, rows_of, weak_form
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.broken_logs import rows
@@ -142,14 +143,33 @@ def on_the_ground(log, before_s, after_s):
     )
 
 
+def test_where_the_speed_is_unknown_a_short_cut_of_the_throttle_is_no_rest_on_the_ground():
+    time_s = np.arange(0.0, 10.0, 0.01)
+    speed = np.full((1000, 4), hover_speed())
+    speed[(time_s < 2.0) | ((time_s > 5.0) & (time_s < 5.3))] = 0.0
+    log = level(time_s, np.zeros((1000, 3)), rotor_speed=speed, about={"partial": ["pos", "vel"]})
+    flown = rows_of(log, VEHICLE, speed).good
+    assert not flown[time_s < 2.9].any() and flown[time_s > 3.1].all()
+    turning = replace(log, rate_b=np.full((1000, 3), 0.5))
+    assert rows_of(turning, VEHICLE, speed).good.all()
+
+
 @pytest.mark.parametrize("ground_s", [(0.0, 0.0), (0.0, 6.0), (30.0, 0.0)])
 def test_of_a_single_flight_the_end_of_what_flew_is_held_out(pair, ground_s):
-    fitted, held = parted(ready([on_the_ground(pair[0], *ground_s)], VEHICLE), [])
+    fitted, held, (words,) = parted(ready([on_the_ground(pair[0], *ground_s)], VEHICLE), [])
     for name in (FORCE.name, TORQUE.name):
         first, last = (part[name][0].form.middle_s for part in (fitted, held))
         assert first.max() < last.min()
         share = len(first) / (len(first) + len(last))
         assert share == pytest.approx(THRESHOLDS.lone_fitted_share, abs=0.1)
+        since_s = float(words.removesuffix(" s").rpartition(" ")[2])
+        assert first.max() - 0.1 < since_s < last.min() + 0.1
+
+
+def test_a_flight_too_short_to_hold_out_a_second_is_refused(pair):
+    short = rows(pair[0], slice(0, round(2.5 / float(np.median(np.diff(pair[0].time_s))))))
+    with pytest.raises(ValueError, match="s of usable flight held out, at least 1 s"):
+        parted(ready([short], VEHICLE), [])
 
 
 def test_a_log_without_a_stretch_is_left_out_and_slow_ones_are_diagnosed_by_their_force(pair):

@@ -1,0 +1,101 @@
+"""Chooses the flights, or the end of a single flight, that a diagnosis holds out of its fits.
+
+Held-out flights test whether the named effects explain flights that no fit has seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from eval.logs.flight_log import FlightLog
+from suite.diagnose.data.flights import ViewFlights
+from suite.diagnose.data.view import SmoothedFlight, smoothed
+from suite.diagnose.data.windows import LENGTH_S
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+
+
+def choose_held_out(
+    logs: Sequence[FlightLog],
+    flight: np.ndarray,
+    start_s: np.ndarray,
+    information: np.ndarray,
+    limits: Thresholds = THRESHOLDS,
+) -> tuple[np.ndarray, list[str]]:
+    """Return for each window (W,) whether it is fitted, and the names of the held-out flights.
+
+    `flight` (W,) is the number of each window's flight, `start_s` (W,) the window's start in it.
+    `information` (W, K) is the information of each window on each of K parameters.
+
+    Held out are the flights whose information the others contain, too. So a flight with the only
+    chirp (a command of rising frequency) or the only pass near the ground is fitted. The choice
+    does not depend on the errors. Of a single flight, the end is held out.
+    """
+    flight = np.asarray(flight)
+    numbers = list(np.unique(flight))
+    if len(numbers) == 1:
+        log = logs[int(numbers[0])]
+        cut_s = limits.lone_fitted_share * log.duration_s
+        is_fitted = np.asarray(start_s) + LENGTH_S <= cut_s
+        since_s = float(np.asarray(start_s)[~is_fitted].min(initial=cut_s))
+        return is_fitted, [f"{log.name} from {since_s:.1f} s"]
+    by_flight = {k: information[flight == k].sum(axis=0) for k in numbers}
+    held: list[int] = []
+    for _ in range(max(1, round(limits.held_out_share * len(numbers)))):
+        kept = [k for k in numbers if k not in held]
+        total = np.sum([by_flight[k] for k in kept], axis=0)
+        informed = total > 0.0
+        # The largest share of the information on any parameter that is lost without the flight.
+        lost = {k: (by_flight[k][informed] / total[informed]).max(initial=0.0) for k in kept}
+        held.append(min(reversed(kept), key=lambda k: lost[k]))
+    return ~np.isin(flight, held), [logs[int(k)].name for k in sorted(held)]
+
+
+def parted(
+    flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRESHOLDS
+) -> tuple[dict[str, list[SmoothedFlight]], dict[str, list[SmoothedFlight]], list[str]]:
+    """Return the fitted flights and the held-out ones, each by view; split a single one in time.
+
+    `held` are the numbers of the flights to hold out. The last value has their names.
+
+    Raises:
+        ValueError: if a part is too short.
+    """
+    fitted_part, held_part, names = _split(flights, held, limits)
+    main = flights.views[0]
+    for what, part in (("to fit", fitted_part), ("held out", held_part)):
+        # The bumps of a view are half a width apart.
+        flown_s = sum(len(one.form.middle_s) for one in part[main.name]) * main.width_s / 2.0
+        if flown_s < limits.least_view_s:
+            raise ValueError(
+                f"{', '.join(flights.names)}: {flown_s:.1f} s of usable flight {what}, at least "
+                f"{limits.least_view_s:g} s are needed: fly longer"
+            )
+    return fitted_part, held_part, names
+
+
+def _split(
+    flights: ViewFlights, held: Sequence[int], limits: Thresholds
+) -> tuple[dict[str, list[SmoothedFlight]], dict[str, list[SmoothedFlight]], list[str]]:
+    """Return what `parted` returns, however short the parts are."""
+    count = len(flights.names)
+    if count > 1:
+        inside = [number for number in range(count) if number not in held]
+        fitted_part, held_part = (
+            {name: [part[k] for k in numbers] for name, part in flights.smoothed.items()}
+            for numbers in (inside, held)
+        )
+        return fitted_part, held_part, [flights.names[k] for k in held]
+    fitted_part, held_part = {}, {}
+    # The share is of the time in flight, since a log may begin or end on the ground.
+    flown_s = flights.smoothed[flights.views[0].name][0].form.middle_s
+    until_s = float(np.quantile(flown_s, limits.lone_fitted_share))
+    for view in flights.views:
+        (single,) = flights.smoothed[view.name]
+        early = single.rows.time_s <= until_s
+        for part, chosen in ((fitted_part, early), (held_part, ~early)):
+            rows = single.rows._replace(good=np.asarray(single.rows.good) & chosen)
+            split = smoothed(view, rows, limits)._replace(reliability=single.reliability)
+            part[view.name] = [split]
+    return fitted_part, held_part, [f"{flights.names[0]} from {until_s:.1f} s"]
