@@ -1,4 +1,4 @@
-"""Generate docs/reference from the code: commands, Python names, settings, effects and sensors.
+"""Generate docs/reference from the code: commands, Python names, settings, catalogues.
 
     python tools/reference.py [--check]
 
@@ -19,6 +19,7 @@ from typing import Any
 import suite
 from eval.effects import EFFECTS
 from eval.effects.interface import bound_value
+from eval.logs.faults.catalogue import FAULTS
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors import SENSORS
 from eval.sensors.measured_state import Axis, MeasuredState
@@ -181,12 +182,19 @@ def catalogue(page: str, entries: Iterable[Any]) -> str:
     return "\n".join(parts)
 
 
+def faults() -> str:
+    """Return the page of the faults of a log."""
+    rows = [f"| `{name}` | {about} | {manoeuvre} |" for name, (about, manoeuvre) in FAULTS.items()]
+    return "\n".join([head("faults"), "| fault | meaning | manoeuvre |\n|---|---|---|", *rows, ""])
+
+
 GENERATORS = {
     "commands": commands,
     "python": python,
     "settings": training,
     "effects": lambda: catalogue("effects", EFFECTS.values()),
     "sensors": lambda: catalogue("sensors", SENSORS.values()),
+    "faults": faults,
 }
 """Name of a page -> function that returns its text."""
 
