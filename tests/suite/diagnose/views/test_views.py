@@ -24,6 +24,8 @@ def test_a_drag_is_named_and_closes_what_any_model_could(by_views):
     assert left.gap_details["closed"] > 0.8 > 0.3 * left.explainable
     assert force.after.rms < 0.6 * force.before.rms and force.removed(force.names) > 0.9
     assert len(by_views.flights.held_out) == 1
+    # Moments of 2 s are drawn together: their errors are correlated.
+    assert [one.before.together for one in by_views.findings] == [20, 40]
 
 
 @pytest.mark.parametrize(("scale", "count"), [(0.9, 1), (1.0, 0)])
