@@ -50,9 +50,9 @@ class PpoConfig:
     clip: Annotated[float, Range(0.0, 10.0, above=True)] = 0.2
     """epsilon: the ratio of an action's new to its old probability counts in the objective up to
     this distance from 1."""
-    epochs: Annotated[int, Range(1, 10_000)] = 4
+    epochs: Annotated[int, Range(1, 10_000)] = 1
     """Passes of the policy over a rollout."""
-    minibatches: Annotated[int, Range(1, 10_000)] = 4
+    minibatches: Annotated[int, Range(1, 10_000)] = 2
     """Gradient steps of a pass, each over a part of the worlds; must divide `episode.batch`."""
     rate: Annotated[float, Range(0.0, 10.0)] = 3e-3
     """Adam's initial learning rate of the policy; it falls linearly to zero."""

@@ -35,7 +35,7 @@ def test_every_experiment_is_listed_and_has_help_for_every_option(capsys):
         ("ablation --set loss.field_gain=0", "loss.field_gain is 0, allowed is a number above"),
         ("ablation --workers 99", "--workers is 99"),
         ("schemes --training-seeds 1 1", "--training-seeds is 1 1"),
-        ("schemes --worlds 6", "allowed with PPO are multiples of its 4 minibatches"),
+        ("schemes --worlds 5", "allowed with PPO are multiples of its 2 minibatches"),
         ("schemes --set loss.progress=1.2", "this command sets loss.progress; give --progress"),
         ("gpu", "JAX finds no GPU here"),
         ("gpu --worlds 4 8 --train-worlds 6", "allowed are those of --worlds: 4 8"),
