@@ -23,7 +23,8 @@ from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.sources import rollout_source
 from suite.diagnose.sources.rollout_source import RolloutSource
-from suite.diagnose.sources.rollouts import LACKING
+from suite.diagnose.sources.rollouts import LACKING, by_rollouts
+from suite.diagnose.sources.source import DiagnosisInput
 from suite.diagnose.thresholds import Thresholds
 from tests.support import diagnosis_flights
 from tests.support.broken_logs import BREAKAGES
@@ -194,21 +195,34 @@ def test_without_noise_the_models_own_error_is_no_finding(vehicle, drive):
     assert all(not one["relevant"] for one in found["negligible"])
 
 
+@pytest.mark.slow
 def test_commands_between_the_rows_of_a_log_are_no_effect(monkeypatch):
-    """If the log has every command, its slow rows limit nothing."""
     uncertain = list[bool]()
     monkeypatch.setattr(RolloutSource, "is_relevant", lambda *_: True)
     monkeypatch.setattr(rollout_source, "structure_where", lambda *got: uncertain.append(got[2]))
     logs = flights(LAGGED, duration_s=5.0, noise=0.1)
     found = diagnose([rows_of(log, slice(0, None, 2)) for log in logs], LAGGED, drive="commands")
-    assert (found.verdict.label, found.named) == ("no_gap", [])
+    assert (found.verdict.label, found.named, uncertain) == ("no_gap", [], [True])
     assert LACKING in found.warnings
 
+
+def test_the_noise_counts_as_certain_only_if_no_command_is_lacking(monkeypatch):
+    """If the log has every command, its slow rows limit nothing."""
+    say, limits = lambda line: None, Thresholds()
+
+    def source_of(logs):
+        made = by_rollouts(
+            DiagnosisInput(logs, LAGGED, (), "commands", "auto", say, limits, True), ()
+        )
+        return made.sources[0], LACKING in made.warnings
+
+    logs = flights(LAGGED, count=2, duration_s=4.0, noise=0.1)
+    source, lacks = source_of([rows_of(log, slice(0, None, 2)) for log in logs])
+    assert lacks and source.coarser is not None and source.coarser_share == 1.0
+    assert sum(source.limits.least_noise) > sum(limits.least_noise)
     monkeypatch.setattr(diagnosis_flights, "EVERY", 10)
-    found = diagnose(flights(LAGGED, duration_s=5.0, noise=0.1), LAGGED, drive="commands")
-    assert (found.verdict.label, found.named) == ("no_gap", [])
-    assert LACKING not in found.warnings
-    assert uncertain == [True, False], "the noise counts as certain only if no command is lacking"
+    source, lacks = source_of(flights(LAGGED, count=2, duration_s=4.0, noise=0.1))
+    assert not lacks and source.coarser is None and source.limits == limits
 
 
 def rows_of(log, rows):
