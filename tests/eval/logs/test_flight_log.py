@@ -8,7 +8,6 @@ import pyarrow.parquet
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from eval.logs import flight_log
 from eval.logs.velocity import velocity_from_position
@@ -75,12 +74,6 @@ def test_a_golden_file_written_by_hand_reads_as_it_says(tmp_path, kind):
     again = flight_log.read_flight(flight_log.write_flight(tmp_path / "again.parquet", log))
     assert again.velocity_derived
     np.testing.assert_array_equal(again.vel_w, log.vel_w)
-
-
-def test_rot_w_is_body_to_world():
-    log = flight_log.log_from_columns(columns(), {}, "a")
-    expected = Rotation.from_quat(log.quat_wxyz, scalar_first=True).as_matrix()
-    np.testing.assert_allclose(log.rot_w, expected, atol=1e-12)
 
 
 def test_one_bad_flight_among_many_is_named_and_all_bad_is_an_error(tmp_path):
