@@ -2,9 +2,10 @@
 
     python tools/coverage.py COUNT [SEED] [CASES] [OUT.json]
 
-It estimates the parameters of COUNT simulated vehicles with random parameters
-(`tests/support/fleets.py`). A case says which signals the logs have; CASES are separated by commas,
-and all by default. For every parameter of a vehicle file the tool prints:
+It estimates the parameters of COUNT simulated vehicles with random parameters (fleets of
+`tests/support/fleets.py`), whose logs have a state estimator's slow errors (first-order, 0.1 to
+1 s) besides noise that is white from row to row. A case says which signals the logs have; CASES are
+separated by commas, and all by default. For every parameter of a vehicle file the tool prints:
 
 - for how many vehicles it was estimated,
 - for how many of these the 95 % interval contains the true value, with Wilson's interval,
@@ -19,26 +20,26 @@ import json
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
+from scipy.signal import lfilter
 
+from eval.effects import EFFECTS
 from eval.flights.follow import FlightFailed, Recording
+from eval.flights.trajectory import Trajectory
 from eval.judging.statistics import wilson
+from eval.logs.flight_log import FlightLog
+from eval.vehicles.vehicle import MotorMap
 from suite.diagnose.identify.identify import identify
+from tracks.geometry.rotation import exp_rot, rot_to_quat
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for tests/support
-from tests.support.fleets import (
-    Fleet,
-    Slow,
-    drawn,
-    logs_of,
-    recordings_of,
-    start,
-    truths,
-)
+from tests.support.fleets import DELAY, Fleet, logs_of, recordings_of, start
 
 CASES = {
     "rotors": ("rotors", ()),
@@ -49,6 +50,121 @@ CASES = {
     "pwm without rates": ("pwm", ("rate_b",)),
 }
 """Case -> the logged input of the flights, and the signals that are removed from their logs."""
+DRAG, FLAPPING = "linear_drag", "blade_flapping"
+
+
+@dataclass(frozen=True)
+class Slow:
+    """A state estimator's errors: standard deviation, and how long they last [s]."""
+
+    pos: tuple[float, float] = (0.004, 0.5)
+    """Each axis [m]."""
+    vel: tuple[float, float] = (0.03, 0.3)
+    """Each axis [m/s]."""
+    attitude: tuple[float, float] = (0.006, 1.0)
+    """About each body axis [rad]."""
+    gyro: tuple[float, float] = (0.02, 0.1)
+    """Each axis [rad/s]."""
+
+
+def drawn(rng: np.random.Generator, duration_s: float = 8.0) -> Fleet:
+    """Return a fleet of drawn numbers on drawn flights: an eight, a circle, climbs, a chirp."""
+
+    def factor(span: float, count: int) -> np.ndarray:
+        return np.exp(rng.uniform(-span, span, count))
+
+    nominal = start()
+    inertia = np.asarray(nominal.inertia) * factor(0.3, 3)
+    inertia = np.minimum(inertia, 0.98 * (inertia.sum() - inertia))
+    k_t, k_q = factor(0.2, 1)[0], factor(0.3, 1)[0]
+    rotors = replace(
+        nominal.rotors,
+        thrust_coefficient=float(nominal.rotors.thrust_coefficient * k_t),
+        torque_coefficient=float(nominal.rotors.torque_coefficient * k_q),
+        time_constant=float(rng.uniform(0.015, 0.05)),
+    )
+    gains = (*rng.uniform(12.0, 26.0, 2).tolist(), float(rng.uniform(5.0, 10.0)))
+    motors = MotorMap(
+        thrust=(float(rng.uniform(0.5, 2.5)), float(rng.uniform(2.5, 5.0))),
+        voltage=16.0,
+        voltage_exponent=float(rng.uniform(0.5, 1.6)),
+    )
+    step_s = 1.0 / nominal.controller.frequency
+    effects = {
+        DRAG: EFFECTS[DRAG].values(tuple(rng.uniform(0.1, 0.6, 3).tolist())),
+        DELAY: EFFECTS[DELAY].values(float(step_s * rng.integers(1, 11))),
+    }
+    truth = replace(
+        nominal,
+        inertia=tuple(inertia.tolist()),
+        rotors=rotors,
+        controller=replace(nominal.controller, rate_gain=gains),
+        motors=motors,
+        effects=MappingProxyType(effects),
+    )
+    speeds = rng.uniform(2.5, 5.0, 4) * [1.0, 1.0, 0.8, 0.2]
+    kinds = {"figure_eight": "sweep", "circle": "wobble", "climb": "wobble", "chirp": "wobble"}
+    ways = tuple(
+        Trajectory(kind, duration_s, speed, turn=turn, direction=float(rng.uniform(0.0, 2 * np.pi)))
+        for (kind, turn), speed in zip(kinds.items(), speeds.tolist(), strict=True)
+    )
+    scale = float(factor(0.15, 1)[0])
+    flapping = EFFECTS[FLAPPING].values(float(rng.uniform(1e-7, 6e-7)))
+    blown = MappingProxyType({**effects, FLAPPING: flapping})
+    return Fleet(replace(truth, effects=blown), ways, scale)
+
+
+def truths(fleet: Fleet, drive: str, told: str = "xyz") -> Mapping[str, tuple[float, ...]]:
+    """Return the true values of all that may be told, by their key in a vehicle file.
+
+    The torque coefficient is that which goes with what else is in the file then: the inertia about
+    z, which follows those about the axes `told` where it was not, and the thrust coefficient,
+    which only rotor speeds tell. Flapping goes with the rotors' speeds, so with that as well.
+    """
+    true, begun = fleet.truth, start()
+    assert true.motors is not None
+    ratio = np.asarray(true.inertia) / begun.inertia
+    twist = true.rotors.torque_coefficient
+    if "z" not in told:
+        twist *= float(np.sqrt(np.prod([ratio["xy".index(axis)] for axis in told])) / ratio[2])
+    flapping = true.effects[FLAPPING].coefficient
+    if drive != "rotors":
+        ratio_t = begun.rotors.thrust_coefficient / true.rotors.thrust_coefficient
+        twist, flapping = twist * ratio_t, flapping * ratio_t**0.5
+    return {
+        "motors.thrust": true.motors.thrust,
+        "motors.voltage_exponent": (true.motors.voltage_exponent,),
+        "effects.linear_drag.coefficient": tuple(true.effects[DRAG].coefficient),
+        "effects.thrust_scale.scale": (fleet.scale,),
+        "effects.blade_flapping.coefficient": (flapping,),
+        "effects.command_delay.delay": (true.effects[DELAY].delay,),
+        "inertia": true.inertia,
+        "rotors.thrust_coefficient": (true.rotors.thrust_coefficient,),
+        "rotors.torque_coefficient": (twist,),
+        "rotors.time_constant": (true.rotors.time_constant,),
+        "controller.rate_gain": true.controller.rate_gain,
+    }
+
+
+def with_slow_errors(log: FlightLog, slow: Slow, rng: np.random.Generator) -> FlightLog:
+    """Return a log to which a state estimator's errors are added."""
+    rot_w = log.rot_w @ np.asarray(exp_rot(_wander(log, slow.attitude, rng)))
+    return replace(
+        log,
+        pos_w=log.pos_w + _wander(log, slow.pos, rng),
+        vel_w=log.vel_w + _wander(log, slow.vel, rng),
+        quat_wxyz=np.asarray(rot_to_quat(rot_w)),
+        rate_b=log.rate_b + _wander(log, slow.gyro, rng),
+    )
+
+
+def _wander(log: FlightLog, size: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
+    """Return a stationary first-order process (T, 3)."""
+    sigma, lasts_s = size
+    keep = float(np.exp(-np.median(np.diff(log.time_s)) / lasts_s))
+    push = sigma * np.sqrt(1.0 - keep**2) * rng.standard_normal((len(log.time_s), 3))
+    push[0] = sigma * rng.standard_normal(3)
+    return np.asarray(lfilter([1.0], [1.0, -keep], push, axis=0))
 
 
 def pulls(
@@ -63,9 +179,10 @@ def pulls(
         rng: random generator of the noise of the logs.
     """
     drive, removed = CASES[case]
+    spoil = partial(with_slow_errors, slow=Slow(), rng=rng)
     logs = [
         replace(log, **{name: np.full_like(getattr(log, name), np.nan) for name in removed})
-        for log in logs_of(fleet, recordings, drive, rng, Slow())
+        for log in logs_of(fleet, recordings, drive, rng, spoil=spoil)
     ]
     numbers = identify(logs, start()).numbers
     intervals = {entry.key: entry.ci95 for entry in numbers}

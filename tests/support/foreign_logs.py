@@ -5,6 +5,7 @@ Another flight than this one is written by giving its function of time in place 
 """
 
 import struct
+from pathlib import Path
 from zlib import crc32
 
 import numpy as np
@@ -12,7 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.support.imported import write
 from tests.support.known_flight import fly, ned, ned_quat
-from tests.support.ros_messages import ACTUATORS, DEFINITIONS, IMU, ODOMETRY, TARGET
+
+ROS_MESSAGES = Path(__file__).with_name("ros_messages")
+"""Definitions of ROS 2 messages (ros2 interface show), and of their `parts`."""
 
 
 class UlogWriter:
@@ -269,9 +272,10 @@ def write_mcap(
     with path.open("wb") as file:
         writer = Writer(file)
 
-        def send(topics, name, definition, rate, message_of):
+        def send(topics, name, rate, message_of):
             """Write a topic at a rate; each further topic has every tenth message of it."""
-            schema = writer.register_msgdef(name, definition + DEFINITIONS)
+            files = [ROS_MESSAGES / f"{part}.msg" for part in (name.rpartition("/")[2], "parts")]
+            schema = writer.register_msgdef(name, "".join(file.read_text() for file in files))
             truth = source(np.arange(span[0], span[1], 1 / rate))
             for k, t in enumerate(truth.time):
                 when = origin + round(t * 1e9)
@@ -311,9 +315,9 @@ def write_mcap(
             return {"velocity": [float(speed) for speed in truth.motor[k]]}
 
         topics = ["/odom", "/odom_slow"]
-        send(topics, "nav_msgs/msg/Odometry", ODOMETRY, odometry, moving)
-        send(["/imu"], "sensor_msgs/msg/Imu", IMU, imu, measured)
-        send(["/target"], "mavros_msgs/msg/AttitudeTarget", TARGET, command, wanted)
-        send(["/motors"], "actuator_msgs/msg/Actuators", ACTUATORS, command, turning)
+        send(topics, "nav_msgs/msg/Odometry", odometry, moving)
+        send(["/imu"], "sensor_msgs/msg/Imu", imu, measured)
+        send(["/target"], "mavros_msgs/msg/AttitudeTarget", command, wanted)
+        send(["/motors"], "actuator_msgs/msg/Actuators", command, turning)
         writer.finish()
     return path

@@ -5,16 +5,23 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tracks.formats.mujoco_scene import add_scene
-from tracks.geometry.scene import Scene, counts, stack
+from tracks.geometry.scene import Counts, Scene, counts, stack
 from tracks.track import Track
 
 POSES = 12
 
 
-def model_of(track: Track) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """Return MuJoCo's model of the scene, and its data at rest."""
+def model_of(
+    track: Track, pad_to: Counts | None = None, drone: bool = False
+) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Return MuJoCo's model of the scene, also with a body at the start, and its data at rest."""
     spec = mujoco.MjSpec()
-    add_scene(spec, track.scene, track.names, track.mesh_sizes)
+    add_scene(spec, track.scene, track.names, track.mesh_sizes, pad_to)
+    if drone:
+        body = spec.worldbody.add_body(name="drone", pos=track.start_pos_w)
+        body.add_freejoint()
+        box = mujoco.mjtGeom.mjGEOM_BOX
+        body.add_geom(name="drone", type=box, size=[0.064, 0.064, 0.025], mass=0.75)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

@@ -16,7 +16,6 @@ from absl.testing import absltest
 from dm_env import test_utils
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers import FlattenObservation, FrameStackObservation
 
 from eval.envs.gymnasium_env import ID, RaceEnv, RaceVectorEnv
 from eval.envs.race import ACTION_LIMIT
@@ -282,12 +281,6 @@ def test_processes_fly_what_one_process_flies():
         assert all(np.array_equal(one[key], other[key]) for key in one)
     for env in envs:
         env.close()
-
-
-def test_wrappers_flatten_and_stack_observations():
-    env = FrameStackObservation(FlattenObservation(RaceEnv(rules=SHORT)), 2)
-    seen, _ = env.reset(seed=0)
-    assert seen.shape == (2, 12 + 24 * 32) and env.observation_space.contains(seen)
 
 
 sb3 = pytest.mark.skipif(

@@ -1,7 +1,7 @@
 """The diagnosis on flights made by MuJoCo: nulls stay null, effects are named, wrong ones lose.
 
-Every effect of the catalogue, hidden at a usual size, is named alone; broken logs end in a verdict
-with warnings or in an error that says what is wrong.
+Broken logs end in a verdict with warnings or in an error that says what is wrong. `suite blind`
+hides every effect of the catalogue, each alone.
 """
 
 import json
@@ -12,10 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eval.effects import EFFECTS, nameable_effects
-from eval.flights.simulate import SENSORS, log_of
-from eval.flights.simulate import fly as fly_ways
-from eval.flights.trajectory import ordinary_flights
+from eval.effects import nameable_effects
 from eval.logs.flight_log import read_flight
 from eval.quadrotor.loops import KINDS
 from suite.common.report import html
@@ -26,7 +23,8 @@ from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.sources import rollout_source
 from suite.diagnose.sources.rollout_source import RolloutSource
-from suite.diagnose.sources.rollouts import LACKING
+from suite.diagnose.sources.rollouts import LACKING, by_rollouts
+from suite.diagnose.sources.source import DiagnosisInput
 from suite.diagnose.thresholds import Thresholds
 from tests.support import diagnosis_flights
 from tests.support.broken_logs import BREAKAGES
@@ -98,10 +96,10 @@ def test_a_force_outside_the_catalogue_is_not_called_by_a_name_alone():
 
 
 @pytest.mark.slow
-def test_a_payload_is_its_mass_and_where_it_sits(ways):
+def test_a_payload_is_its_mass_and_where_it_sits():
     payload = {"mass_offset": (0.06,), "com_offset": ((0.005, -0.003, 0.0),)}
-    truth = with_effects(GIVEN, **DRAG, **payload)
-    found = diagnosis_json(diagnose(logged(truth, ways, 9), GIVEN, by="rollouts"))
+    logs = flights(with_effects(LAGGED, **payload), count=4)
+    found = diagnosis_json(diagnose(logs, LAGGED, by="rollouts"))
     effects = {effect["name"]: effect for effect in found["effects"]}
     heavy = effects.pop("mass_offset", None) or effects.pop("thrust_scale")
     assert {heavy["name"], *heavy["alternatives"]} <= {"mass_offset", "thrust_scale"}
@@ -179,87 +177,10 @@ def test_flights_broken_in_several_ways(sound, breakages, drive, alike, seed):
     outcome(logs, drive)
 
 
-DRAG = {"linear_drag": ((0.3, 0.25, 0.15),), "quadratic_drag": ((0.012, 0.016, 0.03),)}
-GIVEN = with_effects(with_lag(PLAIN, 0.02), **DRAG)
-HIDDEN = {
-    "linear_drag": ((0.4, 0.3, 0.2),),
-    "quadratic_drag": ((0.02, 0.02, 0.03),),
-    "rotor_drag": (2e-5,),
-    "inflow": (5e-5,),
-    "translational_lift": (0.01,),
-    "blade_flapping": (5e-7,),
-    "ground_effect": (4.0, 0.0635),
-    "constant_wind": ((1.5, -1.0, 0.5),),
-    "gusts": (0.8, 5.0),
-    "motor_lag": (0.035,),
-    "command_delay": (0.01,),
-    "thrust_scale": (0.95,),
-    "battery_sag": (0.005, 0.0),
-    "mass_offset": (0.05,),
-    "com_offset": ((0.004, -0.003, 0.0),),
-    "torque_trim": ((0.003, -0.002, 0.001),),
-    "inertia_scale": ((1.15, 0.9, 1.1),),
-    "rotor_gyroscopic": (2e-5,),
-    "rotor_spin_up": (5e-6,),
-    "rate_gain": ((0.85, 0.9, 1.1),),
-    "angular_damping": ((0.6, 0.6, 0.4),),
-    "weak_motor": ((1.0, 0.94, 1.0, 1.0),),
-    "thrust_tilt": ((0.01, -0.008),),
-    "gyro_bias": ((0.02, -0.01, 0.015),),
-    "accelerometer_bias": ((0.15, -0.1, 0.1),),
-    "frame_tilt": ((0.01, 0.008),),
-    "clock_offset": (0.008,),
-}
-ALIKE = {
-    "mass_offset": {"thrust_scale"},
-    "thrust_scale": {"mass_offset"},
-    "rotor_drag": {"linear_drag"},
-}
-"""What half a minute of flight may leave open."""
-
-
-@pytest.fixture(scope="module")
-def ways():
-    return ordinary_flights(np.random.default_rng(5), duration_s=5.5)
-
-
-def logged(truth, ways, seed):
-    """Return what an estimator logs of flights of `truth`, which the controller takes for GIVEN."""
-    rng, sensors = np.random.default_rng(seed), SENSORS["estimator"]
-    flights = fly_ways(GIVEN, truth, ways, sensors.rate_hz, rng=rng)
-    return [log_of(flight, truth, sensors, rng, f"flight_{k}") for k, flight in enumerate(flights)]
-
-
-def test_every_effect_is_a_candidate_and_tested():
-    assert set(HIDDEN) == set(nameable_effects())
-    among = candidates(make_space(GIVEN), True, ("acc_b", "command"))
+def test_every_effect_is_a_candidate():
+    among = candidates(make_space(LAGGED), True, ("acc_b", "command"))
     # Gusts have no fitted parameter but a test of their own.
-    assert {candidate.name for candidate in among} >= set(HIDDEN) - {"gusts"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", HIDDEN)
-def test_an_effect_is_named_alone(name, ways):
-    truth = with_effects(GIVEN, **{**DRAG, name: HIDDEN[name]})
-    logs = logged(truth, ways, list(EFFECTS).index(name))
-    found = diagnosis_json(diagnose(logs, GIVEN, by="rollouts"))
-    assert found["verdict"] in ("named", "partly"), found["unexplained"]
-    assert [effect["name"] for effect in found["effects"]] == [name]
-    (effect,) = found["effects"]
-    assert set(effect["alternatives"]) <= ALIKE.get(name, set())
-    if name != "gusts":
-        assert found["gap"]["after"] < 1.2
-    parameter = EFFECTS[name].parameters[0].name
-    if name == "weak_motor":
-        assert effect["parameters"]["index"]["value"] == 2
-        assert effect["parameters"]["scale"]["value"] == pytest.approx(0.94, abs=0.005)
-        return
-    value = np.array(effect["parameters"][parameter]["value"], dtype=float)
-    true = np.array(HIDDEN[name][0])
-    neutral = np.array(getattr(GIVEN.effects.get(name), parameter, 0.0))
-    scale = np.abs(true - neutral).max()
-    seen = np.isfinite(value)
-    assert np.abs(value - true)[seen].max() < (0.5 if name == "gusts" else 0.15) * scale
+    assert {candidate.name for candidate in among} >= set(nameable_effects()) - {"gusts"}
 
 
 @pytest.mark.slow
@@ -274,21 +195,34 @@ def test_without_noise_the_models_own_error_is_no_finding(vehicle, drive):
     assert all(not one["relevant"] for one in found["negligible"])
 
 
+@pytest.mark.slow
 def test_commands_between_the_rows_of_a_log_are_no_effect(monkeypatch):
-    """If the log has every command, its slow rows limit nothing."""
     uncertain = list[bool]()
     monkeypatch.setattr(RolloutSource, "is_relevant", lambda *_: True)
     monkeypatch.setattr(rollout_source, "structure_where", lambda *got: uncertain.append(got[2]))
     logs = flights(LAGGED, duration_s=5.0, noise=0.1)
     found = diagnose([rows_of(log, slice(0, None, 2)) for log in logs], LAGGED, drive="commands")
-    assert (found.verdict.label, found.named) == ("no_gap", [])
+    assert (found.verdict.label, found.named, uncertain) == ("no_gap", [], [True])
     assert LACKING in found.warnings
 
+
+def test_the_noise_counts_as_certain_only_if_no_command_is_lacking(monkeypatch):
+    """If the log has every command, its slow rows limit nothing."""
+    say, limits = lambda line: None, Thresholds()
+
+    def source_of(logs):
+        made = by_rollouts(
+            DiagnosisInput(logs, LAGGED, (), "commands", "auto", say, limits, True), ()
+        )
+        return made.sources[0], LACKING in made.warnings
+
+    logs = flights(LAGGED, count=2, duration_s=4.0, noise=0.1)
+    source, lacks = source_of([rows_of(log, slice(0, None, 2)) for log in logs])
+    assert lacks and source.coarser is not None and source.coarser_share == 1.0
+    assert sum(source.limits.least_noise) > sum(limits.least_noise)
     monkeypatch.setattr(diagnosis_flights, "EVERY", 10)
-    found = diagnose(flights(LAGGED, duration_s=5.0, noise=0.1), LAGGED, drive="commands")
-    assert (found.verdict.label, found.named) == ("no_gap", [])
-    assert LACKING not in found.warnings
-    assert uncertain == [True, False], "the noise counts as certain only if no command is lacking"
+    source, lacks = source_of(flights(LAGGED, count=2, duration_s=4.0, noise=0.1))
+    assert not lacks and source.coarser is None and source.limits == limits
 
 
 def rows_of(log, rows):

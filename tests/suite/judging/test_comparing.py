@@ -8,10 +8,10 @@ from scipy.stats import t as student
 
 from eval.judging.results import write_results
 from eval.judging.statistics import over_seeds, paired_success, wilson
-from eval.worlds.trial import TrialResult
 from suite.commands import compare
 from suite.common.console import Quiet
 from suite.judging.comparing import compare_runs, compare_seeds, read_runs
+from tests.support.judged_cells import result
 
 
 def test_the_hierarchical_bootstrap_of_a_difference_covers_as_it_says():
@@ -57,13 +57,6 @@ def test_the_interval_of_a_small_layout_is_that_of_its_mean_squares_and_one_seed
             over_seeds(*values)
 
 
-def result(seed, success):
-    return TrialResult(
-        "zigzag", 0, seed, "p", "v", "mujoco", success, 8 * success,
-        "finished" if success else "timeout", None, 0.0, 0.0, 0.0, 5.0, 6.0, 5.0, 8, 8, 0, 0, 0,
-    )  # fmt: skip
-
-
 def run_of(folder, successes, **judged):
     rows = [result(seed, bool(success)) for seed, success in enumerate(successes)]
     conditions = {"world": "mujoco", "time_limit_s": 20.0, "deadline_s": None, **judged}
@@ -101,7 +94,7 @@ def test_a_summary_that_is_none_and_a_trial_that_is_there_twice_are_refused(tmp_
         (tmp_path / "summary.json").write_text(summary)
         with pytest.raises(ValueError, match=rf"summary\.json: .*{said}"):
             read_runs(tmp_path)
-    rows = [result(0, True)] * 2
+    rows = [result(0)] * 2
     write_results(tmp_path, rows, table_markdown="", summary={"judged": {}}, seed=0)
     with pytest.raises(ValueError, match="holds a trial twice"):
         read_runs(tmp_path)

@@ -6,27 +6,13 @@ import numpy as np
 import pytest
 from mujoco import batch
 
+from tests.support.scene_poses import model_of
 from tracks.families import FAMILIES, MAX_COUNTS, make_track
 from tracks.formats.custom import load_track
 from tracks.formats.meshes import named_meshes, solid_meshes
 from tracks.formats.mujoco_scene import GROUND, PARKED, add_scene, solid_name
 from tracks.geometry.clearance import distances
 from tracks.geometry.scene import PARKED_Z, Counts
-
-
-def modelled(track, pad_to=None, drone=False):
-    """Return MuJoCo's model of a track, and its data at rest."""
-    spec = mujoco.MjSpec()
-    add_scene(spec, track.scene, track.names, track.mesh_sizes, pad_to)
-    if drone:
-        body = spec.worldbody.add_body(name="drone", pos=track.start_pos_w)
-        body.add_freejoint()
-        box = mujoco.mjtGeom.mjGEOM_BOX
-        body.add_geom(name="drone", type=box, size=[0.064, 0.064, 0.025], mass=0.75)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    return model, data
 
 
 def geom_names(model):
@@ -36,7 +22,7 @@ def geom_names(model):
 @pytest.mark.parametrize("family", FAMILIES)
 def test_geoms_are_the_solids_in_order(family):
     track = make_track(family, 7, 3)
-    model, data = modelled(track)
+    model, data = model_of(track)
     assert [solid_name(name) for name in geom_names(model)] == [*track.names, GROUND]
     scene = track.scene
     solids = (scene.boxes, scene.cylinders, scene.capsules, scene.spheres)
@@ -54,7 +40,7 @@ def test_geoms_are_the_solids_in_order(family):
 
 def test_padded_scenes_fly_in_one_batch_and_padding_is_out_of_the_way():
     tracks = [make_track(family, level, 1) for family in FAMILIES for level in (0, 9)]
-    models, datas = zip(*(modelled(track, MAX_COUNTS, True) for track in tracks), strict=True)
+    models, datas = zip(*(model_of(track, MAX_COUNTS, True) for track in tracks), strict=True)
     assert {model.ngeom for model in models} == {sum(MAX_COUNTS) + 2}
     worlds = batch.Batch(models[0], len(models))
     worlds.set_models(models)
@@ -66,7 +52,7 @@ def test_padded_scenes_fly_in_one_batch_and_padding_is_out_of_the_way():
 
 
 def test_the_drone_collides_with_every_solid_and_it_is_named():
-    model, data = modelled(make_track("zigzag", 9, 2), MAX_COUNTS, drone=True)
+    model, data = model_of(make_track("zigzag", 9, 2), MAX_COUNTS, drone=True)
     drone, kinds = model.geom("drone").id, ("gate 4 frame", "plate", "pillar", "small", "ground ")
     hit = [i for i, name in enumerate(geom_names(model)) if solid_name(name).startswith(kinds)]
     assert len(hit) > 20
@@ -84,7 +70,7 @@ def test_the_drone_collides_with_every_solid_and_it_is_named():
 
 def test_meshes_are_their_convex_parts(root):
     track = load_track(root / "tracks" / "examples" / "yard.toml")
-    model, data = modelled(track)
+    model, data = model_of(track)
     first = 0
     for name, size in zip(track.names[-2:], track.mesh_sizes, strict=True):
         corners = track.scene.triangles[first : first + size].reshape(-1, 3)
