@@ -1,7 +1,7 @@
 """The diagnosis on flights made by MuJoCo: nulls stay null, effects are named, wrong ones lose.
 
-Broken logs end in a verdict with warnings or in an error that says what is wrong. `suite blind`
-hides every effect of the catalogue, each alone.
+Every effect of the catalogue, hidden at a usual size, is named alone; broken logs end in a verdict
+with warnings or in an error that says what is wrong.
 """
 
 import json
@@ -12,7 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eval.effects import nameable_effects
+from eval.effects import EFFECTS, nameable_effects
+from eval.flights.simulate import SENSORS, log_of
+from eval.flights.simulate import fly as fly_ways
+from eval.flights.trajectory import ordinary_flights
 from eval.logs.flight_log import read_flight
 from eval.quadrotor.loops import KINDS
 from suite.common.report import html
@@ -96,10 +99,10 @@ def test_a_force_outside_the_catalogue_is_not_called_by_a_name_alone():
 
 
 @pytest.mark.slow
-def test_a_payload_is_its_mass_and_where_it_sits():
+def test_a_payload_is_its_mass_and_where_it_sits(ways):
     payload = {"mass_offset": (0.06,), "com_offset": ((0.005, -0.003, 0.0),)}
-    logs = flights(with_effects(LAGGED, **payload), count=4)
-    found = diagnosis_json(diagnose(logs, LAGGED, by="rollouts"))
+    truth = with_effects(GIVEN, **DRAG, **payload)
+    found = diagnosis_json(diagnose(logged(truth, ways, 9), GIVEN, by="rollouts"))
     effects = {effect["name"]: effect for effect in found["effects"]}
     heavy = effects.pop("mass_offset", None) or effects.pop("thrust_scale")
     assert {heavy["name"], *heavy["alternatives"]} <= {"mass_offset", "thrust_scale"}
@@ -177,10 +180,87 @@ def test_flights_broken_in_several_ways(sound, breakages, drive, alike, seed):
     outcome(logs, drive)
 
 
-def test_every_effect_is_a_candidate():
-    among = candidates(make_space(LAGGED), True, ("acc_b", "command"))
+DRAG = {"linear_drag": ((0.3, 0.25, 0.15),), "quadratic_drag": ((0.012, 0.016, 0.03),)}
+GIVEN = with_effects(with_lag(PLAIN, 0.02), **DRAG)
+HIDDEN = {
+    "linear_drag": ((0.4, 0.3, 0.2),),
+    "quadratic_drag": ((0.02, 0.02, 0.03),),
+    "rotor_drag": (2e-5,),
+    "inflow": (5e-5,),
+    "translational_lift": (0.01,),
+    "blade_flapping": (5e-7,),
+    "ground_effect": (4.0, 0.0635),
+    "constant_wind": ((1.5, -1.0, 0.5),),
+    "gusts": (0.8, 5.0),
+    "motor_lag": (0.035,),
+    "command_delay": (0.01,),
+    "thrust_scale": (0.95,),
+    "battery_sag": (0.005, 0.0),
+    "mass_offset": (0.05,),
+    "com_offset": ((0.004, -0.003, 0.0),),
+    "torque_trim": ((0.003, -0.002, 0.001),),
+    "inertia_scale": ((1.15, 0.9, 1.1),),
+    "rotor_gyroscopic": (2e-5,),
+    "rotor_spin_up": (5e-6,),
+    "rate_gain": ((0.85, 0.9, 1.1),),
+    "angular_damping": ((0.6, 0.6, 0.4),),
+    "weak_motor": ((1.0, 0.94, 1.0, 1.0),),
+    "thrust_tilt": ((0.01, -0.008),),
+    "gyro_bias": ((0.02, -0.01, 0.015),),
+    "accelerometer_bias": ((0.15, -0.1, 0.1),),
+    "frame_tilt": ((0.01, 0.008),),
+    "clock_offset": (0.008,),
+}
+ALIKE = {
+    "mass_offset": {"thrust_scale"},
+    "thrust_scale": {"mass_offset"},
+    "rotor_drag": {"linear_drag"},
+}
+"""What half a minute of flight may leave open."""
+
+
+@pytest.fixture(scope="module")
+def ways():
+    return ordinary_flights(np.random.default_rng(5), duration_s=5.5)
+
+
+def logged(truth, ways, seed):
+    """Return what an estimator logs of flights of `truth`, which the controller takes for GIVEN."""
+    rng, sensors = np.random.default_rng(seed), SENSORS["estimator"]
+    flights = fly_ways(GIVEN, truth, ways, sensors.rate_hz, rng=rng)
+    return [log_of(flight, truth, sensors, rng, f"flight_{k}") for k, flight in enumerate(flights)]
+
+
+def test_every_effect_is_a_candidate_and_tested():
+    assert set(HIDDEN) == set(nameable_effects())
+    among = candidates(make_space(GIVEN), True, ("acc_b", "command"))
     # Gusts have no fitted parameter but a test of their own.
-    assert {candidate.name for candidate in among} >= set(nameable_effects()) - {"gusts"}
+    assert {candidate.name for candidate in among} >= set(HIDDEN) - {"gusts"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HIDDEN)
+def test_an_effect_is_named_alone(name, ways):
+    truth = with_effects(GIVEN, **{**DRAG, name: HIDDEN[name]})
+    logs = logged(truth, ways, list(EFFECTS).index(name))
+    found = diagnosis_json(diagnose(logs, GIVEN, by="rollouts"))
+    assert found["verdict"] in ("named", "partly"), found["unexplained"]
+    assert [effect["name"] for effect in found["effects"]] == [name]
+    (effect,) = found["effects"]
+    assert set(effect["alternatives"]) <= ALIKE.get(name, set())
+    if name != "gusts":
+        assert found["gap"]["after"] < 1.2
+    parameter = EFFECTS[name].parameters[0].name
+    if name == "weak_motor":
+        assert effect["parameters"]["index"]["value"] == 2
+        assert effect["parameters"]["scale"]["value"] == pytest.approx(0.94, abs=0.005)
+        return
+    value = np.array(effect["parameters"][parameter]["value"], dtype=float)
+    true = np.array(HIDDEN[name][0])
+    neutral = np.array(getattr(GIVEN.effects.get(name), parameter, 0.0))
+    scale = np.abs(true - neutral).max()
+    seen = np.isfinite(value)
+    assert np.abs(value - true)[seen].max() < (0.5 if name == "gusts" else 0.15) * scale
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Flights that tell a set apart: chosen, written and read back."""
+"""Flights that tell a set apart: written, read back, and diagnosed with the old ones."""
 
 import json
 
@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from eval.effects import EFFECTS
+from eval.flights.simulate import SENSORS, fly, log_of
 from eval.flights.trajectory import Trajectory
+from suite.diagnose.diagnose import diagnose
 from suite.diagnose.plan import (
     COLUMNS,
     OTHERWISE,
@@ -17,7 +19,10 @@ from suite.diagnose.plan import (
     trajectories_for,
     write_plan,
 )
+from suite.diagnose.report.diagnosis_json import diagnosis_json
+from tests.support.vehicles import PLAIN, with_effects, with_lag
 
+LAGGED = with_lag(PLAIN, 0.03)
 SET = {"effects": [{"name": "rotor_drag", "alternatives": ["linear_drag"]}]}
 
 
@@ -60,6 +65,27 @@ def test_an_earlier_plan_goes_and_what_is_not_of_it_stays(tmp_path):
     assert own.exists() and outside.exists()
     (folder / "plan.json").write_text("[]")
     assert write_plan(folder, *trajectories_for(SET))["flights"]
+
+
+@pytest.mark.slow
+def test_flying_the_plan_turns_the_set_into_a_name():
+    truth = with_effects(LAGGED, rotor_drag=(3e-5,))
+    entry = next(e for e in SEPARATIONS if set(e.pair) == {"rotor_drag", "linear_drag"})
+    rng = np.random.default_rng(5)
+
+    def flown(ways):
+        sensors, recordings = SENSORS["estimator"], fly(LAGGED, truth, ways)
+        return [log_of(one, truth, sensors, rng, str(k)) for k, one in enumerate(recordings)]
+
+    logs = flown([*entry.blurred, *entry.blurred])
+    found = diagnosis_json(diagnose(logs, LAGGED))
+    (effect,) = found["effects"]
+    assert {effect["name"], *effect["alternatives"]} >= {"rotor_drag", "linear_drag"}
+    ways, _ = trajectories_for(found)
+    (effect,) = diagnosis_json(diagnose([*logs, *flown(ways)], LAGGED))["effects"]
+    assert (effect["name"], effect["alternatives"]) == ("rotor_drag", [])
+    low, high = effect["parameters"]["coefficient"]["ci95"]
+    assert low < 3e-5 < high
 
 
 def test_plans_name_catalogue_effects_and_end_in_flights():

@@ -50,6 +50,15 @@ def test_another_motor_that_fits_as_well_is_not_ruled_out(drag):
     assert [row[-1] for row in texts(table)] == ["not separable", "ruled out"]
 
 
+def test_the_json_has_what_was_found(drag, found):
+    assert found["verdict"] == drag.label and found["driven_by"] == "commands"
+    (effect,) = found["effects"]
+    assert effect["name"] == "linear_drag" and effect["gap_removed"] > 0.9
+    value = np.array(effect["parameters"]["coefficient"]["value"])
+    np.testing.assert_allclose(value, drag.main.theta[drag.main.search.indices])
+    assert found["gap"]["channels"]["1 s"]["velocity"]["noise_floor"] > 0.0
+
+
 def test_each_view_names_its_own_effect_and_the_page_has_its_headline_first(by_views):
     found = plain(diagnosis_json(by_views))
     effects = {effect["name"]: effect for effect in found["effects"]}
