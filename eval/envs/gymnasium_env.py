@@ -89,11 +89,6 @@ class RaceEnv(gymnasium.Env):
         """The contract for the file of a policy that is trained here."""
         return self._races.contract
 
-    @property
-    def spec_of_policy(self) -> PolicySpec:
-        """The `PolicySpec` of a policy that is trained here."""
-        return self._races.spec
-
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:

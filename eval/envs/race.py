@@ -29,7 +29,6 @@ from eval.worlds.trial import (
     next_centre,
     next_gate,
     start_progress,
-    steps_to_next,
 )
 from policies.observation import observe, view_of
 from policies.spec import PolicySpec
@@ -56,10 +55,9 @@ class Race:
         self.autopilot = make_autopilot(vehicle)
         layout = layout_of([track])
         self.model = compile_model(track, vehicle, self.autopilot.dt, layout.solids)
-        self._period = 1 / (spec.rate_hz * self.autopilot.dt)
-        self.steps_a_decision = max(1, round(self._period))
-        """Number of physics steps between decisions, rounded to a constant; `steps_to_decision`
-        varies instead, and so keeps the mean rate."""
+        period = 1 / (spec.rate_hz * self.autopilot.dt)
+        self.steps_a_decision = max(1, round(period))
+        """Number of physics steps between decisions, rounded to a constant."""
         self._start = start_state(track)
         gates = Gates(*(np.asarray(field)[None] for field in track.scene.gates))
         self._course = Course(gates, np.array([gates.center_w.shape[1]], np.int32))
@@ -67,12 +65,11 @@ class Race:
         if uses_noise(self.autopilot.plant):
             trial = TrialSpec(track.family, track.level, track.seed)
             steps = round(rules.time_limit_s / self.autopilot.dt)
-            self._noise = gust_draws(trial, steps + math.ceil(self._period) + 2)
+            self._noise = gust_draws(trial, steps + math.ceil(period) + 2)
         self._eye = DepthCamera(spec.camera)
         self._loops: AutopilotState
         self.progress: Progress
         self.action_b = np.zeros((1, 3))
-        self._decisions = 0
 
     @property
     def ended_by(self) -> str | None:
@@ -88,12 +85,8 @@ class Race:
         noise = None if self._noise is None else self._noise[:1]
         self._loops = start_autopilot(self.autopilot, motion, noise)
         self.progress = start_progress(motion.pos_w)
-        self.action_b, self._decisions = np.zeros((1, 3)), 0
+        self.action_b = np.zeros((1, 3))
         self._judge(data, bad_wrench=False)
-
-    def steps_to_decision(self) -> int:
-        """Return the number of physics steps until the next decision, as in the judge."""
-        return max(1, int(steps_to_next(np.array(self._decisions), self._period)))
 
     def advance(self, data: mujoco.MjData, action_b: np.ndarray, steps: int) -> float:
         """Fly an action for some physics steps, or until the episode ends; return the reward.
@@ -107,7 +100,6 @@ class Race:
         action = np.asarray(action_b, float)[None]
         guarded = guard_action(limits, action, self.action_b, 0.0, "of the environment's user")
         self.action_b = guarded.action_b
-        self._decisions += 1
         gates_before, path_before = int(self.progress.gates[0]), self._remaining_path()
         for _ in range(steps):
             if self.progress.ended[0] != FLYING:

@@ -36,21 +36,6 @@ def solid_meshes(track: Track) -> list[tuple[str, trimesh.Trimesh]]:
     return [(name, mesh) for name, mesh in named if mesh.bounds[1, 2] > PARKED_Z / 2]
 
 
-def named_meshes(track: Track) -> dict[str, trimesh.Trimesh]:
-    """Return name -> mesh in the world frame; the bars of a gate's frame are one mesh."""
-    parts: dict[str, list[trimesh.Trimesh]] = {}
-    for name, mesh in solid_meshes(track):
-        parts.setdefault(name, []).append(mesh)
-    return {name: _joined(meshes) for name, meshes in parts.items()}
-
-
-def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]
-    vertices = np.concatenate([mesh.vertices for mesh in meshes])
-    return trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
-
-
 def _transform(center_w: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rot_w, center_w

@@ -13,7 +13,7 @@ from eval.logs.velocity import velocity_from_position
 
 LEAST_V, MOST_V = 2.5, 70.0
 """Possible battery voltages, from one empty cell to sixteen full cells [V]."""
-SUNK_M, SUNK_SHARE = 0.5, 0.6
+SUNK_M = 0.5
 """Least fall of the height as the motors start [m]."""
 SPAN_S = 0.6
 """Time over which changes of the vertical speed are compared [s]."""

@@ -260,17 +260,6 @@ def error_of(state: FilterState, truth: FilterState) -> Array:
     return xp.concatenate(parts, axis=-1)
 
 
-def nees(state: FilterState, truth: FilterState) -> Array:
-    """Return the normalised estimation error squared, (N,).
-
-    It has a chi-squared distribution with 15 degrees of freedom if the covariance is correct
-    (Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2).
-    """
-    xp = state.pos_w.__array_namespace__()
-    error = error_of(state, truth)[..., None]
-    return xp.sum(error * xp.linalg.solve(state.covariance, error), axis=(-2, -1))
-
-
 def _skew(vector: Array) -> Array:
     """Return the matrices (..., 3, 3) with [a]x b = a x b."""
     xp = vector.__array_namespace__()

@@ -21,8 +21,6 @@ FLAGS = ("-std=c99", "-O3", "-ffp-contract=fast", "-fPIC", "-shared")
 """Compiler options that every machine supports."""
 NATIVE_FLAGS = ("-march=native",)
 """Options for this machine's processor, left out where the compiler does not support them."""
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
-"""Options under which the suite's policy.c compiles without warnings."""
 MACHINE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENOMEM)
 """Errors of the operating system whose cause is the machine, not the file."""
 COMPILE_S = 600.0

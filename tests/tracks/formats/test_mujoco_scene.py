@@ -9,7 +9,7 @@ from mujoco import batch
 from tests.support.scene_poses import model_of
 from tracks.families import FAMILIES, MAX_COUNTS, make_track
 from tracks.formats.custom import load_track
-from tracks.formats.meshes import named_meshes, solid_meshes
+from tracks.formats.meshes import solid_meshes
 from tracks.formats.mujoco_scene import GROUND, PARKED, add_scene, solid_name
 from tracks.geometry.clearance import distances
 from tracks.geometry.scene import PARKED_Z, Counts
@@ -114,14 +114,3 @@ def test_a_mesh_has_its_solids_name_lies_on_it_and_fills_it():
         # Its corners lie to all sides of the middle, so that it is the whole solid.
         ahead = (mesh.vertices - center_w) @ np.concatenate([np.eye(3), -np.eye(3)]).T
         assert (ahead.max(axis=0) > 0).all(), name
-
-
-def test_a_gates_bars_are_one_mesh_and_parked_bars_none(root):
-    track = load_track(root / "tracks" / "examples" / "yard.toml")
-    meshes = named_meshes(track)
-    assert list(meshes) == list(dict.fromkeys(track.names))
-    assert len(meshes["gate 0 frame"].faces) == 4 * 12
-    assert len(meshes["gate 1 frame"].faces) == 12 * 12
-    assert len(meshes["gate 2 frame"].faces) == 3 * 12
-    gate = meshes["gate 0 frame"]
-    assert np.allclose(gate.bounds, [[-0.025, -0.75, 0.6], [0.025, 0.75, 2.0]])

@@ -15,7 +15,6 @@ from eval.sensors.filter.kalman import (
     ImuNoise,
     error_of,
     move,
-    nees,
     predict,
     project,
     start,
@@ -95,6 +94,15 @@ def flown(steps: int, believed: Believed = RIGHT, seed: int = 0) -> np.ndarray:
             state = update_gate(state, seen_by(truth, rng), believed.corners * PIXEL**2, CAMERA_B)
         found.append(nees(state, truth))
     return np.array(found)
+
+
+def nees(state, truth):
+    """Return the normalised estimation error squared (N,), chi-squared with 15 degrees of freedom.
+
+    See Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2.
+    """
+    error = np.asarray(error_of(state, truth))
+    return np.einsum("nk,nk->n", error, np.linalg.solve(state.covariance, error[..., None])[..., 0])
 
 
 def share_within(nees_of_flights):

@@ -12,7 +12,7 @@ import pytest
 from policies.formats import model_process as process
 from policies.formats.c import arrays, quantised, source
 from policies.formats.c.c_file import load_c
-from policies.formats.c.compiler import STRICT, find_compiler
+from policies.formats.c.compiler import find_compiler
 from policies.formats.c.forward import Observed
 from policies.formats.c.project import c_project, native_actions, random_observations
 from policies.formats.policy_file import load_policy_checkpoint, save_policy
@@ -60,6 +60,9 @@ def answers(policy, observed):
         action, hidden = policy.act(hidden, state[None], image[None], np.array([fresh]))
         found.append(action[0])
     return np.array(found)
+
+
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 
 
 def checked(folder, *flags, name="check"):
