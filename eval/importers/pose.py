@@ -226,9 +226,11 @@ def align(quat: Signal, rate: Signal, name: str, mirrored: bool = False) -> Alig
             raise FlightLogError(name, "time", None, reason)
     offset = _coarse_offset(centre_s, pose_rate_b, rate, name)
     shared = (centre_s + offset > rate.time_s[0]) & (centre_s + offset < rate.time_s[-1])
-    middle = float(np.mean(centre_s[shared]))
     # During the fit, the offset is that in the middle of the flight.
     fit = Alignment(offset, 0.0, np.eye(3), 0.0, np.inf, np.inf)
+    if np.sum(shared) < MIN_SAMPLES:
+        return fit  # the signals agree best where they hardly overlap: no alignment
+    middle = float(np.mean(centre_s[shared]))
     reach, full_reach = FIRST_REACH_S, float(np.max(np.abs(centre_s - middle)))
     # From the middle outwards, because over a long flight the drift is too large for one step.
     while True:

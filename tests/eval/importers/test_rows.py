@@ -256,6 +256,12 @@ def test_noise_widens_the_reported_error():
     assert error < 4 * shaken.offset_sd_s
 
 
+def test_clocks_that_agree_best_where_the_signals_do_not_overlap_are_not_aligned(monkeypatch):
+    monkeypatch.setattr("eval.importers.pose._coarse_offset", lambda *_: -4260.0)
+    found = align(_poses((1, 19), 120.0, 2.0, 0.0), _gyro((0, 20)), "pose")
+    assert found.correlation == 0.0 and found.drift == 0.0
+
+
 def test_a_turn_between_the_bodies_is_found():
     turn = Rotation.from_rotvec([0.4, -0.8, 1.9])
     found = align(_poses((1, 19), 120.0, 2.0, 0.0, turn=turn), _gyro((0, 20)), "pose")
