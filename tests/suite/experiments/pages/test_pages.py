@@ -136,11 +136,12 @@ def test_the_field_and_other_ways_to_learn():
     rows = rows_of("ablation", "setting", "field 0.4", "progress 0.4")
     shares = (percent(row["over"]["success_cross"]["mean"]) for row in rows)
     assert "| the paper's | 200 | {} % | {} % |".format(*shares) in text
-    rows = rows_of("schemes", "scheme", "ours", "ppo")
-    ours, ppo = (row["curves"]["gates"][-1]["mean"] for row in rows)
-    assert f"| ours, with the field | {ours:.2f} |" in text
-    row = next(line for line in text.splitlines() if line.startswith("| PPO "))
-    assert row.endswith(f"| {ppo:.2f} |"), row
+    starts = ("| ours, with the field |", "| ours, with L_proj ", "| PPO ")
+    rows = rows_of("schemes", "scheme", "ours", "projection", "ppo")
+    for start, row in zip(starts, rows, strict=True):
+        wanted = "| {mean:.2f} ({least:.2f} to {most:.2f}) |".format(**row["curves"]["gates"][-1])
+        (line,) = [line for line in text.splitlines() if line.startswith(start)]
+        assert line.endswith(wanted), line
 
 
 def intervals(value):
