@@ -12,7 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from eval.quadrotor import attitude
+from eval.quadrotor.attitude import (
+    HEADING_RATE,
+    action_to_force,
+    attitude_command,
+    blend_heading,
+    level_heading,
+)
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.train.config import QuadrotorConfig
 from suite.train.dynamics import quadrotor
@@ -37,18 +43,18 @@ class Loop(NamedTuple):
 
 def commanded(force_w):
     """Wanted force to body rates, upright."""
-    return attitude.attitude_command(Loop(), force_w, jnp.asarray(LEVEL), jnp.asarray(X)).rate_b
+    return attitude_command(Loop(), force_w, jnp.asarray(LEVEL), jnp.asarray(X)).rate_b
 
 
 def tilted(turn):
     """Small turn of the body to body rates, in hover."""
-    force_w = attitude.action_to_force(jnp.zeros(3), exp_rot(turn))
-    return attitude.attitude_command(Loop(), force_w, exp_rot(turn), jnp.asarray(X)).rate_b
+    force_w = action_to_force(jnp.zeros(3), exp_rot(turn))
+    return attitude_command(Loop(), force_w, exp_rot(turn), jnp.asarray(X)).rate_b
 
 
 def headed(to_gate_w):
     """Direction to the gate to the heading after a moment."""
-    return attitude.blend_heading(jnp.asarray(X), to_gate_w, 0.5 / attitude.HEADING_RATE)
+    return blend_heading(jnp.asarray(X), to_gate_w, 0.5 / HEADING_RATE)
 
 
 def from_rest(action_b):
@@ -76,7 +82,7 @@ def field_of_padded(point_w):
 
 
 def level(turn):
-    return attitude.level_heading(exp_rot(turn))
+    return level_heading(exp_rot(turn))
 
 
 def pull_at_speed(vel_w):

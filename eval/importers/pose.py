@@ -229,7 +229,7 @@ def align(quat: Signal, rate: Signal, name: str, mirrored: bool = False) -> Alig
     # During the fit, the offset is that in the middle of the flight.
     fit = Alignment(offset, 0.0, np.eye(3), 0.0, np.inf, np.inf)
     if np.sum(shared) < MIN_SAMPLES:
-        return fit  # the signals agree best where they hardly overlap: no alignment
+        return fit  # the poses have a hole where the clocks would agree: no alignment
     middle = float(np.mean(centre_s[shared]))
     reach, full_reach = FIRST_REACH_S, float(np.max(np.abs(centre_s - middle)))
     # From the middle outwards, because over a long flight the drift is too large for one step.
@@ -349,7 +349,8 @@ def _coarse_offset(centre_s: np.ndarray, pose_rate_b: np.ndarray, rate: Signal, 
     overlap_weight = np.sqrt(np.clip(shared / min(len(pose), len(log)), 0.0, 1.0))
     score = np.where(shared > min_overlap, product / energy * overlap_weight, -1.0)
     lag = int(np.argmax(score))
-    lag = lag - size if lag > size // 2 else lag
+    # Lags from 0 to the length of the log are positive; negative ones are at the transform's end.
+    lag = lag if lag < len(log) else lag - size
     return float(log_grid[0] - pose_grid[0] + lag * GRID_S)
 
 

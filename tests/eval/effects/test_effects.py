@@ -196,7 +196,7 @@ def test_the_start_is_where_a_swing_comes_to_rest():
     assert line_w[0] / line_w[2] == pytest.approx(np.tan(0.1))
 
 
-def test_small_swings_have_the_period_of_both_masses_and_last():
+def test_small_swings_have_the_period_of_both_masses():
     """Level under (M + m) g the vehicle is free to give way: 2 pi sqrt(L / (g (1 + m / M)))."""
     plant = make_plant(LOADED, 0.002)
     hangs = hanging(plant).carried["slung_load"].line_w
@@ -207,7 +207,6 @@ def test_small_swings_have_the_period_of_both_masses_and_last():
     crossed = down + offset[down] / (offset[down] - offset[down + 1])
     period = 2 * np.pi * np.sqrt(-hangs[2] / (GRAVITY * (1 + LOAD / PLAIN.mass)))
     np.testing.assert_allclose(np.diff(crossed) * 0.002, period, rtol=1e-3)
-    assert offset[-800:].max() == pytest.approx(0.01, rel=0.01), "it keeps its energy"
 
 
 def test_momentum_changes_by_gravity_and_rotors_alone():
@@ -224,6 +223,20 @@ def test_momentum_changes_by_gravity_and_rotors_alone():
         force_w = motion.rot_w @ rotors.force_b + [0.0, 0.0, -9.81 * TOTAL]
         state, motion, _ = step(loaded, state, motion, inputs, 0.002 * k)
         np.testing.assert_allclose(momentum(state, motion) - before, 0.002 * force_w, atol=1e-12)
+
+
+def test_a_wide_swing_keeps_its_energy_but_for_what_the_line_takes():
+    plant = make_plant(LOADED, 0.002)
+    angle = 1.0
+    start = (LENGTH + 0.001) * np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    heights = []
+    for swing, *_ in flown(plant, hanging(plant, start), at_rest(), HOLDING, 4.0):
+        # Seen from the vehicle, whose weight the rotors' push makes up for, the load falls by it.
+        push = GRAVITY * TOTAL / PLAIN.mass
+        heights.append((0.5 * swing.vel_w @ swing.vel_w + push * swing.line_w[2]) / push)
+    heights = np.array(heights) - heights[0]
+    assert heights.max() < 0.001, "m, of 0.23 m"
+    assert -0.006 < heights[-1] < 0.0
 
 
 def test_a_slack_line_pulls_nothing():

@@ -16,6 +16,7 @@ from absl.testing import absltest
 from dm_env import test_utils
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import FlattenObservation, FrameStackObservation
 
 from eval.envs.gymnasium_env import ID, RaceEnv, RaceVectorEnv
 from eval.envs.race import ACTION_LIMIT
@@ -283,6 +284,12 @@ def test_processes_fly_what_one_process_flies():
         env.close()
 
 
+def test_wrappers_flatten_and_stack_observations():
+    env = FrameStackObservation(FlattenObservation(RaceEnv(rules=SHORT)), 2)
+    seen, _ = env.reset(seed=0)
+    assert seen.shape == (2, 12 + 24 * 32) and env.observation_space.contains(seen)
+
+
 sb3 = pytest.mark.skipif(
     importlib.util.find_spec("stable_baselines3") is None,
     reason="pip install 'diffracing-suite[sb3]'",
@@ -298,7 +305,7 @@ def test_a_picture_shows_the_track_from_behind_the_drone_and_what_it_sees():
     assert picture is not None and (picture.shape, picture.dtype) == ((360, 640, 3), np.uint8)
     assert share(picture, colours.AHEAD, 50) > 3e-3 and share(picture, colours.DRONE, 12) > 5e-4
     depth_m = env._races.view().depth_m[0]
-    want = colours.depth_colours(depth_m, env._races.spec.camera.range_m)
+    want = colours.depth_colours(depth_m, env.spec_of_policy.camera.range_m)
     np.testing.assert_array_equal(picture[-120:, -160:][2::5, 2::5], want)
     env.reset(options={"track_seed": 2})
     fresh = RaceEnv(track="circular", track_seed=2, render_mode="rgb_array")

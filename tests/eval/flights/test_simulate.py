@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from eval.flights.follow import FlightFailed
+from eval.flights.follow import FlightFailed, Step, follow, reference_of
 from eval.flights.simulate import FULL_V, SENSORS, fly, log_of
 from eval.flights.trajectory import KINDS, Trajectory
-from eval.quadrotor.plant import Wrench, accelerations, make_plant
+from eval.quadrotor.plant import Command, Motion, Wrench, accelerations, make_plant
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 from tests.support.ways import BARE, CIRCLE, EIGHT, bare_flights, having
@@ -18,13 +18,11 @@ VEHICLE = with_effects(with_lag(PLAIN, 0.03), linear_drag=((0.3, 0.3, 0.1),))
 class Wind:
     """A push along x, and commands that are a tenth too strong."""
 
-    push_w = np.array([0.3, 0.0, 0.0])
-
     def command(self, command, time_s):
         return command._replace(thrust=1.1 * command.thrust)
 
     def wrench(self, motion, wrench, time_s, dt):
-        return Wrench(np.zeros_like(motion.pos_w) + self.push_w, np.zeros_like(motion.pos_w))
+        return Wrench(np.full_like(motion.pos_w, [0.3, 0.0, 0.0]), np.zeros_like(motion.pos_w))
 
 
 def test_a_recording_is_what_the_stepper_makes_of_its_commands():
@@ -32,7 +30,6 @@ def test_a_recording_is_what_the_stepper_makes_of_its_commands():
     assert (len(flight.time_s), len(hover.time_s), flight.period) == (750, 500, 5)
     np.testing.assert_allclose(flight.acting.thrust, 1.1 * flight.command.thrust)
     np.testing.assert_array_equal(flight.extra.force_b, np.tile([0.3, 0.0, 0.0], (750, 1)))
-    assert not np.ptp(flight.command.thrust.reshape(-1, flight.period), axis=1).any()
     assert FULL_V == flight.voltage[0] > flight.voltage[-1]
     plant = make_plant(VEHICLE, flight.dt)
     state = PlantState(flight.rotor_speed, np.zeros((750, 4, 0)), {})
@@ -50,13 +47,6 @@ def test_a_recording_is_what_the_stepper_makes_of_its_commands():
 def test_a_flight_into_the_ground_fails_with_its_time():
     with pytest.raises(FlightFailed, match=r"flight 1 failed at \d\.\d\d s.*gentler"):
         fly(PLAIN, VEHICLE, [Trajectory("hover", 1.0, height=0.0)])
-
-
-def test_a_flight_away_from_its_trajectory_fails_with_its_number():
-    storm = Wind()
-    storm.push_w = np.array([[0.3, 0.0, 0.0], [60.0, 0.0, 0.0]])
-    with pytest.raises(FlightFailed, match=r"flight 2 failed at 0\.\d\d s, 4\.\d m off"):
-        fly(PLAIN, VEHICLE, WAYS, extra=storm)
 
 
 def test_a_rate_must_divide_the_rate_loops():
@@ -110,6 +100,63 @@ def test_faults_of_the_log_are_in_the_log():
     np.testing.assert_allclose(bias, np.tile([0.1, -0.2, 0.3], (len(bias), 1)), atol=1e-12)
     # 0.02 s are two rows of 0.01 s.
     np.testing.assert_allclose(log.pos_w[2:], flight.motion.pos_w[rows][:-2], atol=1e-9)
+
+
+DT = 0.002
+BOTH_WAYS = [Trajectory("circle", 0.4, speed=1.0), Trajectory("hover", 0.2)]
+
+
+class Points:
+    """Bodies that stay level and fall off their trajectories by `off_m` a second."""
+
+    integrator: str | None = "none"
+
+    def __init__(self, wanted, off_m=0.0):
+        self.off_m, self.steps, self.commands = off_m, 0, []
+        self.start_w = wanted.pos_w[0]
+
+    def motion(self):
+        count = len(self.start_w)
+        pos_w = self.start_w + np.array([self.off_m * self.steps * DT, 0.0, 0.0])
+        quat = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+        still = np.zeros((count, 3))
+        return Motion(pos_w, np.tile(np.eye(3), (count, 1, 1)), still, still), quat
+
+    def step(self, motion, command, time_s):
+        assert time_s == pytest.approx(self.steps * DT)
+        self.steps += 1
+        self.commands.append(command)
+        count = len(self.start_w)
+        still, felt = np.zeros((count, 3)), np.full((count, 3), float(self.steps))
+        speed = np.full((count, 4), 10.0 * self.steps)
+        return Step(speed, np.full(count, 16.0), command, Wrench(still, still), felt)
+
+
+def flown(off_m=0.0):
+    wanted = reference_of(BOTH_WAYS, 5, DT)
+    bodies = Points(wanted, off_m)
+    return bodies, follow(bodies, PLAIN, BOTH_WAYS, wanted, 5, DT)
+
+
+def test_each_flight_has_its_length_and_commands_are_held_for_a_period():
+    bodies, (circle, hover) = flown()
+    assert (len(circle.time_s), len(hover.time_s)) == (200, 100)
+    assert circle.period == 5 and circle.integrator == "none"
+    assert all(bodies.commands[k] is bodies.commands[5 * (k // 5)] for k in range(200))
+    given = Command(*(np.array(part)[:100, 1] for part in zip(*bodies.commands, strict=True)))
+    np.testing.assert_array_equal(hover.command.thrust, given.thrust)
+
+
+def test_a_specific_force_stands_with_the_step_after_the_one_that_had_it():
+    _, (circle, _) = flown()
+    np.testing.assert_array_equal(circle.acc_b[0], [0.0, 0.0, 9.81])
+    np.testing.assert_array_equal(circle.acc_b[1:, 0], np.arange(1.0, 200.0))
+    np.testing.assert_array_equal(circle.rotor_speed[:, 0], 10.0 * np.arange(1.0, 201.0))
+
+
+def test_a_flight_away_from_its_trajectory_fails_with_its_number():
+    with pytest.raises(FlightFailed, match=r"flight [12] failed at 0\.\d\d s, 4\.\d m off"):
+        flown(off_m=20.0)
 
 
 def test_the_pilot_stays_on_the_trajectory():

@@ -256,6 +256,11 @@ def test_noise_widens_the_reported_error():
     assert error < 4 * shaken.offset_sd_s
 
 
+def test_short_poses_late_in_a_long_log_are_aligned():
+    found = align(_poses((50, 58), 120.0, 2.0, 0.0), _gyro((0, 60)), "pose")
+    assert found.offset_s == pytest.approx(2.0, abs=1e-3) and found.correlation > 0.99
+
+
 def test_clocks_that_agree_best_where_the_signals_do_not_overlap_are_not_aligned(monkeypatch):
     monkeypatch.setattr("eval.importers.pose._coarse_offset", lambda *_: -4260.0)
     found = align(_poses((1, 19), 120.0, 2.0, 0.0), _gyro((0, 20)), "pose")

@@ -140,6 +140,15 @@ def test_mistakes_of_unit_are_reported_from_the_flights(change, action, fault):
     assert found["decisions"] >= 5 and (found["limited"] > 0.5) == (fault == "action_limited")
 
 
+def test_a_scaled_policy_flies_as_the_plain_one():
+    track = straight((0.5, 4.0))
+    plain = flown(Changed(lambda a: a), track=track)
+    spec = PolicySpec(action=ActionSpec(scale=(20.0,)))
+    scaled = flown(Changed(lambda a: a / 20, spec), track=track)
+    assert scaled.gates_passed == plain.gates_passed == 1
+    assert scaled.pos_x == pytest.approx(plain.pos_x, abs=1e-4)
+
+
 def test_a_vehicle_too_heavy_to_climb_is_no_gravity_in_the_action():
     heavy = replace(VEHICLE, mass=2.7 * VEHICLE.mass)
     result = flown(Pursuit(), rules=Rules(time_limit_s=3.0), vehicle=heavy)

@@ -55,7 +55,6 @@ def test_the_baseline_refuses_what_its_recipe_does_not_have():
             Baseline(config, params)
 
 
-@pytest.mark.slow
 def test_both_sides_have_the_same_residuals():
     task = make_task(20_000, 2.5)
     model = RolloutModel(

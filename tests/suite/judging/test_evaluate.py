@@ -10,7 +10,7 @@ import eval.judging.judge
 from eval.judging.results import read_trials
 from suite.common.console import Console
 from suite.judging.flying import Manner, load_in_manner, policy_for_workers
-from tests.support.commands import answer, evaluate, refused
+from tests.support.commands import answer, evaluate, refused, run
 
 
 def interrupt_after(patch, count):
@@ -141,6 +141,16 @@ def test_with_a_monitor_each_policy_flies_twice_on_the_same_trials(pilots, tmp_p
     loaded = load_in_manner(pilots["diver"], False, Manner(monitored=True))
     make = policy_for_workers(loaded, pilots["diver"], False, 2, Manner(monitored=True))
     assert callable(make) and make().name == "diver+monitor"
+
+
+@pytest.mark.slow
+def test_the_mjx_world_flies_more_trials_than_it_has_slots(pilots, tmp_path):
+    ends = []
+    for world in ("mjx", "mujoco"):
+        asked = f"eval --difficulty 0 --track zigzag --trials 150 --simulator {world} --policy"
+        assert run(asked, pilots["diver"], "--out", tmp_path / world) == 0
+        ends.append([row.ended_by for row in read_trials(tmp_path / world / "trials.parquet")])
+    assert len(ends[0]) == 150 and ends[0] == ends[1]
 
 
 def test_trials_that_are_not_asked_for_again_are_kept_and_said(pilots, tmp_path, capsys):

@@ -8,7 +8,14 @@ import pytest
 
 from eval.logs.flight_log import read_flights, write_flight
 from suite.delta.replay import nominal_model
-from suite.loop import measured
+from suite.loop.measured import (
+    CONTACT_MARGIN_S,
+    Noise,
+    add_measurement_noise,
+    cut_end,
+    first_files,
+    noisy,
+)
 from suite.train.config import PointMassConfig
 from tests.support.point_mass_flights import fly
 
@@ -22,14 +29,14 @@ def logs():
 
 def test_ends_are_cut_and_noise_is_of_its_size(logs):
     log = logs[0]
-    short = measured.cut_end(log, 0.5)
+    short = cut_end(log, 0.5)
     assert log.time_s[-1] - short.time_s[-1] == pytest.approx(0.5, abs=0.034)
     assert len(short.pos_w) == len(short.extra["action_x"]) == len(short.time_s) < len(log.time_s)
-    shaken = measured.noisy(log, measured.Noise(), np.random.default_rng(0))
+    shaken = noisy(log, Noise(), np.random.default_rng(0))
     turn = np.einsum("nij,nik->njk", log.rot_w, shaken.rot_w)
     angle = np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], -1)
-    assert angle.std() == pytest.approx(measured.Noise().attitude, rel=0.2)
-    assert (shaken.rate_b - log.rate_b).std() == pytest.approx(measured.Noise().gyro, rel=0.2)
+    assert angle.std() == pytest.approx(Noise().attitude, rel=0.2)
+    assert (shaken.rate_b - log.rate_b).std() == pytest.approx(Noise().gyro, rel=0.2)
     np.testing.assert_allclose(np.linalg.norm(shaken.quat_wxyz, axis=1), 1, atol=1e-12)
     np.testing.assert_array_equal(shaken.thrust_cmd, log.thrust_cmd)
 
@@ -38,25 +45,25 @@ def test_crashed_flights_lose_their_end_and_short_ones_are_left_out(logs, tmp_pa
     flights, out = tmp_path / "flights", tmp_path / "out"
     rows = [{"file": None, "track": "zigzag", "difficulty": 0, "ended_by": "collision"}]
     # The last is too short to be used.
-    flown = (*logs[:2], measured.cut_end(logs[2], logs[2].duration_s - 1.2))
+    flown = (*logs[:2], cut_end(logs[2], logs[2].duration_s - 1.2))
     for log, ended_by in zip(flown, ("collision", "timeout", "finished"), strict=True):
         file = write_flight(flights / f"{ended_by}.parquet", log)
         rows.append({**rows[0], "file": file.name, "ended_by": ended_by})
     (flights / "flights.json").write_text(json.dumps({"flights": rows}))
-    files = measured.add_measurement_noise(flights, out, 0)
+    files = add_measurement_noise(flights, out, 0)
     assert [file.name for file in files] == ["collision.parquet", "timeout.parquet"]
     kept = [read_flights([file])[0][0].duration_s for file in files]
-    assert logs[0].duration_s - kept[0] == pytest.approx(measured.CONTACT_MARGIN_S, abs=0.034)
+    assert logs[0].duration_s - kept[0] == pytest.approx(CONTACT_MARGIN_S, abs=0.034)
     assert logs[1].duration_s == kept[1]
     (flights / "flights.json").write_text(json.dumps({"flights": rows[:1]}))
     with pytest.raises(ValueError, match="no flight in .* is 1.5 s long"):
-        measured.add_measurement_noise(flights, tmp_path / "none", 0)
+        add_measurement_noise(flights, tmp_path / "none", 0)
 
 
 def test_the_diagnosis_gets_five_flights_or_as_many_as_are_long_enough(logs, tmp_path):
     files = [tmp_path / f"{number}.parquet" for number in range(7)]
     for file in files:
         write_flight(file, logs[0])
-    assert measured.first_files(files, 1.0) == files[:5]
-    assert measured.first_files(files, 5.5 * logs[0].duration_s) == files[:6]
-    assert measured.first_files(files, 99.0 * logs[0].duration_s) == files
+    assert first_files(files, 1.0) == files[:5]
+    assert first_files(files, 5.5 * logs[0].duration_s) == files[:6]
+    assert first_files(files, 99.0 * logs[0].duration_s) == files

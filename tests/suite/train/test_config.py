@@ -6,8 +6,18 @@ from dataclasses import replace
 import pytest
 
 from suite.common.console import Console
-from suite.train import losses, overrides
+from suite.train import losses
 from suite.train.config import Phase, TrainConfig, check
+from suite.train.overrides import (
+    check_owned,
+    check_phases,
+    in_every_phase,
+    override,
+    phase_configs,
+    phase_ends,
+    with_changes,
+    without_quadrotor,
+)
 from suite.train.recipes import RECIPES, at_rate, named_recipe, with_iterations, with_model
 from suite.train.run import train
 from tests.support.training import small_config
@@ -34,7 +44,7 @@ def test_worlds_that_cannot_be_made_are_refused_before_anything_is_written(
 def test_settings_are_changed_by_name():
     changes = ["loss.progress=1", "episode.batch = 8", "physics.drag=(0, 0.5)", "seed=3"]
     changes += ["loss.crash_depth_m=inf", "spec.camera.width=48"]
-    config, plain = overrides.override(TrainConfig(), changes), TrainConfig()
+    config, plain = override(TrainConfig(), changes), TrainConfig()
     assert (config.loss.progress, *config.physics.drag) == (1.0, 0.0, 0.5)
     assert {type(one) for one in (config.loss.progress, *config.physics.drag)} == {float}
     assert (config.episode.batch, config.seed, config.loss.crash_depth_m) == (8, 3, math.inf)
@@ -45,20 +55,20 @@ def test_settings_that_would_do_nothing_or_that_the_command_sets_itself_are_refu
     run = named_recipe("race")
     for change in ("physics.wind_std=(3,3,1)", "physics.action_delay=(0,2)"):
         with pytest.raises(ValueError, match=r"is of the point mass.*set one of quadrotor\."):
-            overrides.override(run, [change])
-    assert overrides.override(run, ["physics.image_delay=2"]).physics.image_delay == 2
+            override(run, [change])
+    assert override(run, ["physics.image_delay=2"]).physics.image_delay == 2
     run = named_recipe("race-paper")
     for change, need, given in (
         ("loss.projection_decay=1", "loss.projection", "3"),
         ("episode.race_share=0.9", "spec.speed_input", "True"),
     ):
         with pytest.raises(ValueError, match=rf"has no effect while {need} is (0|False)"):
-            overrides.override(run, [change])
+            override(run, [change])
         both = [change, f"{need}={given}"]
-        assert overrides.override(run, both) == overrides.override(run, both[::-1])
-    overrides.check_owned(["loss.progress=1"], {"loss.prog": "", "spec": ""})
+        assert override(run, both) == override(run, both[::-1])
+    check_owned(["loss.progress=1"], {"loss.prog": "", "spec": ""})
     with pytest.raises(ValueError, match=r"'spec.rate_hz=30': this command sets spec.*; take"):
-        overrides.check_owned(["spec.rate_hz=30"], {"spec": "take another policy"})
+        check_owned(["spec.rate_hz=30"], {"spec": "take another policy"})
 
 
 @pytest.mark.parametrize(
@@ -76,7 +86,7 @@ def test_settings_that_would_do_nothing_or_that_the_command_sets_itself_are_refu
 )
 def test_wrong_settings_are_refused_by_name(change, words):
     with pytest.raises(ValueError) as error:
-        overrides.override(TrainConfig(), [change])
+        override(TrainConfig(), [change])
     assert words in str(error.value) and change in str(error.value)
 
 
@@ -96,7 +106,7 @@ def test_spreads_go_with_the_size_of_the_vehicle_that_is_asked_for():
 
 
 def test_another_rate_keeps_rollouts_and_delays_in_seconds():
-    slow = overrides.phase_configs(named_recipe("race"))[0]
+    slow = phase_configs(named_recipe("race"))[0]
     fast = at_rate(slow, 30.0)
     assert (fast.episode.steps, fast.episode.image_stride) == (180, 6)
     assert fast.physics.action_delay == (0.0, 2.0), "not 3: the point mass holds no more"
@@ -126,36 +136,34 @@ RUN = with_iterations(TrainConfig(phases=PHASES), 10)
 
 
 def test_a_phase_keeps_what_came_before_and_a_change_holds_in_all_or_in_the_one_that_is_named():
-    assert overrides.phase_ends(RUN) == (5, 8, 10)
-    first, second, third = overrides.phase_configs(RUN)
+    assert phase_ends(RUN) == (5, 8, 10)
+    first, second, third = phase_configs(RUN)
     assert [one.optimizer.iterations for one in (first, second, third)] == [5, 3, 2]
     assert [one.loss.progress for one in (first, second, third)] == [1.2, 2.0, 2.0]
     assert [one.spec.rate_hz for one in (first, second, third)] == [15.0, 15.0, 30.0]
     assert all(one.phases == () for one in (first, second, third))
-    assert overrides.phase_configs(TrainConfig()) == (TrainConfig(),)
-    everywhere = overrides.phase_configs(overrides.with_changes(RUN, ["loss.progress=0.4"]))
+    assert phase_configs(TrainConfig()) == (TrainConfig(),)
+    everywhere = phase_configs(with_changes(RUN, ["loss.progress=0.4"]))
     assert [one.loss.progress for one in everywhere] == [0.4] * 3
     assert everywhere[1].optimizer.rate == 1e-3, "other changes of the phase stay"
-    alone = overrides.phase_configs(
-        overrides.with_changes(RUN, ["phases.3.loss.progress=0.4", "loss.jerk=0.5"])
-    )
+    alone = phase_configs(with_changes(RUN, ["phases.3.loss.progress=0.4", "loss.jerk=0.5"]))
     assert [one.loss.progress for one in alone] == [1.2, 2.0, 0.4]
     assert [one.loss.jerk for one in alone] == [0.5] * 3
-    always = overrides.phase_configs(overrides.in_every_phase(RUN, "loss", progress=0.7))
+    always = phase_configs(in_every_phase(RUN, "loss", progress=0.7))
     assert [one.loss.progress for one in always] == [0.7] * 3
     for number in ("0", "4", "x"):
         with pytest.raises(ValueError, match="this run has 3 phases"):
-            overrides.with_changes(RUN, [f"phases.{number}.loss.progress=1"])
-    recipe = overrides.without_quadrotor(named_recipe("race"))
-    overrides.check_phases(recipe)
-    assert all(one.quadrotor is None for one in overrides.phase_configs(recipe))
+            with_changes(RUN, [f"phases.{number}.loss.progress=1"])
+    recipe = without_quadrotor(named_recipe("race"))
+    check_phases(recipe)
+    assert all(one.quadrotor is None for one in phase_configs(recipe))
 
 
 def test_recipes_are_within_the_limits_and_their_phases_share_any_number_of_iterations():
     for recipe in map(named_recipe, RECIPES):
-        overrides.check_phases(recipe)
+        check_phases(recipe)
         for total in (3, 7, 100, 4500, 4501):
-            ends = overrides.phase_ends(with_iterations(recipe, total))
+            ends = phase_ends(with_iterations(recipe, total))
             assert ends[-1] == total and list(ends) == sorted(ends)
 
 
@@ -171,4 +179,4 @@ def test_recipes_are_within_the_limits_and_their_phases_share_any_number_of_iter
 )
 def test_phases_that_cannot_be_trained_are_refused(second, words):
     with pytest.raises(ValueError, match=words):
-        overrides.check_phases(replace(RUN, phases=(Phase(0.5), second)))
+        check_phases(replace(RUN, phases=(Phase(0.5), second)))

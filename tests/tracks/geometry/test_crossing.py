@@ -1,5 +1,6 @@
 """Crossings against a plain geometric check, and what must not change them."""
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given
@@ -61,6 +62,17 @@ def test_repeated_corners_change_nothing():
     point = np.random.default_rng(0).uniform(-1, 1, (500, 2))
     assert np.array_equal(is_inside(padded, point), is_inside(SQUARE, point))
     assert is_inside(padded, np.zeros(2)) and not is_inside(padded, np.array([0.0, 0.51]))
+
+
+def test_any_leading_shape_and_both_libraries():
+    center_w, rot_w, opening, before, after = draw(4, 12)
+    before, after = (to_world(center_w, rot_w, p) for p in (before, after))
+    flat = crossing(center_w, rot_w, opening, before, after)
+    gates = (np.broadcast_to(a, (3, 4, *a.shape)) for a in (center_w, rot_w, opening))
+    shaped = crossing(*gates, before.reshape(3, 4, 3), after.reshape(3, 4, 3))
+    in_jax = jax.jit(crossing)(center_w, rot_w, opening, before, after)
+    for a, b, c in zip(flat, shaped, in_jax, strict=True):
+        assert np.array_equal(a, b.reshape(12)) and np.array_equal(a, np.asarray(c))
 
 
 @pytest.mark.parametrize(("distance", "near"), [(0.34, True), (0.36, False)])

@@ -8,8 +8,17 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from eval.logs.faults import check
 from eval.logs.faults.catalogue import FAULTS
+from eval.logs.faults.check import (
+    CLOCK,
+    DRIVE,
+    POSE,
+    CheckContext,
+    check_files,
+    check_log,
+    run_checks,
+    with_fixes,
+)
 from eval.logs.faults.clock import check_clock
 from eval.logs.faults.drive import commands
 from eval.logs.faults.drive.commands import check_controller_rate
@@ -54,12 +63,12 @@ def logged(seed, end):
 
 def checked(parts, vehicle=VEHICLE, fov=1.0):
     seen_deg = tuple(fov * angle for angle in vehicle.camera.fov_deg)
-    against = check.CheckContext(vehicle, POLICY_HZ, seen_deg)
-    checks = (*check.CLOCK, *check.POSE, lambda rows, _: check_clock(rows), *check.DRIVE)
-    findings, readings, _ = check.run_checks(parts, checks, against, fix=True)
+    against = CheckContext(vehicle, POLICY_HZ, seen_deg)
+    checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
+    findings, readings, _ = run_checks(parts, checks, against, fix=True)
     commands = {name: value for name, value in parts.items() if name != "throttle"}
     findings += check_controller_rate(commands, POLICY_HZ, "the policy")
-    return findings + check.check_files(against), readings
+    return findings + check_files(against), readings
 
 
 def named(findings):
@@ -172,8 +181,8 @@ def test_each_measure_of_the_force_shows_that_z_of_the_position_is_inverted(sour
 @pytest.mark.parametrize("name", ["flight_1", "flight_2", "flight_3"])
 def test_the_examples_flights_show_that_z_of_the_position_is_inverted(name):
     log = read_flight(FOLDER / f"{name}.parquet")
-    assert "position_axes" not in {f.fault for f in check.check_log(log)[0]}
-    findings, readings = check.check_log(check.with_fixes(log, (("pos", "x,y,-z"),)), fix=True)
+    assert "position_axes" not in {f.fault for f in check_log(log)[0]}
+    findings, readings = check_log(with_fixes(log, (("pos", "x,y,-z"),)), fix=True)
     assert named(findings) == {"position_axes"} and readings == (("pos", "x,y,-z"),)
 
 

@@ -9,8 +9,17 @@ import pytest
 import suite.blind.continuous
 from eval.flights.simulate import SENSORS
 from eval.flights.trajectory import Trajectory
-from suite.blind.continuous import timing
 from suite.blind.continuous.body import POS, QUAT, RATE, VEL
+from suite.blind.continuous.timing import (
+    CLOCK_S,
+    COLOUR_S,
+    DROPPED,
+    JITTER,
+    Conditions,
+    draw_conditions,
+    jittered_stamps,
+    schedule,
+)
 from suite.blind.continuous_flight import fly_continuous, with_loop_frequency
 from tests.suite.test_imports import imported
 from tests.support.vehicles import PLAIN, with_effects, with_lag
@@ -44,7 +53,7 @@ def test_a_finer_step_changes_a_flight_by_far_less_than_the_noise(lag):
         battery_sag=(0.005, 0.0),
         rotor_gyroscopic=(2e-5,),
     )
-    conditions = timing.Conditions(333.0, 97.0, 0.3, 0.0, 0.0, 0.0, 0.1)
+    conditions = Conditions(333.0, 97.0, 0.3, 0.0, 0.0, 0.0, 0.1)
 
     def rows(step_s):
         flown = fly_continuous(
@@ -65,7 +74,7 @@ def test_a_finer_step_changes_a_flight_by_far_less_than_the_noise(lag):
 def test_the_error_falls_with_the_fourth_power_of_the_step():
     # Without ticks in between: a loop as slow as the rows, so that steps are as long as allowed.
     truth = with_lag(with_effects(quadratic_drag=((0.5, 0.4, 0.3),)), 0.02)
-    conditions = timing.Conditions(50.0, 50.0, 0.0, 0.0, 0.0, 0.0, 0.1)
+    conditions = Conditions(50.0, 50.0, 0.0, 0.0, 0.0, 0.0, 0.1)
 
     def last(step_s):
         flown = fly_continuous(
@@ -85,7 +94,7 @@ def starts(plan, mask, flight=0):
 
 def test_the_loop_starts_its_period_anew_at_every_row():
     stamps = np.array([[0.0], [0.007], [0.0125], [0.02]])
-    plan = timing.schedule(stamps, 0.003, 0.0, step_s=0.001)
+    plan = schedule(stamps, 0.003, 0.0, step_s=0.001)
     ticks = [0.0, 0.003, 0.006, 0.007, 0.010, 0.0125, 0.0155, 0.0185]
     np.testing.assert_allclose(starts(plan, plan.is_tick), ticks, atol=1e-12)
     assert plan.length_s.max() <= 0.001 + 1e-9
@@ -96,10 +105,10 @@ def test_the_loop_starts_its_period_anew_at_every_row():
 
 def test_a_command_acts_from_its_stamp_on_and_a_late_one_inside_a_period():
     stamps = np.array([[0.0], [0.007], [0.0125], [0.02]])
-    at_once = timing.schedule(stamps, 0.003, 0.0)
+    at_once = schedule(stamps, 0.003, 0.0)
     row = np.searchsorted(stamps[:, 0], at_once.start_s[:, 0] + 1e-9, side="right") - 1
     np.testing.assert_array_equal(at_once.acting[:, 0], row)
-    late = timing.schedule(stamps, 0.003, 0.0042)
+    late = schedule(stamps, 0.003, 0.0042)
     changes = np.flatnonzero(np.diff(late.acting[:, 0])) + 1
     np.testing.assert_allclose(late.start_s[changes, 0], [0.0042, 0.0112, 0.0167], atol=1e-12)
     assert late.acting[0, 0] == -1 and not late.is_tick[changes, 0].any()
@@ -111,10 +120,10 @@ def test_a_command_acts_from_its_stamp_on_and_a_late_one_inside_a_period():
 
 def test_flights_side_by_side_keep_their_own_times():
     rng = np.random.default_rng(2)
-    stamps = timing.jittered_stamps(rng, 3, -0.1, 0.4, 90.0, 0.3)
-    both = timing.schedule(stamps, 1 / 410.0, 0.013)
+    stamps = jittered_stamps(rng, 3, -0.1, 0.4, 90.0, 0.3)
+    both = schedule(stamps, 1 / 410.0, 0.013)
     for flight in range(3):
-        alone = timing.schedule(stamps[:, flight : flight + 1], 1 / 410.0, 0.013)
+        alone = schedule(stamps[:, flight : flight + 1], 1 / 410.0, 0.013)
         moving = both.length_s[:, flight] > 0.0
         assert not both.is_tick[~moving, flight].any(), "who waits does nothing"
         for name in ("start_s", "length_s", "is_tick", "acting"):
@@ -128,7 +137,7 @@ def test_flights_side_by_side_keep_their_own_times():
 
 
 def test_jitter_stays_within_its_share_of_a_row_but_for_the_first():
-    stamps = timing.jittered_stamps(np.random.default_rng(0), 4, -0.25, 5.0, 200.0, 0.3)
+    stamps = jittered_stamps(np.random.default_rng(0), 4, -0.25, 5.0, 200.0, 0.3)
     number = np.round(stamps * 200.0)
     off = stamps * 200.0 - number
     assert np.abs(off).max() <= 0.3 + 1e-9 and np.abs(off).max() > 0.29
@@ -137,26 +146,26 @@ def test_jitter_stays_within_its_share_of_a_row_but_for_the_first():
     assert (np.diff(stamps, axis=0) > 0.4 / 200.0 - 1e-9).all()
     assert stamps[0].max() < -0.24 and stamps[-1].min() > 5.0
     assert np.std(off[:, 0] - off[:, 1]) > 0.1, "each flight has its own"
-    even = timing.jittered_stamps(np.random.default_rng(0), 2, 0.0, 1.0, 100.0, 0.0)
+    even = jittered_stamps(np.random.default_rng(0), 2, 0.0, 1.0, 100.0, 0.0)
     np.testing.assert_allclose(np.diff(even, axis=0), 0.01)
 
 
 def test_conditions_are_within_bounds_and_of_every_kind():
-    drawn = [timing.draw_conditions(np.random.default_rng(seed)) for seed in range(400)]
+    drawn = [draw_conditions(np.random.default_rng(seed)) for seed in range(400)]
     values = {name: np.array([asdict(c)[name] for c in drawn]) for name in asdict(drawn[0])}
     for name, low, high in (
         ("loop_hz", 200.0, 2000.0),
         ("row_hz", 50.0, 1000.0),
-        ("jitter", 0.0, timing.JITTER),
-        ("clock_s", 0.0, timing.CLOCK_S),
-        ("dropped", 0.0, timing.DROPPED),
-        ("colour_s", *timing.COLOUR_S),
+        ("jitter", 0.0, JITTER),
+        ("clock_s", 0.0, CLOCK_S),
+        ("dropped", 0.0, DROPPED),
+        ("colour_s", *COLOUR_S),
     ):
         assert low <= values[name].min() and values[name].max() <= high, name
         assert values[name].min() < low + 0.1 * (high - low), name
         assert values[name].max() > high - 0.1 * (high - low), name
-    assert timing.JITTER == 0.3 and timing.CLOCK_S == 1e-4
+    assert JITTER == 0.3 and CLOCK_S == 1e-4
     assert (values["row_hz"] <= values["loop_hz"]).all()
     assert 0.4 < (values["coloured"] > 0.0).mean() < 0.6
     assert 0.1 < (values["jitter"] == 0.0).mean() < 0.3
-    assert timing.draw_conditions(np.random.default_rng(7)) == drawn[7]
+    assert draw_conditions(np.random.default_rng(7)) == drawn[7]

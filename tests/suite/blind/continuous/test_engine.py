@@ -42,6 +42,12 @@ def test_a_rotors_lag_is_that_of_first_order():
     assert run.state[-1, 0, VEL][2] == pytest.approx(climb, rel=1e-9)
 
 
+def test_steady_wind_is_what_drag_brings_the_vehicle_to():
+    truth = with_effects(linear_drag=((2.0, 2.0, 0.0),), constant_wind=((3.0, -1.0, 0.0),))
+    vel_w = flown(truth, [0.0, 1.0], [(HOVER, 0, 0, 0)]).state[-1, 0, VEL]
+    np.testing.assert_allclose(vel_w, (1 - np.exp(-2.0)) * np.array([3.0, -1.0, 0]), atol=1e-8)
+
+
 def test_the_rate_loop_measures_at_its_ticks_and_at_rows_and_not_at_a_late_command():
     # Held torque: a period of length h moves the rate by K h (command - rate).
     run = flown(PLAIN, [0.0, 0.0037, 0.01], [(HOVER, 0.4, 0, 0), (HOVER, 0.4, 0, 0)])

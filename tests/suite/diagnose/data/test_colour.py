@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.data import colour
+from suite.diagnose.data.colour import (
+    ESTIMATED,
+    Noise,
+    colour_filter,
+    measured_noise,
+    residual_as_noise,
+)
 from suite.diagnose.data.windows import SLICES, cut
 from tests.support.diagnosis_flights import fly_all
 from tests.support.vehicles import PLAIN
@@ -19,7 +25,7 @@ def windows():
 
 def measured(residual, windows):
     """Return the noise of residuals that do not depend on the start."""
-    return colour.measured_noise(residual, np.zeros((*residual.shape, 12)), windows)
+    return measured_noise(residual, np.zeros((*residual.shape, 12)), windows)
 
 
 def noise_like(windows, share, lasts_s, rng, group=GROUP):
@@ -60,7 +66,7 @@ def test_groups_of_one_estimator_have_one_correlation_time(windows):
     pose = SLICES["position"]
     weak[..., pose] = noise_like(windows, 0.9, 0.05, rng, "position")[..., pose]
     coloured = measured(weak, windows).coloured
-    assert set(coloured) == set(colour.ESTIMATED)
+    assert set(coloured) == set(ESTIMATED)
     assert coloured["velocity"][1] == coloured["position"][1] == pytest.approx(0.05, rel=0.4)
     assert coloured["velocity"][0] < 0.1
 
@@ -73,8 +79,8 @@ def test_white_noise_and_a_slow_error_of_the_model_have_no_colour(windows):
 
 
 def test_the_filter_makes_rows_independent(windows):
-    noise = colour.Noise(np.ones(19), {GROUP: (0.85, 0.05)})
-    one = colour.colour_filter(noise, GROUP, windows)
+    noise = Noise(np.ones(19), {GROUP: (0.85, 0.05)})
+    one = colour_filter(noise, GROUP, windows)
     values = noise_like(windows, 0.85, 0.05, np.random.default_rng(2))[..., SLICES[GROUP]]
     white = one @ values
     neighbours = (white[:, 1:] * white[:, :-1]).mean() / (white**2).mean()
@@ -88,7 +94,7 @@ def test_where_the_model_lacks_something_the_whole_residual_counts_as_noise(wind
     swing = np.sin(6.0 * windows.row_s[..., None] + rng.uniform(0.0, 6.0, (len(residual), 1, 3)))
     residual[..., SLICES["velocity"]] += 8.0 * swing
     nothing = np.zeros((*residual.shape, 12))
-    noise = colour.residual_as_noise(residual, nothing, windows)
+    noise = residual_as_noise(residual, nothing, windows)
     np.testing.assert_allclose(noise.sigma[SLICES["velocity"]], 8.0 / np.sqrt(2.0), rtol=0.3)
     share, lasts_s = noise.coloured["velocity"]
     assert share > 0.95 and lasts_s > 0.1
