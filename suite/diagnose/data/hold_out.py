@@ -65,8 +65,7 @@ def parted(
     fitted_part, held_part, names = _split(flights, held, limits)
     main = flights.views[0]
     for what, part in (("to fit", fitted_part), ("held out", held_part)):
-        # The bumps of a view are half a width apart.
-        flown_s = sum(len(one.form.middle_s) for one in part[main.name]) * main.width_s / 2.0
+        flown_s = sum(len(one.form.middle_s) for one in part[main.name]) * main.spacing_s
         if flown_s < limits.least_view_s:
             raise ValueError(
                 f"{', '.join(flights.names)}: {flown_s:.1f} s of usable flight {what}, at least "

@@ -134,6 +134,11 @@ class View:
     axes: tuple[int, ...] = (0, 1, 2)
     """Body axes along which the accelerations are identifiable."""
 
+    @property
+    def spacing_s(self) -> float:
+        """Time between the middles of neighbouring bumps [s]."""
+        return 0.5 * self.width_s
+
 
 FORCE = View(
     "force", "translation under the measured attitude and thrust", "m/s^2", slice(0, 3), 0.2, True

@@ -59,8 +59,8 @@ class ViewSource(Source):
         }
         floor = float(np.sqrt(self._noise_power))
         offset = rms_length(data.residual - within)
-        # Means of flights are independent. Moments are half a width apart.
-        block = 1 if self.held.means else round(2.0 * self.limits.view_block_s / self.view.width_s)
+        # Means of flights are independent.
+        block = 1 if self.held.means else round(self.limits.view_block_s / self.view.spacing_s)
         return Gap(energy, energy, {self.name: channels}, floor, offset, block)
 
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
