@@ -114,19 +114,22 @@ def drawn(rng: np.random.Generator, duration_s: float = 8.0) -> Fleet:
     return Fleet(replace(truth, effects=blown), ways, scale)
 
 
-def truths(fleet: Fleet, drive: str, told: str = "xyz") -> Mapping[str, tuple[float, ...]]:
-    """Return the true values of all that may be told, by their key in a vehicle file.
+def truths(fleet: Fleet, drive: str, identified: str = "xyz") -> Mapping[str, tuple[float, ...]]:
+    """Return the true values of all numbers that may be identified, by key of a vehicle file.
 
-    The torque coefficient is that which goes with what else is in the file then: the inertia about
-    z, which follows those about the axes `told` where it was not, and the thrust coefficient,
-    which only rotor speeds tell. Flapping goes with the rotors' speeds, so with that as well.
+    Only ratios of some numbers are identifiable. So the torque coefficient is the one that belongs
+    to the file's other numbers. If the inertia about z is not among the axes `identified`, it is
+    scaled like those that are. The thrust coefficient is identifiable from rotor speeds only. The
+    coefficient of flapping depends on the rotor speeds, and so on the thrust coefficient.
     """
     true, begun = fleet.truth, start()
     assert true.motors is not None
     ratio = np.asarray(true.inertia) / begun.inertia
     twist = true.rotors.torque_coefficient
-    if "z" not in told:
-        twist *= float(np.sqrt(np.prod([ratio["xy".index(axis)] for axis in told])) / ratio[2])
+    if "z" not in identified:
+        twist *= float(
+            np.sqrt(np.prod([ratio["xy".index(axis)] for axis in identified])) / ratio[2]
+        )
     flapping = true.effects[FLAPPING].coefficient
     if drive != "rotors":
         ratio_t = begun.rotors.thrust_coefficient / true.rotors.thrust_coefficient

@@ -1,8 +1,8 @@
 """Simulated flights of vehicles whose numbers are known, to judge the identification by.
 
 A fleet is one vehicle on its flights, flown in MuJoCo under its nominal loop and logged with noise
-that is white from row to row. What the motors were told is worked out backwards from how their
-rotors turned.
+that is white from row to row. The commands of the motors are computed backwards from the speeds of
+their rotors.
 """
 
 from __future__ import annotations

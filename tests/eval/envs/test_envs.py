@@ -305,7 +305,7 @@ def test_a_picture_shows_the_track_from_behind_the_drone_and_what_it_sees():
     assert picture is not None and (picture.shape, picture.dtype) == ((360, 640, 3), np.uint8)
     assert share(picture, colours.AHEAD, 50) > 3e-3 and share(picture, colours.DRONE, 12) > 5e-4
     depth_m = env._races.view().depth_m[0]
-    want = colours.depth_colours(depth_m, env.spec_of_policy.camera.range_m)
+    want = colours.depth_colours(depth_m, env._races.spec.camera.range_m)
     np.testing.assert_array_equal(picture[-120:, -160:][2::5, 2::5], want)
     env.reset(options={"track_seed": 2})
     fresh = RaceEnv(track="circular", track_seed=2, render_mode="rgb_array")

@@ -277,13 +277,20 @@ def test_without_noise_the_models_own_error_is_no_finding(vehicle, drive):
 
 @pytest.mark.slow
 def test_commands_between_the_rows_of_a_log_are_no_effect(monkeypatch):
+    """If the log has every command, its slow rows limit nothing."""
     uncertain = list[bool]()
     monkeypatch.setattr(RolloutSource, "is_relevant", lambda *_: True)
     monkeypatch.setattr(rollout_source, "structure_where", lambda *got: uncertain.append(got[2]))
     logs = flights(LAGGED, duration_s=5.0, noise=0.1)
     found = diagnose([rows_of(log, slice(0, None, 2)) for log in logs], LAGGED, drive="commands")
-    assert (found.verdict.label, found.named, uncertain) == ("no_gap", [], [True])
+    assert (found.verdict.label, found.named) == ("no_gap", [])
     assert LACKING in found.warnings
+
+    monkeypatch.setattr(diagnosis_flights, "EVERY", 10)
+    found = diagnose(flights(LAGGED, duration_s=5.0, noise=0.1), LAGGED, drive="commands")
+    assert (found.verdict.label, found.named) == ("no_gap", [])
+    assert LACKING not in found.warnings
+    assert uncertain == [True, False], "the noise counts as certain only if no command is lacking"
 
 
 def test_the_noise_counts_as_certain_only_if_no_command_is_lacking(monkeypatch):

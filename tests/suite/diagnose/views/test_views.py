@@ -64,6 +64,15 @@ def test_an_inertia_is_named_though_the_trim_of_each_flight_is_larger():
     assert found.main.after.energy.sum() < found.main.before.energy.sum()
 
 
+@pytest.mark.slow
+def test_a_slow_effect_is_no_noise_with_a_memory_however_long_the_flights():
+    logs = flights(4, seed=6, duration_s=20.0, battery_sag=(0.004, 0.0))
+    found = diagnose(logs, VEHICLE, by="views")
+    ((_, name),) = found.named
+    assert name.candidate.name == "battery_sag" and 0.8 < name.share < 1.0
+    assert found.vehicle.effects["battery_sag"].rate == pytest.approx(0.004, rel=0.05)
+
+
 def test_an_attitude_alone_shows_the_torque_as_finely_as_a_gyro():
     moved = flights(4, 5, 5.0, com_offset=((0.006, -0.002, 0.0),))
     lost, about = np.full_like(moved[0].rate_b, np.nan), {"partial": ["rate"]}

@@ -35,8 +35,7 @@ def before():
     return {view.name: task_of(logs, view) for view in (FORCE, TORQUE)}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("share", [0.8, 1.0])
+@pytest.mark.parametrize("share", [0.8, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_a_change_stands_out_of_how_flights_differ_though_the_file_is_wrong(before, share):
     motor = {"weak_motor": ((1.0, 1.0, share, 1.0),)} if share < 1.0 else {}
     logs = flights(3, 6, 5.0, 1.0, thrust_scale=(0.9,), linear_drag=(DRAG,), **motor)
