@@ -231,8 +231,7 @@ def register_simulator(name: str, simulator: Any) -> None:
 
 
 def _console(progress: bool) -> Console:
-    from suite.common.console import Console
-    from suite.common.work import Silent
+    from suite.common.console import Console, Silent
 
     return Console() if progress else Silent()
 

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 import psutil
 
-from suite.common.work import Silent
+from suite.common.console import Silent
 from tracks.common.work import Workers, read_workers, run_pieces
 from tracks.common.work.pickling import pack
 from tracks.common.work.threads import set_threads

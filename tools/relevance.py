@@ -33,8 +33,8 @@ from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import Vehicle, with_effects
 from eval.worlds import nearest
 from suite.blind.oracle.information import Column
+from suite.common.console import Silent
 from suite.common.startup import keep_compiled
-from suite.common.work import Silent
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.evidence.rollouts import rollouts_along
 from suite.diagnose.report.diagnosis_json import diagnosis_json

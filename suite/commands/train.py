@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from suite.commands.list import list_settings
-from suite.common.console import Console
+from suite.common.console import Console, Silent
 from suite.common.curve import tensorboard
 from suite.common.options import Advanced, Command
 from suite.common.running.hosts import ProcessOptions, connect, read_member
 from suite.common.startup import use_device
-from suite.common.work import Silent
 from suite.train.config import TrainConfig
 from suite.train.overrides import check_phases, with_changes
 from suite.train.recipes import (

@@ -106,6 +106,24 @@ class Quiet(Console):
         """Print nothing."""
 
 
+class Silent(Quiet):
+    """A console that prints nothing."""
+
+    def note(self, text: str) -> None:
+        """Print nothing."""
+
+    @contextmanager
+    def progress(
+        self, label: str, total: float, clock: object = None, begun: float = 0.0
+    ) -> Iterator[Update]:
+        """Show nothing."""
+
+        def update(done: float, note: str = "") -> None:
+            del done, note
+
+        yield update
+
+
 @contextmanager
 def _bar(label: str, total: float, begun: float) -> Iterator[Update]:
     """Show a progress bar on a terminal; yields the function that updates it."""

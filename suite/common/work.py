@@ -7,13 +7,15 @@ option `--workers`: a number of processes, or the address of the scheduler of a 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
-from typing import Annotated, Any, TypeVar
+from queue import SimpleQueue
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import tyro
 
-from suite.common.console import Console, Quiet, Update
+from suite.common.console import Console, Silent, Update
 from suite.common.errors import WorkFailed
 from suite.common.options import Advanced
 from suite.common.running.remote import Job, do_remotely, parcels, replace_content
@@ -29,20 +31,21 @@ WorkersOption = Advanced[
 """Type of the option `--workers`; `read_workers_option` reads it."""
 
 
-class Silent(Quiet):
-    """A console that prints nothing, for parallel jobs, whose lines would mix."""
+class Forwarding(Silent):
+    """A console for a job in another process: it prints nothing, and forwards the progress."""
 
-    def note(self, text: str) -> None:
-        """Print nothing."""
+    def __init__(self, forward: Callable[[float], None]) -> None:
+        """Make a console that calls `forward` with the finished share of the job, from 0 to 1."""
+        self._forward = forward
 
     @contextmanager
     def progress(
         self, label: str, total: float, clock: object = None, begun: float = 0.0
     ) -> Iterator[Update]:
-        """Show nothing."""
+        """Forward the progress of a long piece of work."""
 
         def update(done: float, note: str = "") -> None:
-            del done, note
+            self._forward(done / total)
 
         yield update
 
@@ -83,8 +86,8 @@ def do_jobs(
         jobs: the jobs; afterwards their folders have the products.
         workers: None or 1 is this process, on all cores. Several processes of this machine are
             pinned to separate cores. Processes of a cluster get the content of folders.
-        console: shows the number of finished jobs. In this process `do` gets it too; in other
-            processes `do` gets a silent one.
+        console: shows the progress of all jobs together. In this process `do` gets it; in other
+            processes `do` gets one that forwards its progress (on a cluster none).
         title: short description of the jobs.
 
     Raises:
@@ -95,22 +98,28 @@ def do_jobs(
     if workers is None or workers == 1:
         return [do(job, console) for job in jobs]
     results: dict[int, Result] = {}
+    shares = [0.0] * len(jobs)
     with console.progress(title, len(jobs)) as update:
 
         def keep(number: int, result: Any) -> None:
-            """Store the result of a job; from a cluster it also has the files of the folder."""
-            if isinstance(workers, str):
-                result, files = result
+            """Store the result of a job, or show its progress."""
+            if isinstance(result, _Share):
+                shares[number] = max(shares[number], result.value)
+            elif isinstance(workers, str):
+                # From a cluster a result also has the files of the folder.
+                results[number], files = result
                 replace_content(jobs[number].folder, files)
-            results[number] = result
-            update(len(results))
+                shares[number] = 1.0
+            else:
+                results[number], shares[number] = result, 1.0
+            update(round(sum(shares), 2))
 
         try:
             if isinstance(workers, str):
                 work = partial(do_remotely, partial(_do_silently, do))
                 run_pieces(work, parcels(jobs), workers, keep)
             else:
-                run_pieces(partial(_yield_result, do), jobs, workers, keep, pinned=True)
+                run_pieces(partial(_do_with_progress, do), jobs, workers, keep, pinned=True)
         except WorkerDied as error:
             raise WorkFailed(
                 f"{title}: a process died; the products of the others are kept. Repeat the command "
@@ -119,12 +128,27 @@ def do_jobs(
     return [results[number] for number in range(len(jobs))]
 
 
+class _Share(NamedTuple):
+    """Message of a worker process: the finished share of its job."""
+
+    value: float
+
+
 def _do_silently(do: Callable[[Job, Console], Result], job: Job) -> Result:
     """Do a job in a worker process, without output."""
     share_threads()
     return do(job, Silent())
 
 
-def _yield_result(do: Callable[[Job, Console], Result], job: Job) -> Iterator[Result]:
-    """Do a job in a worker process and yield its one result, as `run_pieces` expects."""
-    yield _do_silently(do, job)
+def _do_with_progress(do: Callable[[Job, Console], Result], job: Job) -> Iterator[_Share | Result]:
+    """Do a job in a worker process; yields its progress, and then its result.
+
+    The job has a thread of its own, since its console cannot yield.
+    """
+    share_threads()
+    messages: SimpleQueue[_Share | None] = SimpleQueue()
+    with ThreadPoolExecutor(1) as thread:
+        result = thread.submit(do, job, Forwarding(lambda share: messages.put(_Share(share))))
+        result.add_done_callback(lambda _: messages.put(None))
+        yield from iter(messages.get, None)
+        yield result.result()
