@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -21,13 +22,19 @@ MEASURED, BEFORE, AFTER = "#1d2430", "#8b93a1", "#2463c9"
 
 
 def series_chart(series: Series) -> bytes:
-    """Draw a held-out stretch, measured and simulated, as a PNG."""
+    """Draw held-out flights, measured and simulated, as a PNG."""
     figure = Figure(figsize=(9.0, 3.1), layout="constrained")
     axes = figure.subplots()
-    axes.plot(series.time_s, series.measured, color=MEASURED, lw=1.6, label="measured")
+    measured: dict[str, Any] = {"lw": 1.6}
+    simulated: dict[str, Any] = {"lw": 1.4}
+    if series.x_label == "flight":
+        measured = {"ls": "", "marker": "o", "ms": 9.0, "mfc": "none"}
+        simulated = {"ls": "", "marker": "x", "mew": 2.0}
+        axes.set_xticks(series.x)
+    axes.plot(series.x, series.measured, color=MEASURED, label="measured", **measured)
     for (label, values), colour in zip(series.simulated.items(), (BEFORE, AFTER), strict=False):
-        axes.plot(series.time_s, values, color=colour, lw=1.4, label=label)
-    axes.set_xlabel("time [s]", fontsize=8)
+        axes.plot(series.x, values, color=colour, label=label, **simulated)
+    axes.set_xlabel(series.x_label, fontsize=8)
     figure.legend(fontsize=8, frameon=False, ncols=3, loc="outside lower center")
     titled(axes, superscripts(series.label))
     return png(figure)

@@ -122,20 +122,27 @@ def _mismatch(mismatch: Mapping[str, Any]) -> Grid:
 
 
 LEAST_P = 0.0005
-"""P-values up to this are not printed. The null distribution (without any effect) has about two
-thousand draws, so smaller values are not resolved."""
+"""P-values up to this are not printed. The null distribution (without any effect) has some thousand
+draws, so smaller values are not resolved."""
+ALONE = (
+    "All {count} candidates, each fitted alone before anything was named. The gain is the fall of "
+    "the whitened squared error on stretches that were left out of its fit."
+)
+CHANGED = (
+    "The candidates whose gain is close to the best, each fitted alone before anything was named. "
+    "The gain is the fall of the whitened squared error of the flights' means, less two for each "
+    "fitted number."
+)
+"""Explanations of the table of candidates; the second is for a change since reference flights."""
 
 
 def candidates_section(diagnosis: Diagnosis) -> Section:
     """Return the gain of each candidate when it is fitted alone, for each source of evidence."""
     parts: list[Part] = []
     for finding in diagnosis.findings:
-        scores, limits = finding.search.first, finding.source.limits
+        scores = finding.search.first
         if not scores:
             continue
-        chance = ""
-        if scores[0].chance > 0.0:
-            chance = f" By chance the best gain is above {scores[0].chance:.1f} once in 100."
         named = {candidate.label for candidate in finding.search.candidates}
         rows = [
             (
@@ -146,13 +153,14 @@ def candidates_section(diagnosis: Diagnosis) -> Section:
             )
             for s in scores
         ]
-        words = (
-            f"All {len(scores)} candidates, each fitted alone before anything was named. The gain "
-            "is the fall of the whitened squared error on stretches that were left out of its fit; "
-            "p is the probability that the best of all candidates gains as much by chance, left "
+        words = CHANGED if diagnosis.references else ALONE.format(count=len(scores))
+        words += (
+            f" P is the probability that the best of all candidates gains as much by chance, left "
             f"out up to {LEAST_P:g}. Effects are named one after another while p is at most "
-            f"{limits.name_p_value:g}; then all are refitted jointly.{chance}"
+            f"{finding.search.judged.evidence.name_p_value:g}; then all are refitted jointly."
         )
+        if scores[0].chance > 0.0:
+            words += f" By chance the best gain is above {scores[0].chance:.1f} once in 100."
         title = finding.source.name.capitalize()
         parts.append(grid(title, ["effect", "gain", "p", ""], rows, words))
     return Section("The candidates", parts)
@@ -271,8 +279,8 @@ AGREEMENT = (
 def agreement_section(diagnosis: Diagnosis) -> Section:
     """Return what each source compares, and how much each flight supports the named effects."""
     parts: list[Part] = [
-        f"{finding.source.name}: {finding.source.about}, in means or stretches of "
-        f"{finding.source.horizon_s:g} s; driven by {diagnosis.flights.driven_by}."
+        f"{finding.source.name}: {finding.source.about}, in {finding.source.window}; "
+        f"driven by {diagnosis.flights.driven_by}."
         for finding in diagnosis.findings
     ]
     for finding, named in diagnosis.named:

@@ -34,6 +34,7 @@ USE = (
     "Use the corrected vehicle: give the new vehicle.toml, in --out, to suite eval, train and loop "
     "(--vehicle)."
 )
+UNTESTED = "Whether the file itself is right was not tested: for that, leave out --reference."
 CHECK = "Run suite check on these logs: a wrong unit, sign, order or clock resembles physics."
 
 
@@ -128,73 +129,78 @@ def next_steps(result: Mapping[str, Any]) -> list[str]:
     Args:
         result: content of diagnosis.json.
     """
-    return list(_STEPS[result["verdict"]](result))
+    use, search_for = USE, _search_for(result["unexplained"])
+    steps = {
+        "no_gap": [
+            "Use the vehicle file as it is.",
+            "If your task is faster than these flights, fly faster or turn harder, and repeat "
+            "this.",
+        ],
+        "unknown": [
+            CHECK,
+            "suite identify wrote this vehicle file: repeat it if the vehicle has changed since."
+            if result.get("identified")
+            else "Run suite identify if the numbers of the vehicle file were never estimated.",
+            *search_for,
+            "Otherwise add an effect to the catalogue, or fit a correction with suite delta.",
+        ],
+    }
+    if result["reference"]:
+        use = f"{USE} It is your file with this change. {UNTESTED}"
+        steps["no_gap"] = [f"Keep the vehicle file that you use. {UNTESTED}"]
+        steps["unknown"] = [CHECK, "Look for what was changed on the vehicle.", *search_for]
+    separate = _separate(result)
+    return {
+        "named": [
+            use,
+            *separate,
+            "Or remove the cause on the vehicle, fly again and repeat this: expect no_gap.",
+        ],
+        "partly": [
+            f"{use} Its values are approximate; on held-out flights it is closer than your file.",
+            *separate,
+            CHECK,
+            *search_for,
+        ],
+        **steps,
+    }[result["verdict"]]
 
 
-def _no_gap(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the advice for the verdict `no_gap`."""
-    yield "Use the vehicle file as it is."
-    yield "If your task is faster than these flights, fly faster or turn harder, and repeat this."
-
-
-def _separate(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield advice for each named effect that has alternatives."""
+def _separate(result: Mapping[str, Any]) -> list[str]:
+    """Return advice for each named effect that has alternatives."""
+    steps = []
     for effect in result["effects"]:
         if effect["alternatives"]:
             names = ", ".join([effect["name"], *effect["alternatives"]])
             start = f"{effect['name']} from "
             flights = [line for line in result["separate_with"] if line.startswith(start)]
-            yield (
+            steps.append(
                 f"These flights do not separate {names}. Decide by what is known of the vehicle, "
                 f"or fly what separates {'; '.join(flights)}. suite diagnose --plan writes such "
                 "flights."
             )
+    return steps
 
 
-def _explained(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the advice for the verdict `named`."""
-    yield USE
-    yield from _separate(result)
-    yield "Or remove the cause on the vehicle, fly again and repeat this: expect no_gap."
-
-
-def _partly(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the advice for the verdict `partly`."""
-    yield f"{USE} Its values are approximate; on held-out flights it is closer than your file."
-    yield from _separate(result)
-    yield CHECK
-    yield from _unexplained(result)
-
-
-def _unknown(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the advice for the verdict `unknown`."""
-    yield CHECK
-    if result.get("identified"):
-        yield "suite identify wrote this vehicle file: repeat it if the vehicle has changed since."
-    else:
-        yield "Run suite identify if the numbers of the vehicle file were never estimated."
-    yield from _unexplained(result)
-    yield "Otherwise add an effect to the catalogue, or fit a correction with suite delta."
-
-
-def _unexplained(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield advice on the remaining error: what it depends on, and an oscillating force."""
-    where = result["unexplained"]["where"]
-    if where:
-        yield superscripts(
-            f"Search for the cause of the unexplained error: {where}. The report's section "
-            "Remaining error has its size, and the quantities that it depends on."
+def _search_for(unexplained: Mapping[str, Any]) -> list[str]:
+    """Return advice on the remaining error: what it depends on, and an oscillating force."""
+    steps = []
+    if unexplained["where"]:
+        steps.append(
+            superscripts(
+                f"Search for the cause of the unexplained error: {unexplained['where']}. The "
+                "report's section Remaining error has its size, and the quantities that it "
+                "depends on."
+            )
         )
-    swing = result["unexplained"].get("swing")  # an oscillating force, as of a load on a line
-    if swing:
-        yield (
+    if swing := unexplained.get("swing"):  # an oscillating force, as of a load on a line
+        steps.append(
             "If the vehicle carries a load on a line, weigh it and write mass and length = "
             f"{swing['length_m']:.2g} into [effects.slung_load] of the vehicle file."
         )
+    return steps
 
 
-_STEPS = {"no_gap": _no_gap, "named": _explained, "partly": _partly, "unknown": _unknown}
-"""Functions that yield the advice, by verdict."""
 LEAST_SHOWN = 0.001
 """A smaller gap is printed as "less than" this value, in the unit of the gap (times the noise,
 m/s^2 or rad/s^2)."""

@@ -66,8 +66,8 @@ class Remaining(NamedTuple):
 class Series(NamedTuple):
     """A held-out stretch as measured and as simulated, for a chart of N points."""
 
-    time_s: np.ndarray
-    """(N,) time of each point [s]; NaN where a line breaks."""
+    x: np.ndarray
+    """(N,) time of each point [s], or number of its flight; NaN where a line breaks."""
     measured: np.ndarray
     """(N,) measured values."""
     simulated: Mapping[str, np.ndarray]
@@ -76,6 +76,8 @@ class Series(NamedTuple):
     """Label of the vertical axis: quantity, direction and unit."""
     caption: str
     """Text below the chart."""
+    x_label: str = "time [s]"
+    """Label of the horizontal axis; with "flight" each point is a flight of its own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +99,8 @@ class Source(ABC):
     """For people: definition of the gap."""
     horizon_s: float
     """Length of the windows over which the gap is measured [s]."""
+    window: str
+    """For people: the windows over which the gap is measured."""
     weighed: tuple[Evidence, Block]
     """The fitted flights with the weights of their residuals, and the linearisation of these
     residuals, both at the start of the search."""

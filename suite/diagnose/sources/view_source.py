@@ -8,7 +8,6 @@ and whether structure remains beyond the named effects.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,8 +17,7 @@ from suite.diagnose.data.view import FlightRows, SmoothedFlight, View
 from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.evidence.moments import centred, means_of, validation_groups
 from suite.diagnose.evidence.views import ViewBlock, ViewEvidence
-from suite.diagnose.search.change import search_motion_change
-from suite.diagnose.search.evaluation import Evaluation, SearchResult
+from suite.diagnose.search.evaluation import SearchResult
 from suite.diagnose.sources.source import Remaining, Series, Source, sizes_by_effect
 from suite.diagnose.verdict.disturbances import residual_swing
 from suite.diagnose.verdict.gap import Channel, EffectSize, Gap, rms_length, view_size
@@ -43,15 +41,15 @@ class ViewSource(Source):
     floor: np.ndarray
     """(3,) standard deviation of a mean acceleration that measurement noise causes, by body axis
     [the view's unit]."""
+    reason = UNPREDICTED
+    """Why an error above the noise floor does not count as structure, see `Remaining.reason`."""
     all_flights: ViewEvidence | None = None
     """All flights, to search for an oscillating force; None in a torque view."""
 
     def gap(self, found: SearchResult, theta: np.ndarray) -> Gap:
         """Return the gap on the held-out flights, see `Source`."""
         data = self.held.residuals(theta)
-        # A flight's mean error (its trim) is no error within the flight, and is subtracted. Where
-        # only means of flights are compared, there is nothing to subtract.
-        within = data.residual if self.held.means else centred(data.residual, data.flight)
+        within = self._within(data.residual, data.flight)
         error = np.sqrt((within**2).mean(axis=0))
         energy = (within**2).sum(axis=1)
         channels = {
@@ -59,9 +57,19 @@ class ViewSource(Source):
         }
         floor = float(np.sqrt(self._noise_power))
         offset = rms_length(data.residual - within)
-        # Means of flights are independent.
-        block = 1 if self.held.means else round(self.limits.view_block_s / self.view.spacing_s)
-        return Gap(energy, energy, {self.name: channels}, floor, offset, block)
+        return Gap(energy, energy, {self.name: channels}, floor, offset, self.block)
+
+    @property
+    def block(self) -> int:
+        """Number of neighbouring means that a bootstrap draws together."""
+        return round(self.limits.view_block_s / self.view.spacing_s)
+
+    def _within(self, residual: np.ndarray, flight: np.ndarray) -> np.ndarray:
+        """Return the `residual` (M, 3) without each flight's mean (its trim).
+
+        A mean is no error within the flight. `flight` (M,) is the number of each row's flight.
+        """
+        return centred(residual, flight)
 
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
         """Return the sizes of the named effects on the fitted flights, see `Source`."""
@@ -104,7 +112,7 @@ class ViewSource(Source):
             structured,
             beyond,
             where,
-            NO_AGREEMENT if self.held.means else UNPREDICTED,
+            self.reason,
             explainable,
             swing=swing,
             gap_details={"closed": closed, "explainable": explainable},
@@ -140,12 +148,7 @@ class ViewSource(Source):
         assert isinstance(evidence, ViewEvidence)
         before = self.held.residuals(found.start.theta)
         after = self.held.residuals(found.estimate.theta)
-        spread = np.where(np.isfinite(evidence.repeatability), evidence.repeatability, np.nan)
-        # Means of flights have no error within flights for a black box to explain.
-        if self.held.means:
-            power = (before.residual**2).mean(axis=0)
-            closed = 1.0 - (after.residual**2).mean(axis=0) / np.maximum(power, TINY)
-            return Shares(closed, np.maximum(closed, 0.0), np.zeros(3), power, spread)
+        spread = self._repeatability(found)
         # Fit one black box to the error of the given vehicle, and a second one to the error that
         # remains with the named effects. Both are tested on the held-out flights.
         inputs, held_inputs = (
@@ -168,6 +171,12 @@ class ViewSource(Source):
         )
         variance = (centred(before.residual, before.flight) ** 2).mean(axis=0)
         return Shares(closed, np.maximum(explainable, closed), with_both - closed, variance, spread)
+
+    def _repeatability(self, found: SearchResult) -> np.ndarray:
+        """Return the standard deviation (3,) of the flights' means; NaN with too few flights."""
+        evidence = found.last.evidence
+        assert isinstance(evidence, ViewEvidence)
+        return np.where(np.isfinite(evidence.repeatability), evidence.repeatability, np.nan)
 
     def series(self, found: SearchResult) -> Series:
         """Return the stretch of a held-out flight that the named effects change most.
@@ -200,29 +209,6 @@ class ViewSource(Source):
             f"{quantity} along body {'xyz'[axis]} [{self.unit}]",
             "A stretch of a held-out flight, with its constant offset.",
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class MotionSource(ViewSource):
-    """Source for a change since reference flights that shows only in motion.
-
-    It is the fallback of the source that compares means of flights: it is searched if no mean has
-    changed.
-    """
-
-    reference: ViewEvidence
-    """The reference flights, before the change."""
-    fitted: ViewEvidence
-    """The flights after the change."""
-    views: int
-    """Number of views that are searched; the search corrects for it."""
-
-    def search(self, say: Callable[[str], None], seed: int) -> SearchResult:
-        """Search for an effect that has changed since the reference flights, see `Source`."""
-        found = search_motion_change(self.reference, self.fitted, self.candidates, self.views)
-        evidence, block = self.weighed
-        unchanged = Evaluation(evidence, self.start, block)
-        return found or SearchResult((), self.start, unchanged, unchanged, [])
 
 
 class Shares(NamedTuple):

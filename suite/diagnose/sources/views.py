@@ -7,39 +7,32 @@ the reference flights instead.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from eval.effects import EFFECTS
-from suite.diagnose.data.flights import ViewFlights, ready
+from suite.diagnose.data.flights import ready
 from suite.diagnose.data.hold_out import choose_held_out, parted
 from suite.diagnose.data.inertial import UNSEEN, is_inertial
 from suite.diagnose.data.view import View
 from suite.diagnose.estimate.composites import composites
-from suite.diagnose.estimate.parameters import Candidate, candidates, make_space
+from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
-from suite.diagnose.search.change import (
-    RotorSpread,
-    change_evidence,
-    less_reference_residual,
-    rotor_spread,
-)
+from suite.diagnose.sources.change import references_of, since_reference, spread_words
 from suite.diagnose.sources.source import DiagnosisInput, Source, SourceSet
-from suite.diagnose.sources.view_source import MotionSource, ViewSource
+from suite.diagnose.sources.view_source import ViewSource
 from suite.diagnose.verdict.actuators import find_rotor_lag
 
 BASE_S, ROW_S = 5.0, 4e-4
 """Estimated duration on two cores: fixed part, and for each row [s]."""
 MEASURE = (
     "RMS over the axes of the residual of {about} on held-out flights [{unit}], both "
-    "sides smoothed over {width:g} s"
+    "sides smoothed over {width:g} s, without each flight's constant offset"
 )
-OFFSETS = ", without each flight's constant offset"
-"""End of the definition, except where means of flights are compared."""
 
 
 def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | None:
@@ -75,7 +68,7 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
         for view in flights.views
     }
     # `earlier` is the evidence of the reference flights by view; empty if there are none.
-    earlier, spread, left_out = _references(given, flights, evidence)
+    earlier, spread, left_out = references_of(given, flights, evidence)
     rows = min(sum(len(log.time_s) for log in logs), limits.most_rows)
     about = ", ".join(view.about for view in flights.views)
     given.say(f"views: {about}; by {flights.source}; {rows} rows: "
@@ -87,11 +80,12 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
     start_s = np.zeros(len(information))
     is_fitted, _ = choose_held_out(logs, block.flight, start_s, information, limits)
     held_numbers = sorted({*block.flight.tolist()} - {*block.flight[is_fitted].tolist()})
-    fitted, held, held_names = parted(flights, held_numbers, limits)
+    parts = parted(flights, held_numbers, limits)
     # Make one source for each view.
     sources = []
-    for name, one in evidence.items():
-        to_fit, held_out = (replace(one, flights=part[name]) for part in (fitted, held))
+    for name in parts.fitted:
+        one = evidence[name]
+        to_fit, held_out = (replace(one, flights=p[name]) for p in (parts.fitted, parts.held))
         shared: dict[str, Any] = {
             **_descriptions(one.view),
             "limits": limits,
@@ -101,7 +95,7 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
             # Of logs that lack a required signal only the means of flights are compared.
             partial = any(log.partial for log in [*logs, *references])
             sources.append(
-                _since_reference(earlier[name], to_fit, held_out, spread, allowed, partial, shared)
+                since_reference(earlier[name], to_fit, held_out, spread, allowed, partial, shared)
             )
             continue
         weighed = to_fit.estimate_noise(to_fit.start)
@@ -116,110 +110,20 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
     lag = None if references else find_rotor_lag(logs, vehicle, limits)
     return SourceSet(
         tuple(sources),
-        held_names,
+        parts.names,
         flights.source,
-        (*flights.notes, *not_shown, *left_out),
+        (*flights.notes, *parts.notes, *not_shown, *left_out),
         (lag,) if lag else (),
-        _spread_words(spread, len(references)),
+        spread_words(spread, len(references)),
     )
 
 
 def _descriptions(view: View) -> dict[str, Any]:
     """Return the fields of a source that depend only on its view, by name."""
     about = {"about": view.about, "unit": view.unit}
-    measure = MEASURE.format(**about, width=view.width_s) + OFFSETS
+    measure = MEASURE.format(**about, width=view.width_s)
     return {
         **about, "name": view.name, "view": view, "horizon_s": view.width_s, "measure": measure,
+        "window": f"means of {view.width_s:g} s",
         "subject": f"error of the {view.name}",
     }  # fmt: skip
-
-
-def _since_reference(
-    reference: ViewEvidence,
-    evidence: ViewEvidence,
-    held: ViewEvidence,
-    spread: RotorSpread,
-    allowed: Sequence[Candidate],
-    means_only: bool,
-    shared: dict[str, Any],
-) -> ViewSource:
-    """Return the source that searches for a change since the `reference` flights.
-
-    It compares means of flights. If no mean has changed, its fallback searches for a change that
-    shows only in motion.
-
-    Args:
-        reference: the flights before the change.
-        evidence: the flights to fit.
-        held: the held-out flights.
-        spread: how much the rotors' thrusts vary between the flights of one vehicle.
-        allowed: effects that the search may try.
-        means_only: whether there is no fallback.
-        shared: fields of both sources.
-    """
-    difference, start = change_evidence(reference, evidence.flights, spread)
-    weighed = difference.relinearise(start)
-    shared = {**shared, "weighed": weighed, "start": start, "names_small": True}
-    in_motion = MotionSource(
-        candidates=allowed, held=held, reference=reference, fitted=evidence,
-        views=len(spread.along), **shared,
-    )  # fmt: skip
-    means = replace(less_reference_residual(reference, start.theta, held.flights), means=True)
-    compared = view_candidates(allowed, weighed[1])
-    shared["measure"] = shared["measure"].removesuffix(OFFSETS)
-    fallback = None if means_only else in_motion
-    return ViewSource(candidates=compared, held=means, fallback=fallback, **shared)
-
-
-def _spread_words(spread: RotorSpread | None, count: int) -> tuple[str, ...]:
-    """Return a text for people on how much the `count` reference flights differ, if any."""
-    if spread is None:
-        return ()
-    return (
-        f"The {count} reference flights differ as if each rotor's thrust varied by "
-        f"{100 * spread.share:.1f} % from flight to flight ({spread.freedom} degrees of freedom). "
-        "The differences along each axis count as well. A change is named if it exceeds these "
-        "differences significantly.",
-    )
-
-
-def _references(
-    given: DiagnosisInput, flights: ViewFlights, evidence: Mapping[str, ViewEvidence]
-) -> tuple[dict[str, ViewEvidence], RotorSpread | None, tuple[str, ...]]:
-    """Prepare the reference flights, to be compared with `flights` and their `evidence` by view.
-
-    Returns:
-        Their evidence by view, the spread between flights, and a note for each unusable flight.
-
-    Raises:
-        ValueError: if less than two are usable, or their signals differ from the other flights'.
-    """
-    if not given.references:
-        return {}, None, ()
-    before = ready(given.references, given.vehicle, given.limits, given.logs)
-    if len(before.names) < 2:
-        raise ValueError(
-            "; ".join(
-                [
-                    f"--reference has {len(before.names)} flight; at least 2 are needed, better 3, "
-                    "to estimate how flights of one vehicle differ",
-                    *before.notes,
-                ]
-            )
-        )
-    if before.views != flights.views or before.source != flights.source:
-        raise ValueError(
-            f"the reference flights are driven by {before.source} and allow "
-            f"{_view_words(before)}, the others by {flights.source} and {_view_words(flights)}: "
-            "log the same signals in both"
-        )
-    earlier = {n: replace(one, flights=before.smoothed[n]) for n, one in evidence.items()}
-    return earlier, rotor_spread([*earlier.values(), *evidence.values()]), before.notes
-
-
-def _view_words(flights: ViewFlights) -> str:
-    """Return a text with the views of flights, their axes and the width of their windows."""
-    return " and ".join(
-        f"{view.name} (along {''.join('xyz'[k] for k in view.axes)}, means of {view.width_s:g} s)"
-        for view in flights.views
-    )

@@ -131,7 +131,13 @@ def test_a_change_is_written_as_every_diagnosis_is(tmp_path, capsys):
     for axis in told["gap"]["channels"]["force"].values():
         assert {"before", "after", "noise_floor", "repeatability"} <= set(axis)
     assert json.loads((tmp_path / "out/diagnosis.json").read_text())["verdict"] == told["verdict"]
-    assert "data:image/png" in (tmp_path / "out/report.html").read_text()
+    # Means of flights are compared: their floor is the spread of the reference flights, and the
+    # chart has one point for each of the two reference flights and the held-out one.
+    assert "the mean of each flight" in told["gap"]["measure"]
+    assert 0.0 < told["gap"]["noise_floor"] < told["gap"]["before"]
+    report = (tmp_path / "out/report.html").read_text()
+    assert "data:image/png" in report and "flights 1 to 2 are the reference flights" in report
+    assert "while p is at most 0.02" in report
     assert load_vehicle(str(tmp_path / "out/vehicle.toml")).effects
 
 

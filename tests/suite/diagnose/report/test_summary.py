@@ -89,3 +89,10 @@ def test_a_file_of_suite_identify_is_not_sent_back_to_it(tmp_path):
     assert not is_identified(str(path))
     steps = next_steps(found("unknown", identified=True))
     assert "repeat it if the vehicle has changed" in steps[1]
+
+
+@pytest.mark.parametrize("verdict", ["no_gap", "named", "partly"])
+def test_after_a_search_for_a_change_the_file_itself_counts_as_untested(verdict):
+    steps = next_steps(found(verdict, [DRAG], reference=["old"]))
+    assert "was not tested: for that, leave out --reference" in steps[0]
+    assert "as it is" not in steps[0]
