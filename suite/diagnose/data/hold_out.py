@@ -6,6 +6,7 @@ Held-out flights test whether the named effects explain flights that no fit has 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,11 +36,12 @@ def choose_held_out(
     flight = np.asarray(flight)
     numbers = list(np.unique(flight))
     if len(numbers) == 1:
-        log = logs[int(numbers[0])]
-        cut_s = limits.lone_fitted_share * log.duration_s
-        is_fitted = np.asarray(start_s) + LENGTH_S <= cut_s
+        # The share is of the windows, since signals may be missing in a part of the log.
+        end_s = np.asarray(start_s) + LENGTH_S
+        cut_s = float(np.quantile(end_s, limits.lone_fitted_share))
+        is_fitted = end_s <= cut_s
         since_s = float(np.asarray(start_s)[~is_fitted].min(initial=cut_s))
-        return is_fitted, [f"{log.name} from {since_s:.1f} s"]
+        return is_fitted, [f"{logs[int(numbers[0])].name} from {since_s:.1f} s"]
     by_flight = {k: information[flight == k].sum(axis=0) for k in numbers}
     held: list[int] = []
     for _ in range(max(1, round(limits.held_out_share * len(numbers)))):
@@ -52,31 +54,45 @@ def choose_held_out(
     return ~np.isin(flight, held), [logs[int(k)].name for k in sorted(held)]
 
 
-def parted(
-    flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRESHOLDS
-) -> tuple[dict[str, list[SmoothedFlight]], dict[str, list[SmoothedFlight]], list[str]]:
-    """Return the fitted flights and the held-out ones, each by view; split a single one in time.
+class Parted(NamedTuple):
+    """Flights that are fitted and those that are held out, each by name of the view."""
 
-    `held` are the numbers of the flights to hold out. The last value has their names.
+    fitted: dict[str, list[SmoothedFlight]]
+    held: dict[str, list[SmoothedFlight]]
+    names: list[str]
+    """Names of the held-out flights or stretches."""
+    notes: tuple[str, ...] = ()
+    """Views that were left out and why, in words."""
+
+
+def parted(flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRESHOLDS) -> Parted:
+    """Return the fitted flights and the held-out ones; a single flight is split in time.
+
+    `held` are the numbers of the flights to hold out. A second view is left out if a part of it is
+    too short.
 
     Raises:
-        ValueError: if a part is too short.
+        ValueError: if a part of the first view is too short.
     """
-    fitted_part, held_part, names = _split(flights, held, limits)
-    main = flights.views[0]
-    for what, part in (("to fit", fitted_part), ("held out", held_part)):
-        flown_s = sum(len(one.form.middle_s) for one in part[main.name]) * main.spacing_s
-        if flown_s < limits.least_view_s:
-            raise ValueError(
-                f"{', '.join(flights.names)}: {flown_s:.1f} s of usable flight {what}, at least "
-                f"{limits.least_view_s:g} s are needed: fly longer"
+    parts, notes = _split(flights, held, limits), list[str]()
+    for number, view in enumerate(flights.views):
+        for what, part in (("to fit", parts.fitted), ("held out", parts.held)):
+            flown_s = sum(len(one.form.middle_s) for one in part[view.name]) * view.spacing_s
+            if flown_s >= limits.least_view_s:
+                continue
+            need = (
+                f"{flown_s:.1f} s of usable flight {what}, at least {limits.least_view_s:g} s are "
+                "needed: fly longer"
             )
-    return fitted_part, held_part, names
+            if number == 0:
+                raise ValueError(f"{', '.join(flights.names)}: {need}")
+            notes.append(f"{view.name}: not examined, {need}")
+            del parts.fitted[view.name], parts.held[view.name]
+            break
+    return parts._replace(notes=tuple(notes))
 
 
-def _split(
-    flights: ViewFlights, held: Sequence[int], limits: Thresholds
-) -> tuple[dict[str, list[SmoothedFlight]], dict[str, list[SmoothedFlight]], list[str]]:
+def _split(flights: ViewFlights, held: Sequence[int], limits: Thresholds) -> Parted:
     """Return what `parted` returns, however short the parts are."""
     count = len(flights.names)
     if count > 1:
@@ -85,7 +101,7 @@ def _split(
             {name: [part[k] for k in numbers] for name, part in flights.smoothed.items()}
             for numbers in (inside, held)
         )
-        return fitted_part, held_part, [flights.names[k] for k in held]
+        return Parted(fitted_part, held_part, [flights.names[k] for k in held])
     fitted_part, held_part = {}, {}
     # The share is of the time in flight, since a log may begin or end on the ground.
     flown_s = flights.smoothed[flights.views[0].name][0].form.middle_s
@@ -97,4 +113,4 @@ def _split(
             rows = single.rows._replace(good=np.asarray(single.rows.good) & chosen)
             split = smoothed(view, rows, limits)._replace(reliability=single.reliability)
             part[view.name] = [split]
-    return fitted_part, held_part, [f"{flights.names[0]} from {until_s:.1f} s"]
+    return Parted(fitted_part, held_part, [f"{flights.names[0]} from {until_s:.1f} s"])

@@ -115,22 +115,22 @@ def held_out(logs: Sequence[FlightLog]) -> dict[str, HeldOut]:
 def _compare(fitted: Coloured, series: Sequence[Series]) -> HeldOut:
     """Compare the autocorrelation of a model with that of held-out flights, up to `SHORT_S`."""
     step_s = max(flight.step_s for flight in series)
-    lags = np.arange(round(SHORT_S / step_s) + 1)
+    lag_s = step_s * np.arange(round(SHORT_S / step_s) + 1)
     duration_s = float(np.mean([flight.duration_s for flight in series]))
-    measured = _autocorrelation(series, lags)
-    model = fitted.correlation(lags * step_s, duration_s)
+    measured = _autocorrelation(series, lag_s)
+    model = fitted.correlation(lag_s, duration_s)
     difference = np.abs(model - measured)
     worst = int(difference.argmax())
-    shown = (lags[worst] * step_s, measured[worst], model[worst], difference[worst])
+    shown = (lag_s[worst], measured[worst], model[worst], difference[worst])
     return HeldOut(*map(float, shown))
 
 
-def _autocorrelation(series: Sequence[Series], lags: np.ndarray) -> np.ndarray:
-    """Return the autocorrelation (L,) of all flights at `lags` (L,) in steps."""
-    total, pairs = np.zeros(len(lags)), np.zeros(len(lags))
+def _autocorrelation(series: Sequence[Series], lag_s: np.ndarray) -> np.ndarray:
+    """Return the autocorrelation (L,) of all flights at `lag_s` (L,) [s]."""
+    total, pairs = np.zeros(len(lag_s)), np.zeros(len(lag_s))
     for flight in series:
         centred = flight.value - np.nanmean(flight.value)
-        for place, lag in enumerate(lags.tolist()):
+        for place, lag in enumerate(np.rint(lag_s / flight.step_s).astype(int).tolist()):
             product = centred[lag:] * centred[: len(centred) - lag]
             total[place] += np.nansum(product)
             pairs[place] += np.isfinite(product).sum()

@@ -8,7 +8,7 @@ import pytest
 from suite.diagnose.data.hold_out import choose_held_out
 from suite.diagnose.data.noise import noise_of, rotor_noise
 from suite.diagnose.data.windows import BURN_IN_S, LENGTH_S, SLICES, STEPS, cut, take
-from suite.diagnose.thresholds import Thresholds
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tests.support.broken_logs import rows
 from tests.support.diagnosis_flights import NOISE
 from tests.support.vehicles import PLAIN
@@ -115,4 +115,13 @@ def test_a_flight_that_alone_identifies_something_is_fitted_and_of_a_single_one_
     windows, _ = cut([log], PLAIN, False)
     information = np.ones((len(windows.flight), 1))
     fitted, names = choose_held_out([log], windows.flight, windows.start_s, information)
-    assert names == ["flight_0 from 2.3 s"] and fitted.any() and not fitted[-1]
+    assert fitted.any() and not fitted[-1]
+    assert names == [f"flight_0 from {windows.start_s[~fitted].min():.1f} s"]
+
+
+@pytest.mark.parametrize("begin_s", [0.0, 45.0])
+def test_windows_in_a_part_of_a_single_log_are_split_where_they_are(log, begin_s):
+    start_s = begin_s + np.arange(0.0, 15.0, 0.5)
+    long = replace(log, time_s=60.0 * np.linspace(0.0, 1.0, len(log.time_s)))
+    fitted, _ = choose_held_out([long], 0 * start_s, start_s, np.ones((len(start_s), 1)))
+    assert fitted.mean() == pytest.approx(THRESHOLDS.lone_fitted_share, abs=0.05)

@@ -46,3 +46,12 @@ def test_a_drift_of_flights_is_significant_and_within_its_interval():
     assert sum(drift.low > 0.0 for drift in found) > 0.6 * count
     assert sum(drift.low <= DRIFT <= drift.high for drift in found) > 0.85 * count
     assert np.median([drift.value for drift in found]) == pytest.approx(DRIFT, rel=0.1)
+
+
+def test_rows_without_a_velocity_are_not_rows_at_rest():
+    speed = np.full(ROWS, SPEED)
+    speed[50:90] = np.nan
+    value = np.where(np.isnan(speed), np.nan, np.random.default_rng(5).normal(size=ROWS))
+    found = colour._variograms([Series(value, speed, 0.1)], np.array([1.0]))
+    assert found is not None
+    np.testing.assert_allclose(found.speed, SPEED)

@@ -15,7 +15,9 @@ from eval.logs.flight_log import FlightLog, write_flight
 from eval.sensors.interface import Draws, View
 from eval.sensors.sensors_file import load_sensors, sensor_set
 from suite.common.console import Console
+from suite.diagnose.sensors import identify
 from suite.diagnose.sensors.clock import Clock, clock_of, on_gyro_clock
+from suite.diagnose.sensors.colour import Series
 from suite.diagnose.sensors.errors import errors_of
 from suite.diagnose.sensors.identify import fit_sensors, held_out, identify_sensors, parameters_of
 from tracks.geometry.camera import Camera
@@ -166,3 +168,12 @@ def test_a_log_without_an_estimate_or_a_reference_is_refused(tmp_path):
     write_flight(tmp_path / "bare.parquet", lost)
     with pytest.raises(ValueError, match="column pos_x: no reference for the estimate"):
         identify_sensors([tmp_path], tmp_path / "mine.toml", Console())
+
+
+def test_the_correlation_of_logs_with_other_rates_is_compared_at_equal_lags():
+    fine = np.convolve(np.random.default_rng(1).normal(size=40_000), np.ones(30), "valid")
+    lag_s = 0.02 * np.arange(10)
+    at_100_hz, at_50_hz = Series(fine, 0.0 * fine, 0.01), Series(fine[::2], 0.0 * fine[::2], 0.02)
+    np.testing.assert_allclose(
+        identify._autocorrelation([at_100_hz, at_50_hz], lag_s), 1.0 - lag_s / 0.3, atol=0.05
+    )

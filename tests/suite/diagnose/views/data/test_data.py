@@ -156,7 +156,8 @@ def test_where_the_speed_is_unknown_a_short_cut_of_the_throttle_is_no_rest_on_th
 
 @pytest.mark.parametrize("ground_s", [(0.0, 0.0), (0.0, 6.0), (30.0, 0.0)])
 def test_of_a_single_flight_the_end_of_what_flew_is_held_out(pair, ground_s):
-    fitted, held, (words,) = parted(ready([on_the_ground(pair[0], *ground_s)], VEHICLE), [])
+    parts = parted(ready([on_the_ground(pair[0], *ground_s)], VEHICLE), [])
+    fitted, held, (words,), _ = parts
     for name in (FORCE.name, TORQUE.name):
         first, last = (part[name][0].form.middle_s for part in (fitted, held))
         assert first.max() < last.min()
@@ -170,6 +171,15 @@ def test_a_flight_too_short_to_hold_out_a_second_is_refused(pair):
     short = rows(pair[0], slice(0, round(2.5 / float(np.median(np.diff(pair[0].time_s))))))
     with pytest.raises(ValueError, match="s of usable flight held out, at least 1 s"):
         parted(ready([short], VEHICLE), [])
+
+
+def test_a_second_view_with_too_little_to_hold_out_is_left_out(pair):
+    short = rows(pair[0], slice(0, round(5.0 / float(np.median(np.diff(pair[0].time_s))))))
+    without = replace(short, about={"partial": ["quat", "rate"]})
+    parts = parted(ready([without], VEHICLE), [])
+    assert set(parts.fitted) == set(parts.held) == {FORCE.name}
+    (note,) = parts.notes
+    assert note.startswith("torque: not examined, ") and "held out, at least 1 s" in note
 
 
 def test_a_log_without_a_stretch_is_left_out_and_slow_ones_are_diagnosed_by_their_force(pair):
