@@ -146,6 +146,7 @@ def cut(
     integrator: str = "continuous",
     coarser: FlightWindows | None = None,
     only: Collection[int] | None = None,
+    since_s: float = 0.0,
     fewer_commands: FlightWindows | None = None,
 ) -> tuple[FlightWindows | None, list[str]]:
     """Return the windows of `logs` (None if no flight has one) and warnings.
@@ -162,6 +163,7 @@ def cut(
         coarser: the windows that an earlier call returned. If given, the same ones are cut with
             steps of twice the length, from every second rotor speed and `with_hidden_torque`.
         only: numbers of the flights that are cut; all if not given.
+        since_s: earliest start of a window after its log's start [s].
         fewer_commands: as `coarser`, but with usual steps, and from every second command.
     """
     starts, warnings = list[tuple[int, int]](), list[str]()  # (flight, row) each
@@ -169,7 +171,7 @@ def cut(
     for number, (log, state) in enumerate(zip(logs, states, strict=True)):
         if number not in (range(len(logs)) if only is None else only):
             continue
-        rows = _start_rows(log, state.whole, rotor_input, stride_s, limits.longest_hole_s)
+        rows = _start_rows(log, state.whole, rotor_input, since_s, stride_s, limits.longest_hole_s)
         if not rows:
             shortest_s = LENGTH_S + BURN_IN_S + HISTORY_S
             warnings.append(f"{log.name}: no stretch of {shortest_s:g} s without a hole")
@@ -203,12 +205,17 @@ def take(data: Any, chosen: Array) -> Any:
 
 
 def _start_rows(
-    log: FlightLog, complete: np.ndarray, rotor_input: bool, stride_s: float, hole_s: float
+    log: FlightLog,
+    complete: np.ndarray,
+    rotor_input: bool,
+    since_s: float,
+    stride_s: float,
+    hole_s: float,
 ) -> list[int]:
     """Return the rows at which windows start, among rows with a `complete` state, (T,) bool."""
     time_s = log.time_s
     inputs_s = [time_s[rows] for rows in _input_rows(log, rotor_input)]
-    next_s, starts = time_s[0] + BURN_IN_S + HISTORY_S, []
+    next_s, starts = time_s[0] + max(BURN_IN_S + HISTORY_S, since_s), []
     while True:
         candidates = np.flatnonzero((time_s >= next_s - 1e-9) & complete)
         if not len(candidates) or time_s[candidates[0]] + LENGTH_S > time_s[-1] + 1e-6:

@@ -28,7 +28,7 @@ from suite.diagnose.evidence.rollouts import (
     rollout_evidence,
     start_estimate,
 )
-from suite.diagnose.sources.rollout_source import ROUNDING_S, RolloutSource
+from suite.diagnose.sources.rollout_source import RolloutSource
 from suite.diagnose.sources.source import DiagnosisInput, Source, SourceSet
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.actuators import (
@@ -141,9 +141,8 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
     # The gap is more precise with windows that overlap.
     since_s = float(not_fitted.start_s.min())
     held_flights = np.unique(not_fitted.flight).tolist()
-    held, _ = windows_of(stride_s=limits.gap_stride_s, only=held_flights)
+    held, _ = windows_of(stride_s=limits.gap_stride_s, only=held_flights, since_s=since_s)
     assert held is not None
-    held = take(held, held.start_s >= since_s - ROUNDING_S)
     begin = start_estimate(model, held)
     flies = _finite(model.linearise(begin.theta, begin.free, held, []), limits)
     if not flies.all():

@@ -125,3 +125,9 @@ def test_windows_in_a_part_of_a_single_log_are_split_where_they_are(log, begin_s
     long = replace(log, time_s=60.0 * np.linspace(0.0, 1.0, len(log.time_s)))
     fitted, _ = choose_held_out([long], 0 * start_s, start_s, np.ones((len(start_s), 1)))
     assert fitted.mean() == pytest.approx(THRESHOLDS.lone_fitted_share, abs=0.05)
+
+
+def test_the_windows_of_the_end_of_a_log_count_alone_for_the_largest_number(log):
+    limits = Thresholds(most_windows=6)
+    windows, _ = cut([log], PLAIN, False, stride_s=0.1, limits=limits, since_s=2.0)
+    assert len(windows.flight) == 6 and windows.start_s.min() == pytest.approx(2.0, abs=0.02)
