@@ -52,7 +52,7 @@ from suite.diagnose.verdict.gap import (
     EffectSize,
     Gap,
     from_true_starts,
-    measure,
+    gap_of,
     overlap,
     remaining_share,
     rollout_size,
@@ -113,7 +113,8 @@ class RolloutSource(Source):
 
     def gap(self, found: SearchResult, theta: np.ndarray) -> Gap:
         """Return the gap on the held-out flights, see `Source`."""
-        return measure(self.model, theta, self.held, of_rollouts(found.last).noise, self.limits)
+        linear = from_true_starts(self.model, theta, self.held)
+        return gap_of(linear, self.held, of_rollouts(found.last).noise, self.limits)
 
     def is_worse(self, before: Gap, after: Gap) -> bool:
         """Return whether the gap has grown by more than chance, see `Source`."""

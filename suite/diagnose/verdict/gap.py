@@ -128,17 +128,6 @@ def remaining_share(before: Gap, after: Gap) -> float:
     return remaining / max(before.rms - before.floor, remaining, 1e-9)
 
 
-def measure(
-    model: RolloutModel,
-    theta: np.ndarray,
-    windows: FlightWindows,
-    noise: Noise,
-    limits: Thresholds = THRESHOLDS,
-) -> Gap:
-    """Return the gap of `model` on `windows` at the parameters `theta` (P,), given the noise."""
-    return gap_of(from_true_starts(model, theta, windows), windows, noise, limits)
-
-
 def from_true_starts(
     model: RolloutModel, theta: np.ndarray, windows: FlightWindows, indices: Sequence[int] = ()
 ) -> Linearisation:
@@ -165,7 +154,9 @@ def gap_of(
     residual = block_of(whitening, linear, (), windows).residual
     slow = slow_energy(whitening, residual)
     score = slow[:, :STATE].sum(axis=1) / whitening.slow_freedom[:, :STATE].sum(axis=1)
-    free_noise = start_noise(noise.sigma, windows, linear.offset.shape[1], limits)
+    # Noise of the start numbers: the state, and then errors of the rotor speeds.
+    rotors = np.full(linear.offset.shape[1] - STATE, rotor_spread(windows, limits))
+    free_noise = np.append(np.nan_to_num(noise.sigma[:STATE]), rotors)
     channels: dict[str, dict[str, Channel]] = {}
     for horizon_s in HORIZONS_S:
         channels[f"{horizon_s:g} s"] = {}
@@ -207,21 +198,6 @@ def true_starts(model: RolloutModel, theta: np.ndarray, windows: FlightWindows) 
     acc_w = (np.asarray(windows.row_vel_w)[window, row] - windows.vel_w) / np.maximum(span_s, 1e-3)
     offset[:, 6:9] = delay_s * np.where(has_vel.any(axis=1, keepdims=True), acc_w, 0.0)
     return offset
-
-
-def start_noise(
-    sigma: np.ndarray, windows: FlightWindows, free: int, limits: Thresholds = THRESHOLDS
-) -> np.ndarray:
-    """Return the standard deviation (F,) of the errors of a window's start numbers.
-
-    Start numbers are the 12 of the start state, and then errors of the rotor speeds. `free` is
-    their number F, and `sigma` (19,) the noise of the channels.
-    """
-    noise = np.zeros(free)
-    noise[:STATE] = np.where(np.isfinite(sigma), sigma, 0.0)[:STATE]
-    if free > STATE:
-        noise[STATE:] = rotor_spread(windows, limits)
-    return noise
 
 
 def noise_floor(slope: np.ndarray, noise: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from suite.diagnose.sources.rollout_source import of_rollouts, structure_where
 from suite.diagnose.sources.source import Remaining
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.disturbances import Swing, _likelihood, find_turbulence
-from suite.diagnose.verdict.gap import Gap, measure, noise_floor, remaining_share
+from suite.diagnose.verdict.gap import Gap, from_true_starts, gap_of, noise_floor, remaining_share
 from suite.diagnose.verdict.residual_structure import (
     AXES,
     DisturbanceEquations,
@@ -98,7 +98,8 @@ def test_a_gap_has_its_interval_its_noise_floor_and_the_share_that_remains_of_it
 def test_a_diagnosis_is_measured_on_what_was_held_out(drag, found_drag, flown):
     assert drag.label == "named" and drag.flights.driven_by == "commands"
     noise = of_rollouts(found_drag.search.last).noise
-    again = measure(flown.model, found_drag.theta, flown.held, noise)
+    linear = from_true_starts(flown.model, found_drag.theta, flown.held)
+    again = gap_of(linear, flown.held, noise)
     np.testing.assert_array_equal(again.score, found_drag.after.score)
     assert found_drag.after.rms < 1.3 < found_drag.before.rms
 
