@@ -101,6 +101,19 @@ def test_motors_are_where_each_firmware_has_them():
     x = ((front, right), (rear, left), (front, left), (rear, right))
     assert px4.QUAD_X == ardupilot.QUAD_X == x
     assert ardupilot.QUAD_PLUS == ((0, right), (0, left), (front, 0), (rear, 0))
+    assert ardupilot.MOTOR_SIDES[18] == ardupilot.MOTOR_SIDES[12] == betaflight.MOTOR_SIDE
+    anticlockwise = ((front, right), (front, left), (rear, left), (rear, right))
+    assert ardupilot.MOTOR_SIDES[13] == anticlockwise
+    assert ardupilot.MOTOR_SIDES[14] == (anticlockwise[0], *anticlockwise[:0:-1])
+
+
+@pytest.mark.parametrize(
+    ("frame_type", "told"), [(14, "the file's 1, 2, 3, 4"), (19, "TYPE 19 is")]
+)
+def test_the_type_of_an_ardupilot_frame_orders_its_motors(tmp_path, frame_type, told):
+    truth = known_flight.fly(np.arange(0.0, 1.5, 0.01))
+    path = write_bin(tmp_path / "log.bin", truth, frame_type=frame_type)
+    assert told in text(import_log(path, None, PARTIAL)[1], "motors")
 
 
 def test_a_map_of_columns_and_an_odd_number_of_poles_are_not_for_betaflight(tmp_path):
