@@ -217,6 +217,20 @@ def test_without_motors_or_without_a_take_off_nothing_is_cut():
     assert span == (-np.inf, np.inf) and finding.status == "ok"
     span, (finding,) = airborne(Recording("log", {"pos": signals["pos"]}))
     assert span == (-np.inf, np.inf) and "no signal shows when the motors" in finding.evidence
+def test_positions_that_miss_the_flight_move_neither_end_of_it():
+    signals = recording().signals
+    late = TIME < 1.2
+    pos = Signal(TIME[late], signals["pos"].value[late])
+    span, _ = airborne(Recording("log", {"pos": pos, "pwm": signals["pwm"]}))
+    np.testing.assert_allclose(span, (1.75, 8.15), atol=0.02)
+
+
+def test_speeds_with_the_sign_of_their_spin_show_the_flight():
+    speed = np.where((TIME > 2.0) & (TIME < 8.0), 700.0, 50.0)[:, None] * [1.0, -1.0, 1.0, -1.0]
+    span, _ = airborne(Recording("log", {"motor": Signal(TIME, speed)}))
+    np.testing.assert_allclose(span, (2.0, 8.0), atol=0.02)
+
+
 
 
 def _gyro(span, rate=500.0, bias=0.0, noise=0.0):
