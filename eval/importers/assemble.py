@@ -18,7 +18,8 @@ from eval.importers.options import ImportOptions
 from eval.importers.rows import GAP_S, GAP_STEPS, row_times, rows_at, sampled_rows, slowest
 from eval.importers.signals import NEEDED, Recording, median_step, with_readings
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
-from eval.logs.faults.check import CLOCK, DRIVE, POSE, CheckContext, run_checks
+from eval.logs.faults.check import DRIVE, POSE, CheckContext, run_checks
+from eval.logs.faults.clock import check_time
 from eval.logs.faults.finding import Finding, finding_lines
 from eval.logs.faults.reading import MOTORS, read_rows
 from eval.logs.flight_log import FlightLog, log_from_columns
@@ -88,11 +89,16 @@ def assemble(
     _require_signals(recording, options.partial, findings)
     # Checks of the clock, then of the frames of position, attitude and gyro.
     context = CheckContext(options.vehicle)
-    more_findings, readings, _ = run_checks(
-        {"time": recording.signals[slowest(recording)].time_s}, CLOCK, context, options.fix
-    )
-    findings += more_findings
-    recording = with_readings(recording, readings)  # rows need the time in seconds
+    if not recording.has_seconds:
+        fastest = min(median_step(samples.time_s) for samples in recording.signals.values())
+        more_findings, readings, _ = run_checks(
+            {"time": recording.signals[slowest(recording)].time_s},
+            (lambda rows, _: check_time(rows, fastest),),
+            context,
+            options.fix,
+        )
+        findings += more_findings
+        recording = with_readings(recording, readings)  # rows need the time in seconds
     coarse = row_times(recording, COARSE_HZ, 0.0, None)
     more_findings, readings, _ = run_checks(rows_at(recording, coarse), POSE, context, options.fix)
     findings += more_findings

@@ -54,6 +54,8 @@ class Recording:
     """Metadata of the file: firmware, airframe, start."""
 
 
+    has_seconds: bool = False
+    """Whether the format defines the unit of time; otherwise the import checks it."""
 def make_signal(
     time_s: np.ndarray, value: np.ndarray, file: str, name: str
 ) -> tuple[Signal | None, Finding | None]:

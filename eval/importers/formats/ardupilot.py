@@ -128,7 +128,9 @@ def read(path: Path, options: ImportOptions) -> Recording:
         findings.append(Finding("note", "motors", text))
     motor_side = MOTOR_SIDES.get(frame_type, QUAD_X)
     signals, more_findings = collect(parts, str(path))
-    return Recording(str(path), signals, (*findings, *more_findings), motor_side, about)
+    return Recording(
+        str(path), signals, (*findings, *more_findings), motor_side, about, has_seconds=True
+    )
 
 
 def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]]:

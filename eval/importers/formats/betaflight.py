@@ -161,7 +161,8 @@ def read(path: Path, options: ImportOptions) -> Recording:
         {name: (time_s, value) for name, value in parts.items()}, box.name
     )
     about = {our_key: str(box.header[key]) for key, our_key in ABOUT.items() if box.header.get(key)}
-    return Recording(box.name, signals, (*findings, *more_findings), MOTOR_SIDE, about)
+    findings += more_findings
+    return Recording(box.name, signals, tuple(findings), MOTOR_SIDE, about, has_seconds=True)
 
 
 def _volts(voltage: np.ndarray, unit: str, fix: bool, findings: list[Finding]) -> np.ndarray:

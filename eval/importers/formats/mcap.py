@@ -89,7 +89,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
     messages = _on_one_clock(chosen, findings)
     findings += _motor_count(messages)
     signals, more_findings = _signals(messages, str(path))
-    return Recording(str(path), signals, (*findings, *more_findings), motor_side)
+    return Recording(str(path), signals, (*findings, *more_findings), motor_side, has_seconds=True)
 
 
 def _choices(

@@ -126,6 +126,20 @@ def test_a_recording_becomes_a_log_that_says_where_it_is_from():
     assert log.about["findings"] == [finding._asdict() for finding in findings]
 
 
+@pytest.mark.parametrize(("scale", "known"), [(1.0, False), (1e3, False), (1.0, True)])
+def test_a_slow_pose_leaves_the_unit_of_time_to_faster_signals(scale, known):
+    parts = flight(end=30.0)
+    time_s = parts.pop("time") * scale
+    rows = {name: slice(None, None, 100 if name in ("pos", "quat") else 1) for name in parts}
+    signals = {n: Signal(time_s[rows[n]], value[rows[n]]) for n, value in parts.items()}
+    if known:  # no faster signal
+        signals = {name: signals[name] for name in ("pos", "quat")}
+    asked = ImportOptions(vehicle=PLAIN, partial=True, fix=False)
+    log, findings = assemble(Recording("log", signals, has_seconds=known), "made", asked)
+    assert log.duration_s == pytest.approx(29.5)
+    assert ("time_unit" in {f.fault for f in findings}) is (scale != 1.0)
+
+
 def test_start_and_end_cut_more_than_the_time_on_the_ground():
     parts = dict(recording().signals)
     del parts["cmd_thrust"], parts["cmd_rate"]
