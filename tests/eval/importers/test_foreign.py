@@ -319,6 +319,13 @@ def test_rotors_without_a_turn_are_not_counted_and_speeds_are_of_the_poles():
 @pytest.mark.parametrize(
     ("numbers", "unit", "volts"),
     [
+def test_a_hexacopter_is_counted_by_its_outputs_where_it_logs_no_speeds(tmp_path):
+    path = made.write_blackbox(tmp_path / "log.csv", span=(0, 2), rate=250.0)
+    path.write_text(path.read_text().replace("eRPM[0], eRPM[1]", "motor[4], motor[5]"))
+    path.write_text(path.read_text().replace("eRPM[", "other["))
+    assert "6 motors of the log turn" in text(import_log(path, None, PARTIAL)[1], "motors")
+
+
         ([16.13, 16.02], "", [16.13, 16.02]),
         ([1613.0, 1602.0], "", [16.13, 16.02]),
         ([16.13, 16.02], "V", [16.13, 16.02]),
