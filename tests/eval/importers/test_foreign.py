@@ -1,6 +1,7 @@
 """Logs of PX4, Betaflight, ArduPilot, Crazyflie and ROS 2, made from a flight that is known."""
 
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -210,6 +211,8 @@ def test_mcap_topics_are_chosen_by_a_map(tmp_path):
     chosen.write_text('[topics]\nodometry = "/imu"\n')
     with pytest.raises(FlightLogError, match="'/imu' has no nav_msgs/Odometry"):
         import_log(path, None, ImportOptions(map=chosen))
+    with pytest.raises(ValueError, match=r"mappings/crazyswarm2\.toml: .* unknown"):
+        import_log(path, None, ImportOptions(map=Path("crazyswarm2")))
 
 
 def test_mcap_motors_are_put_in_order_by_a_map(tmp_path):
@@ -316,9 +319,6 @@ def test_rotors_without_a_turn_are_not_counted_and_speeds_are_of_the_poles():
     assert "motor_count" in {finding.fault for finding in findings}
 
 
-@pytest.mark.parametrize(
-    ("numbers", "unit", "volts"),
-    [
 def test_a_hexacopter_is_counted_by_its_outputs_where_it_logs_no_speeds(tmp_path):
     path = made.write_blackbox(tmp_path / "log.csv", span=(0, 2), rate=250.0)
     path.write_text(path.read_text().replace("eRPM[0], eRPM[1]", "motor[4], motor[5]"))
@@ -326,6 +326,9 @@ def test_a_hexacopter_is_counted_by_its_outputs_where_it_logs_no_speeds(tmp_path
     assert "6 motors of the log turn" in text(import_log(path, None, PARTIAL)[1], "motors")
 
 
+@pytest.mark.parametrize(
+    ("numbers", "unit", "volts"),
+    [
         ([16.13, 16.02], "", [16.13, 16.02]),
         ([1613.0, 1602.0], "", [16.13, 16.02]),
         ([16.13, 16.02], "V", [16.13, 16.02]),
