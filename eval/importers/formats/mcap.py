@@ -25,7 +25,7 @@ import numpy as np
 from eval.importers.mapping_file import map_file, motor_side_of
 from eval.importers.options import ImportOptions
 from eval.importers.rows import in_world
-from eval.importers.signals import Recording, Signal, collect
+from eval.importers.signals import Recording, Signal, collect, without_empty
 from eval.logs.columns import FlightLogError, quoted
 from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import Finding
@@ -212,7 +212,7 @@ def _signals(
     signals, findings = collect(parts, name)
     if "vel" in signals and "quat" in signals:
         signals["vel"] = in_world(signals["vel"], signals["quat"])
-    return signals, findings
+    return without_empty(signals), findings
 
 
 def _xyz(vector: Any) -> list[float]:
