@@ -129,6 +129,8 @@ def test_unknown_samples_and_steps_of_time_that_are_none_are_left_out():
 def test_a_time_that_goes_back_often_is_refused_and_few_known_samples_are_no_signal():
     with pytest.raises(FlightLogError, match=r"row 2: .* 9 of 10 samples of 'gyro'"):
         make_signal(np.arange(10.0)[::-1], np.zeros((10, 3)), "log", "gyro")
+    with pytest.raises(FlightLogError, match="row 4: "):
+        make_signal(np.arange(10.0)[::-1], np.array([np.nan] * 2 + [0.0] * 8), "log", "gyro")
     assert make_signal(np.full(3, np.nan), np.zeros(3), "log", "gyro") == (None, None)
     assert median_step(np.array([0.0, 0.5, 1.0, 9.0])) == 0.5 and median_step(np.zeros(1)) == np.inf
 
