@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from eval.importers.checks.late import OF_POSE
 from eval.importers.formats.table import read_table
 from eval.importers.frames import conjugate, multiply, rotation_vector
 from eval.importers.options import ImportOptions
 from eval.importers.rows import averaged, continuous, row_times, rows_at
-from eval.importers.signals import Recording, Signal, median_step
+from eval.importers.signals import Recording, Signal, median_step, with_readings
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.pose import GOOD, TIMES_BETTER, fit_pose_readings
@@ -98,6 +99,7 @@ def with_pose(
     """
     assert options.pose is not None
     pose = read_table(options.pose, options.pose_map, options)
+    pose = with_readings(pose, tuple(r for r in options.read if r[0] in OF_POSE))
     for name, text in (("pos", "position"), ("quat", "attitude")):
         if name not in pose.signals:
             reason = f"holds no {text}; name its columns with --pose-map"
@@ -149,7 +151,7 @@ def _join(recording: Recording, pose: Recording, quat: Signal, alignment: Alignm
     """Return `recording` with the pose, whose attitude is `quat`, on the recording's clock."""
     signals = {n: samples for n, samples in recording.signals.items() if n not in OTHER_WORLD}
     for name, samples in {**pose.signals, "quat": quat}.items():
-        if name in ("pos", "quat", "vel"):
+        if name in OF_POSE:
             time_s = alignment.offset_s + (1.0 + alignment.drift) * samples.time_s
             signals[name] = Signal(time_s, samples.value)
     return replace(recording, signals=signals)

@@ -165,8 +165,6 @@ def test_a_jump_of_position_and_one_of_speed_are_left_out(signals):
     assert {finding.signal for finding in findings} == {"position", "velocity"}
 
 
-def test_repeated_poses_are_left_out_with_what_is_logged_with_them(signals):
-    for samples in signals.values():
 def test_a_lone_position_does_not_end_the_check_of_velocities(signals):
     kept = np.delete(np.arange(600), [*range(400, 425), *range(426, 450)])
     signals["pos"] = Signal(*(part[kept] for part in signals["pos"]))
@@ -175,6 +173,8 @@ def test_a_lone_position_does_not_end_the_check_of_velocities(signals):
     assert 599 == len(cleaned.signals["vel"].time_s)
 
 
+def test_repeated_poses_are_left_out_with_what_is_logged_with_them(signals):
+    for samples in signals.values():
         samples.value[1::3] = samples.value[0::3]
     cleaned, findings = clean(Recording("log", signals))
     assert {len(cleaned.signals[name].time_s) for name in signals} == {400}
