@@ -122,9 +122,9 @@ def read(path: Path, options: ImportOptions) -> Recording:
         text = f"FRAME_CLASS is {frame_class}, not 1: no quadrotor"
         fault = ("motor_count", None, 0.95, "none: only quadrotors can be diagnosed")
         findings.append(Finding("doubt", "motors", text, *fault))
-    frame_type = parameters.get("FRAME_TYPE", 1.0)
+    frame_type = int(parameters.get("FRAME_TYPE", 1.0))
     if frame_type not in MOTOR_SIDES:
-        text = f"the order of FRAME_TYPE {frame_type:g} is unknown; that of a quadrotor X is read"
+        text = f"the order of FRAME_TYPE {frame_type} is unknown; that of a quadrotor X is read"
         findings.append(Finding("note", "motors", text))
     motor_side = MOTOR_SIDES.get(frame_type, QUAD_X)
     signals, more_findings = collect(parts, str(path))
