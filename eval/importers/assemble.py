@@ -11,16 +11,17 @@ import numpy as np
 
 from eval.importers.checks.airborne import airborne
 from eval.importers.checks.glitches import clean
-from eval.importers.checks.late import check_delay
+from eval.importers.checks.late import OF_POSE, check_delay
 from eval.importers.commands import order_motors, rates_wanted, thrust_command
 from eval.importers.mapping import KEPT
 from eval.importers.options import ImportOptions
 from eval.importers.rows import GAP_S, GAP_STEPS, row_times, rows_at, sampled_rows, slowest
 from eval.importers.signals import NEEDED, Recording, median_step, with_readings
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
-from eval.logs.faults.check import CLOCK, DRIVE, POSE, CheckContext, run_checks
+from eval.logs.faults.check import DRIVE, POSE, CheckContext, run_checks
+from eval.logs.faults.clock import check_time
 from eval.logs.faults.finding import Finding, finding_lines
-from eval.logs.faults.reading import MOTORS, read_rows
+from eval.logs.faults.reading import BY_ATTITUDE, MOTORS, read_rows
 from eval.logs.flight_log import FlightLog, log_from_columns
 
 COARSE_HZ = 100.0
@@ -75,24 +76,39 @@ def assemble(
         FlightLogError: where a required signal is missing or breaks a rule.
     """
     findings = list(recording.findings)
+    # An order of motors refers to the vehicle's order, so it is applied after `order_motors`.
+    orders = tuple(
+        (signal, steps) for signal, steps in options.read if signal in MOTORS and "," in steps
+    )
+    readings, later = tuple(r for r in options.read if r not in orders), ()
+    if options.pose is not None:  # its signals are read with it, and the log has no attitude yet
+        readings = tuple(r for r in readings if r[0] not in OF_POSE)
+        later = tuple(r for r in readings if any(step in r[1] for step in BY_ATTITUDE))
+    recording = with_readings(recording, tuple(r for r in readings if r not in later))
+    context = CheckContext(options.vehicle)
+    if not recording.has_seconds and any(name in recording.signals for name in NEEDED):
+        fastest = min(median_step(samples.time_s) for samples in recording.signals.values())
+        more_findings, readings, _ = run_checks(
+            {"time": recording.signals[slowest(recording)].time_s},
+            (lambda rows, _: check_time(rows, fastest),),
+            context,
+            options.fix,
+        )
+        findings += more_findings
+        recording = with_readings(recording, readings)  # rows need the time in seconds
+    origin_s = min((samples.time_s[0] for samples in recording.signals.values()), default=0.0)
     if options.pose is not None:
         from eval.importers.pose import with_pose
 
         recording, more_findings = with_pose(recording, options)
         findings += more_findings
-    # An order of motors refers to the vehicle's order, so it is applied after `order_motors`.
-    orders = tuple(
-        (signal, steps) for signal, steps in options.read if signal in MOTORS and "," in steps
-    )
-    recording = with_readings(recording, tuple(r for r in options.read if r not in orders))
+        recording = with_readings(recording, later)
+    for signal, steps in options.read:
+        if signal not in ("time", *recording.signals) and steps != "drop":
+            text = f"--read {signal}={steps} is not used: the log has no {signal}"
+            findings.append(Finding("note", "file", text))
     _require_signals(recording, options.partial, findings)
-    # Checks of the clock, then of the frames of position, attitude and gyro.
-    context = CheckContext(options.vehicle)
-    more_findings, readings, _ = run_checks(
-        {"time": recording.signals[slowest(recording)].time_s}, CLOCK, context, options.fix
-    )
-    findings += more_findings
-    recording = with_readings(recording, readings)  # rows need the time in seconds
+    # Checks of the frames of position, attitude and gyro.
     coarse = row_times(recording, COARSE_HZ, 0.0, None)
     more_findings, readings, _ = run_checks(rows_at(recording, coarse), POSE, context, options.fix)
     findings += more_findings
@@ -108,7 +124,9 @@ def assemble(
     if options.trim:
         flight_span_s, more_findings = airborne(recording)
         findings += more_findings
-    time_s = row_times(recording, options.rate_hz, options.start_s, options.end_s, flight_span_s)
+    time_s = row_times(
+        recording, options.rate_hz, options.start_s, options.end_s, flight_span_s, origin_s
+    )
     findings += _notes_on_rates(recording, time_s)
     rows = rows_at(recording, time_s)
     # Convert the commands, and check them.
@@ -187,6 +205,9 @@ def _drop_half_commands(rows: dict[str, np.ndarray], partial: bool) -> list[Find
 
     A partial log keeps a thrust without rates.
     """
+    for name in ("cmd_thrust", "cmd_rate", "cmd_torque"):
+        if name in rows and not np.isfinite(rows[name]).any():
+            del rows[name]
     dropped = []
     if "cmd_thrust" in rows and not ({"cmd_rate", "cmd_torque"} & rows.keys()) and not partial:
         dropped.append("cmd_thrust")

@@ -24,7 +24,7 @@ from eval.importers.frames import (
 from eval.importers.mapping_file import MIXERS, Column, LogMap
 from eval.importers.options import ImportOptions
 from eval.importers.rows import continuous, in_world, measured
-from eval.importers.signals import Recording, Signal, collect
+from eval.importers.signals import Recording, Signal, collect, without_empty
 from eval.logs.columns import ESTIMATE, GROUPS, FlightLogError
 from eval.logs.faults.finding import Finding
 
@@ -89,6 +89,7 @@ def recording_of(
     for signal in ("vel", "rate", "acc"):
         if signal in signals and used_columns[signal].other_axes:
             _change_axes(signals, signal, used_columns[signal])
+    signals = without_empty(signals)
     if "cmd_thrust" in signals and not used_columns["cmd_thrust"].per_mass:
         findings += _per_mass(signals, about.get("mass"), options)
     return Recording(name, signals, (*findings, *more_findings), mapping.motor_side, about)

@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from eval.importers.checks.late import OF_POSE
 from eval.importers.formats.table import read_table
 from eval.importers.frames import conjugate, multiply, rotation_vector
 from eval.importers.options import ImportOptions
 from eval.importers.rows import averaged, continuous, row_times, rows_at
-from eval.importers.signals import Recording, Signal, median_step
+from eval.importers.signals import Recording, Signal, median_step, with_readings
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.pose import GOOD, TIMES_BETTER, fit_pose_readings
 from eval.logs.faults.reading import TIMES, read_as
-from eval.logs.files import MOST_ROWS
 from tracks.geometry.rotation import rot_to_quat
 
 FIRST_REACH_S = 15.0
@@ -50,6 +50,8 @@ READINGS = {
 SIGNS = ("-roll", "-pitch", "-yaw")
 """Conventions with one wrong sign. They and a mirrored gyro serve to align the clocks only; later
 checks decide which signal is wrong (`eval/logs/faults/pose.py`, `vectors.py`)."""
+OTHER_WORLD = ("vel", "cmd_quat")
+"""Signals in the log's world frame, which is not that of the pose."""
 USUAL_STEP_S = 1.0 / 150.0
 """Usual time between poses [s]; cameras and trackers give 30 to 1000 a second."""
 LONG_S = 7200.0
@@ -97,6 +99,7 @@ def with_pose(
     """
     assert options.pose is not None
     pose = read_table(options.pose, options.pose_map, options)
+    pose = with_readings(pose, tuple(r for r in options.read if r[0] in OF_POSE))
     for name, text in (("pos", "position"), ("quat", "attitude")):
         if name not in pose.signals:
             reason = f"holds no {text}; name its columns with --pose-map"
@@ -104,6 +107,10 @@ def with_pose(
     if "rate" not in recording.signals:
         raise FlightLogError(recording.name, None, None, "holds no gyro to align a pose with")
     pose, time_findings = _in_seconds(pose)
+    for source, samples in ((pose, pose.signals["quat"]), (recording, recording.signals["rate"])):
+        if (length_s := samples.time_s[-1] - samples.time_s[0]) > LONG_S:
+            reason = f"lasts {length_s:.4g} s, more than {LONG_S:g} s; name its unit of time, or "
+            raise FlightLogError(source.name, "time", None, reason + "cut it")
     quat, alignment, attitude_findings = _align_pose(pose, recording, options.fix)
     rotation_deg = alignment.rotation_deg
     text = (
@@ -112,6 +119,9 @@ def with_pose(
         f"rates correlate by {alignment.correlation:.3f}"
     )
     findings = [*pose.findings, *time_findings]
+    if left_out := [name for name in OTHER_WORLD if name in recording.signals]:
+        text = f"{' and '.join(left_out)} of the log are in another world frame: left out"
+        findings.append(Finding("note", "pose", text))
     findings += [Finding("ok", "pose clock", text), *attitude_findings]
     if abs(alignment.drift) > max(DRIFT, 4.0 * alignment.drift_sd):
         text = (
@@ -139,9 +149,9 @@ def with_pose(
 
 def _join(recording: Recording, pose: Recording, quat: Signal, alignment: Alignment) -> Recording:
     """Return `recording` with the pose, whose attitude is `quat`, on the recording's clock."""
-    signals = dict(recording.signals)
+    signals = {n: samples for n, samples in recording.signals.items() if n not in OTHER_WORLD}
     for name, samples in {**pose.signals, "quat": quat}.items():
-        if name in ("pos", "quat", "vel"):
+        if name in OF_POSE:
             time_s = alignment.offset_s + (1.0 + alignment.drift) * samples.time_s
             signals[name] = Signal(time_s, samples.value)
     return replace(recording, signals=signals)
@@ -159,8 +169,11 @@ def _has_wrong_sign(recording: Recording) -> bool:
 
 def _in_seconds(pose: Recording) -> tuple[Recording, list[Finding]]:
     """Return the pose with its time in seconds, in the unit that gives a usual camera rate."""
-    step = median_step(pose.signals["quat"].time_s)
-    unit = min(TIMES, key=lambda name: abs(np.log(step * TIMES[name] / USUAL_STEP_S)))
+    time_s = pose.signals["quat"].time_s
+    step, length = median_step(time_s), time_s[-1] - time_s[0]
+    # A slow pose is no fast one in a smaller unit, in which it would be too short.
+    units = [unit for unit, factor in TIMES.items() if length * factor >= OVERLAP_S] or list(TIMES)
+    unit = min(units, key=lambda name: abs(np.log(step * TIMES[name] / USUAL_STEP_S)))
     if unit == "s":
         return pose, []
     scaled = {n: Signal(s.time_s * TIMES[unit], s.value) for n, s in pose.signals.items()}
@@ -215,15 +228,11 @@ def align(quat: Signal, rate: Signal, name: str, mirrored: bool = False) -> Alig
         mirrored: fit a reflection instead of a rotation (one axis of the gyro is inverted).
 
     Raises:
-        FlightLogError: where either signal is too short, too long or has too few samples.
+        FlightLogError: where either signal is too short or has too few samples.
     """
     centre_s, pose_rate_b = _pose_rates(quat)
     if len(centre_s) < MIN_SAMPLES:
         raise FlightLogError(name, None, None, "too few poses to align the clocks by")
-    for samples in (quat, rate):
-        if samples.time_s[-1] - samples.time_s[0] > LONG_S:
-            reason = f"lasts more than {LONG_S:g} s; name its unit of time, or cut it"
-            raise FlightLogError(name, "time", None, reason)
     offset = _coarse_offset(centre_s, pose_rate_b, rate, name)
     shared = (centre_s + offset > rate.time_s[0]) & (centre_s + offset < rate.time_s[-1])
     # During the fit, the offset is that in the middle of the flight.
@@ -305,28 +314,9 @@ def _pose_rates(quat: Signal) -> tuple[np.ndarray, np.ndarray]:
     return (0.5 * (quat.time_s[count:] + quat.time_s[:-count]))[no_gap], rates[no_gap]
 
 
-def grid(time_s: np.ndarray, name: str) -> np.ndarray:
-    """Return the grid of the cross-correlation (G,) from the first to the last time [s].
-
-    Args:
-        time_s: (N,) increasing times of a signal [s].
-        name: name of the file, for messages.
-
-    Raises:
-        FlightLogError: where the grid would be longer than any flight.
-    """
-    span, most = time_s[-1] - time_s[0], MOST_ROWS * GRID_S
-    if span > most:
-        reason = (
-            f"lasts {span:.4g} s, allowed are {most:g} s to align clocks by: is its clock damaged?"
-        )
-        raise FlightLogError(name, "time", None, reason)
-    return np.arange(time_s[0], time_s[-1], GRID_S)
-
-
 def _coarse_offset(centre_s: np.ndarray, pose_rate_b: np.ndarray, rate: Signal, name: str) -> float:
     """Return the log's clock minus the pose's clock [s], by correlating the rates' magnitudes."""
-    pose_grid, log_grid = grid(centre_s, name), grid(rate.time_s, name)
+    pose_grid, log_grid = (np.arange(t[0], t[-1], GRID_S) for t in (centre_s, rate.time_s))
     min_overlap = int(OVERLAP_S / GRID_S)
     if min(len(pose_grid), len(log_grid)) < min_overlap:
         raise FlightLogError(name, None, None, f"less than {OVERLAP_S:g} s to align clocks by")

@@ -29,6 +29,9 @@ HELD = (
     "kept:cmd_force",
 )
 """Signals that hold their value until the next sample."""
+MEASURED = ("kept:est_", "kept:acc_w_")
+"""First letters of the kept columns that are measured signals; others, such as a mode, may have
+values between which nothing lies."""
 GAP_S = 0.1
 GAP_STEPS = 5.0
 """A pause between two samples is a gap if it is longer than `GAP_S` seconds and longer than
@@ -58,6 +61,8 @@ def rows_at(recording: Recording, time_s: np.ndarray) -> dict[str, np.ndarray]:
     for name, samples in recording.signals.items():
         if name in HELD:
             rows[name] = held(samples, time_s)
+        elif name.startswith("kept:") and not name.startswith(MEASURED):
+            rows[name] = unchanged(samples, time_s)
         else:
             rows[name] = measured(samples, time_s, smooth=name in SMOOTH)
     if "quat" in rows:
@@ -79,16 +84,18 @@ def row_times(
     start_s: float,
     end_s: float | None,
     within: tuple[float, float] = (-np.inf, np.inf),
+    origin_s: float | None = None,
 ) -> np.ndarray:
     """Return the rows' times (T,) on the recording's clock [s].
 
     Args:
         recording: holds at least one of pos, quat and rate.
         rate_hz: at most this many rows a second.
-        start_s: least time of the first row [s], counted from the first time at which pos, quat
-            and rate all have samples.
+        start_s: least time of the first row [s], counted from `origin_s`.
         end_s: largest time of the last row [s], counted in the same way; None: no limit.
         within: first and last allowed time on the recording's clock [s].
+        origin_s: first sample of the file, on the recording's clock [s]; None: the first time at
+            which pos, quat and rate all have samples.
 
     Raises:
         FlightLogError: where fewer than two samples are left.
@@ -98,7 +105,8 @@ def row_times(
     # The rows lie in the time that all required signals share.
     begin = max(s.time_s[0] for s in needed)
     end = min(s.time_s[-1] for s in needed)
-    last_allowed = end if end_s is None else min(end, begin + end_s)
+    origin_s = begin if origin_s is None else origin_s
+    last_allowed = end if end_s is None else min(end, origin_s + end_s)
     times = recording.signals[slowest(recording)].time_s
     times = times[(times >= begin) & (times <= end)]
     step = median_step(times)
@@ -119,12 +127,12 @@ def row_times(
         step /= parts
     stride = max(1, int(np.ceil(1.0 / (rate_hz * step) - 0.01)))
     valid = (times >= within[0]) & (times <= within[1])
-    time_s = times[valid & (times >= begin + start_s) & (times <= last_allowed)][::stride]
+    time_s = times[valid & (times >= origin_s + start_s) & (times <= last_allowed)][::stride]
     if len(time_s) < 2:
         if valid.any():
             reason = (
-                f"no row between --start and --end; rows are from {times[valid][0] - begin:.1f} to "
-                f"{times[valid][-1] - begin:.1f} s, counted from the file's first sample"
+                f"no row between --start and --end; rows are from {times[valid][0] - origin_s:.1f} "
+                f"to {times[valid][-1] - origin_s:.1f} s, counted from the file's first sample"
             )
         else:
             spans = ", ".join(
@@ -230,6 +238,14 @@ def held(samples: Signal, time_s: np.ndarray) -> np.ndarray:
     longest_age_s = max(HOLD_S, 10.0 * median_step(t)) if len(t) > 1 else np.inf
     out[(last_sample < 0) | (age > longest_age_s)] = np.nan
     return out
+
+
+def unchanged(samples: Signal, time_s: np.ndarray) -> np.ndarray:
+    """Return the nearest sample for rows at `time_s` (T,) as (T, C), NaN in gaps."""
+    index = nearest(samples.time_s, time_s)
+    longest_s = max(GAP_S, GAP_STEPS * median_step(samples.time_s))
+    is_near = np.abs(samples.time_s[index] - time_s) <= longest_s
+    return np.where(is_near[:, None], samples.value[index], np.nan)
 
 
 def in_world(vel_b: Signal, quat: Signal) -> Signal:

@@ -16,7 +16,7 @@ import numpy as np
 
 from eval.logs.columns import LARGEST, FlightLogError
 from eval.logs.faults.finding import Finding
-from eval.logs.faults.reading import TIMES, Readings, option, read_as
+from eval.logs.faults.reading import QUATS, TIMES, Readings, option, read_as
 
 NEEDED = ("pos", "quat", "rate")
 """Signals that a flight log must have; a partial log lacks some of them."""
@@ -24,6 +24,8 @@ BACKWARDS_MAX = 0.05
 """Largest share of samples with non-increasing time in an accepted signal."""
 MAD_TO_SD = 1.4826
 """Factor from a median absolute deviation to the standard deviation of normal noise."""
+LEAST_NORM = 1e-3
+"""Quaternions with a smaller norm are no attitudes: motion capture writes zeros without a body."""
 LEAST_STEP = 1e-15
 """Least step of increasing times, so that a division by it does not overflow."""
 
@@ -52,6 +54,8 @@ class Recording:
     motors have the vehicle's order."""
     about: Mapping[str, Any] = field(default_factory=dict)
     """Metadata of the file: firmware, airframe, start."""
+    has_seconds: bool = False
+    """Whether the format defines the unit of time; otherwise the import checks it."""
 
 
 def make_signal(
@@ -86,7 +90,7 @@ def make_signal(
     forward[1:] = time_s[1:] - np.maximum.accumulate(time_s)[:-1] > LEAST_STEP
     backwards = int(np.sum(~forward))
     if backwards > BACKWARDS_MAX * len(time_s):
-        row = int(np.argmin(forward)) + 1
+        row = int(np.flatnonzero(finite)[np.argmin(forward)]) + 1
         reason = (
             f"time does not increase in {backwards} of {len(time_s)} samples of {name!r}; "
             "cut the file to one flight, and check which column is the time"
@@ -111,6 +115,12 @@ def collect(
     """
     signals, findings = {}, []
     for name, (time_s, value) in parts.items():
+        if name in QUATS:
+            is_lost = np.linalg.norm(value, axis=1) < LEAST_NORM
+            value = np.where(is_lost[:, None], np.nan, value)
+            if is_lost.any():
+                text = f"{np.sum(is_lost)} samples of {name!r} are zeros, no attitude: left out"
+                findings.append(Finding("note", "attitude", text))
         try:
             samples, finding = make_signal(time_s, value, file, name)
         except FlightLogError as error:
@@ -156,6 +166,11 @@ def _next_attitude(quat: Signal | None, time_s: np.ndarray) -> np.ndarray:
         raise ValueError("--read from-body, from-world and plus-gravity need an attitude")
     index = np.clip(np.searchsorted(quat.time_s, time_s), 0, len(quat.time_s) - 1)
     return quat.value[index] / np.linalg.norm(quat.value[index], axis=1, keepdims=True)
+
+
+def without_empty(signals: Mapping[str, Signal]) -> dict[str, Signal]:
+    """Return the signals that have samples; a rotation leaves none without an attitude in time."""
+    return {name: samples for name, samples in signals.items() if len(samples.time_s)}
 
 
 def median_step(time_s: np.ndarray) -> float:

@@ -134,9 +134,13 @@ def check_columns(
     for column, data in values.items():
         _refuse_where(np.isinf(data), name, column, data, "infinite")
         _refuse_where(np.abs(data) > LARGEST, name, column, data, "too large for any unit")
-    present = [group for group in present if _has_values(group, values, name, needed)]
+    empty = [column for column, data in values.items() if np.isnan(data).all()]
+    if missing := [column for group in needed for column in GROUPS[group] if column in empty]:
+        raise FlightLogError(name, missing[0], 1, "missing in every row")
+    present = [group for group in present if not set(GROUPS[group]) & set(empty)]
     if not partial:
-        _need_a_command(present, columns, name)
+        _refuse_half_a_command(present, columns, name)
+        _need_a_command(present, columns, name, empty)
     elif present == ["time"]:
         raise FlightLogError(name, None, None, "holds a time and nothing else that is known")
 
@@ -169,8 +173,6 @@ def _present_groups(
             raise FlightLogError(
                 name, missing[0], None, "missing" + _did_you_mean(missing[0], columns)
             )
-    if needed != ("time",):
-        _refuse_half_a_command(present, columns, name)
     if not len(columns["time"]):
         raise FlightLogError(name, None, None, "no rows; at least 1 s of flight is needed")
     return present
@@ -187,13 +189,19 @@ def _refuse_half_a_command(
     ):
         if one in present and not any(other in present for other in others):
             column = GROUPS[others[0]][0]
-            reason = f"missing; {GROUPS[one][0]} needs it{_did_you_mean(column, columns)}"
+            state = "missing in every row" if column in columns else "missing"
+            reason = f"{state}; {GROUPS[one][0]} needs it{_did_you_mean(column, columns)}"
             raise FlightLogError(name, column, None, reason)
 
 
-def _need_a_command(present: list[str], columns: Mapping[str, np.ndarray], name: str) -> None:
+def _need_a_command(
+    present: list[str], columns: Mapping[str, np.ndarray], name: str, empty: list[str]
+) -> None:
     if not any(all(group in present for group in groups) for groups in COMMANDS):
         hint = _did_you_mean("cmd_thrust", columns) or _did_you_mean("motor_1", columns)
+        commands = dict.fromkeys(group for groups in COMMANDS for group in groups)
+        empty = [column for group in commands for column in GROUPS[group] if column in empty]
+        hint = f"; missing in every row: {', '.join(empty)}" if empty else hint
         reason = (
             "neither cmd_thrust with cmd_rate_x, _y, _z (or cmd_torque_x, _y, _z) "
             "nor motor_1 to motor_4 nor pwm_1 to pwm_4 is there"
@@ -232,17 +240,6 @@ def as_numbers(values: np.ndarray, column: str, name: str) -> np.ndarray:
         except (TypeError, ValueError):
             raise FlightLogError(name, column, k + 1, f"{value!r} is not a number") from None
     return numbers
-
-
-def _has_values(
-    group: str, values: Mapping[str, np.ndarray], name: str, needed: tuple[str, ...]
-) -> bool:
-    for column in GROUPS[group]:
-        if np.isnan(values[column]).all():
-            if group in needed:
-                raise FlightLogError(name, column, 1, "missing in every row")
-            return False
-    return True
 
 
 def _check_time(time: np.ndarray, row_number: np.ndarray, name: str) -> None:

@@ -28,6 +28,8 @@ MOST_ROWS = 4_000_000
 MOST_CELLS = 100_000_000
 """Most cells of a flight log, rows times columns: all defined columns at `MOST_ROWS`."""
 PARQUET_MAGIC = b"PAR1"
+LONGEST_CELL = 2**26
+"""Longest cell of a CSV, the one with the metadata [bytes]."""
 MOST_BEFORE = 500
 """Most lines of a CSV that are searched for its header."""
 OTHERS = {
@@ -156,7 +158,10 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]
             path,
             # One thread: only then does pyarrow report the numbers of bad rows.
             read_options=pyarrow.csv.ReadOptions(
-                column_names=names, skip_rows=before + 1, use_threads=False
+                column_names=names,
+                skip_rows=before + 1,
+                use_threads=False,
+                block_size=LONGEST_CELL,
             ),
             parse_options=pyarrow.csv.ParseOptions(invalid_row_handler=remember),
             convert_options=pyarrow.csv.ConvertOptions(
@@ -221,11 +226,14 @@ def _check_text(path: Path, columns: int) -> None:
 
 def _csv_header(path: Path) -> tuple[list[str], int]:
     """Return the names of the columns, and the number of lines before them."""
+    usual_limit = csv.field_size_limit(LONGEST_CELL)
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             lines = [row for row, _ in zip(csv.reader(file), range(MOST_BEFORE), strict=False)]
     except (UnicodeDecodeError, csv.Error):
         raise FlightLogError(str(path), None, None, NOT_CSV) from None
+    finally:
+        csv.field_size_limit(usual_limit)
     names = [name.strip() for name in lines[0]] if lines else []
     if len(names) == 1 and any(mark in names[0] for mark in ";\t"):
         reason = "the first line has no commas; separate the columns by commas"
@@ -270,6 +278,8 @@ def _arrays(table: pa.Table, path: Path) -> dict[str, np.ndarray]:
     """Return the columns of a table as arrays; texts are arrays of objects."""
     columns: dict[str, np.ndarray] = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
+        if not name:
+            continue  # commas at the end of the lines
         if name in columns:
             raise FlightLogError(str(path), name, None, "this column is there twice")
         if pa.types.is_null(column.type) or pa.types.is_decimal(column.type):

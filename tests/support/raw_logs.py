@@ -60,7 +60,7 @@ ARDUPILOT = {
     "RATE": (3, "Qfff", "TimeUS,RDes,PDes,YDes"),
     "RCOU": (4, "QHHHH", "TimeUS,C1,C2,C3,C4"),
     "ESC": (5, "QBf", "TimeUS,Instance,RPM"),
-    "BAT": (6, "QBf", "TimeUS,Instance,Volt"),
+    "BAT": (6, "QBf", "TimeUS,Inst,Volt"),
     "CTUN": (7, "Qf", "TimeUS,ThO"),
     "ATT": (8, "Qfff", "TimeUS,Roll,Pitch,Yaw"),
     "XKF1": (9, "QBffffff", "TimeUS,C,VN,VE,VD,PN,PE,PD"),
@@ -68,7 +68,7 @@ ARDUPILOT = {
 TYPES = {"Q": "Q", "N": "16s", "f": "f", "B": "B", "H": "H"}
 
 
-def write_bin(path, truth, pose=False):
+def write_bin(path, truth, pose=False, frame_type=1):
     """Write ArduPilot's .bin: messages are two bytes, their number, and their packed columns."""
     data = bytearray()
 
@@ -87,6 +87,7 @@ def write_bin(path, truth, pose=False):
     for output, motor in enumerate((36, 33, 34, 35), start=1):
         send("PARM", 0, f"SERVO{output}_FUNCTION".encode(), motor, 0.0)
     send("PARM", 0, b"MOT_PWM_MIN", 1100, 1000)
+    send("PARM", 0, b"FRAME_TYPE", frame_type, 1)
     flip, motors = np.array([1.0, -1.0, -1.0]), truth.motor[:, [0, 2, 3, 1]]
     ned, angles = made.ned(truth.pos), _angles(truth)
     for k, t in enumerate((truth.time * 1e6).astype(int) + 7_000_000):
@@ -98,6 +99,7 @@ def write_bin(path, truth, pose=False):
         for esc in range(4):
             send("ESC", t, esc, motors[k, esc] * 30 / np.pi)
         send("BAT", t, 0, truth.voltage[k])
+        send("BAT", t, 1, 5.0)
         send("CTUN", t, truth.thrust[k] / 30.0)
         if pose:
             send("ATT", t, *angles[k])

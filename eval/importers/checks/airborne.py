@@ -60,7 +60,7 @@ def _motor_effort(recording: Recording) -> Signal | None:
         samples = recording.signals.get(name)
         if samples is None or len(samples.time_s) < 10:
             continue
-        thrust_level = np.mean(samples.value, axis=1) ** power
+        thrust_level = np.mean(samples.value**power, axis=1)  # speeds may have the spin's sign
         high_level = float(np.quantile(thrust_level, 0.95))
         if high_level <= 0.0:
             continue
@@ -86,6 +86,8 @@ def _off_ground(pos: Signal, start: float, stop: float) -> tuple[float, float]:
     """
     height = pos.value[:, 2]
     is_inside = (pos.time_s >= start) & (pos.time_s <= stop)
+    if not is_inside.any():
+        return start, stop
     if np.isfinite(start):
         before = height[(pos.time_s < start) & (pos.time_s > start - 1.0)]
         ground = float(np.median(before)) if len(before) else float(height[is_inside][0])

@@ -137,9 +137,9 @@ def _without_glitches(vel: Signal, pos: Signal) -> tuple[Signal, list[Finding]]:
     path = velocity_from_position(pos.time_s, pos.value)
     slope = np.stack([np.interp(vel.time_s, pos.time_s, column) for column in path.T], axis=1)
     error = vel.value - slope
-    deviation = np.abs(error - np.median(error, axis=0))
-    error_sd = MAD_TO_SD * np.median(deviation, axis=0)
-    speed = float(np.sqrt(np.mean(np.sum(slope**2, axis=1))))
+    deviation = np.abs(error - np.nanmedian(error, axis=0))  # no slope at a lone position
+    error_sd = MAD_TO_SD * np.nanmedian(deviation, axis=0)
+    speed = float(np.sqrt(np.nanmean(np.sum(slope**2, axis=1))))
     if np.linalg.norm(error_sd) > 0.3 * max(speed, VEL_LEAST):
         return vel, []
     bad = np.any(deviation > np.maximum(GLITCH_SD * error_sd, VEL_LEAST), axis=1)

@@ -11,7 +11,7 @@ from eval.importers.signals import Recording, Signal
 from eval.logs.faults.clock import LATE_S, LEAST_S, SURE, delay_of
 from eval.logs.faults.finding import Finding
 
-LATE = ("pos", "quat", "vel")
+OF_POSE = ("pos", "quat", "vel")
 """Signals of the device that measures the pose; they share its delay."""
 
 
@@ -46,7 +46,7 @@ def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Findin
         return recording, findings
     drift = fit.drift if fit.drifts else 0.0
     signals = dict(recording.signals)
-    for name in LATE:
+    for name in OF_POSE:
         if name in signals:
             time_s, value = signals[name]
             signals[name] = Signal(time_s - (delay + drift * (time_s - fit.middle_s)), value)

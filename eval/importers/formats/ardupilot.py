@@ -50,6 +50,17 @@ QUAD_X = ((1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0))
 left, rear right."""
 QUAD_PLUS = ((0.0, -1.0), (0.0, 1.0), (1.0, 0.0), (-1.0, 0.0))
 """Positions of motors 1 to 4 of a quadrotor plus (x forward, y left): right, left, front, rear."""
+_BETAFLIGHT_X = ((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
+MOTOR_SIDES = {
+    **dict.fromkeys((0, 6, 16), QUAD_PLUS),
+    **dict.fromkeys((1, 2, 3, 17), QUAD_X),
+    **dict.fromkeys((12, 18), _BETAFLIGHT_X),
+    13: ((1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0)),
+    14: ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)),
+}
+"""FRAME_TYPE of a quadrotor -> positions of motors 1 to 4 (ArduPilot's AP_MotorsMatrix.cpp)."""
+INSTANCES = ("I", "C", "Inst", "Instance")
+"""Columns with the number of the sensor, core or battery of a message."""
 MOTOR_1 = 33
 """SERVOn_FUNCTION of motor 1; motors 2 to 4 have the next numbers."""
 DEG, RPM = np.pi / 180.0, np.pi / 30.0
@@ -111,9 +122,15 @@ def read(path: Path, options: ImportOptions) -> Recording:
         text = f"FRAME_CLASS is {frame_class}, not 1: no quadrotor"
         fault = ("motor_count", None, 0.95, "none: only quadrotors can be diagnosed")
         findings.append(Finding("doubt", "motors", text, *fault))
-    motor_side = QUAD_PLUS if parameters.get("FRAME_TYPE", 1.0) == 0.0 else QUAD_X
+    frame_type = int(parameters.get("FRAME_TYPE", 1.0))
+    if frame_type not in MOTOR_SIDES:
+        text = f"the order of FRAME_TYPE {frame_type} is unknown; that of a quadrotor X is read"
+        findings.append(Finding("note", "motors", text))
+    motor_side = MOTOR_SIDES.get(frame_type, QUAD_X)
     signals, more_findings = collect(parts, str(path))
-    return Recording(str(path), signals, (*findings, *more_findings), motor_side, about)
+    return Recording(
+        str(path), signals, (*findings, *more_findings), motor_side, about, has_seconds=True
+    )
 
 
 def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]]:
@@ -186,7 +203,8 @@ def _close(reader: Any, kind: object, error: object, trace: TracebackType | None
 def _columns(rows: list[dict[str, Any]], name: str) -> Rows:
     """Return the numeric columns of a message: of its first instance or core, or of all ESCs."""
     if name != "ESC":
-        rows = [r for r in rows if not r.get("I", r.get("C", 0))] or rows
+        key = next((k for k in INSTANCES if k in rows[0]), "")
+        rows = [r for r in rows if not r.get(key, 0)] or rows
     numeric = [k for k, v in rows[0].items() if isinstance(v, (int, float))]
     return {k: np.array([r.get(k, np.nan) for r in rows], dtype=np.float64) for k in numeric}
 

@@ -161,7 +161,8 @@ def read(path: Path, options: ImportOptions) -> Recording:
         {name: (time_s, value) for name, value in parts.items()}, box.name
     )
     about = {our_key: str(box.header[key]) for key, our_key in ABOUT.items() if box.header.get(key)}
-    return Recording(box.name, signals, (*findings, *more_findings), MOTOR_SIDE, about)
+    findings += more_findings
+    return Recording(box.name, signals, tuple(findings), MOTOR_SIDE, about, has_seconds=True)
 
 
 def _volts(voltage: np.ndarray, unit: str, fix: bool, findings: list[Finding]) -> np.ndarray:
@@ -191,6 +192,10 @@ def _outputs(box: Blackbox, findings: list[Finding]) -> dict[str, np.ndarray]:
     low, high = box.settings("motorOutput", PULSES if np.nanmin(raw) >= PULSES[0] else DSHOT)
     if not high > low:
         return {}
+    names = [f"motor[{k}]" for k in range(8) if box.has(f"motor[{k}]")]
+    if len(names) > 4 and not any(_ERPM.match(column) for column in box.columns):
+        is_on = np.any(box.values(names, {"": 1.0}) > low, axis=0)
+        findings += check_count(int(np.sum(is_on)), "of the log")
     text = f"motor outputs from {low:g} to {high:g} are 0 to 1"
     findings.append(Finding("note", "motors", text))
     return {"pwm": np.clip((raw - low) / (high - low), 0.0, 1.0)}

@@ -92,7 +92,8 @@ def read(path: Path, options: ImportOptions) -> Recording:
         missing,
         options,
     )
-    return replace(recording, findings=(*findings, *recording.findings))
+    findings = [*findings, *recording.findings]
+    return replace(recording, findings=tuple(findings), has_seconds=True)
 
 
 def decode(data: bytes, name: str) -> tuple[dict[str, dict[str, np.ndarray]], list[Finding]]:

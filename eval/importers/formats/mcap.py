@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from eval.importers.mapping_file import motor_side_of
+from eval.importers.mapping_file import map_file, motor_side_of
 from eval.importers.options import ImportOptions
 from eval.importers.rows import in_world
-from eval.importers.signals import Recording, Signal, collect
+from eval.importers.signals import Recording, Signal, collect, without_empty
 from eval.logs.columns import FlightLogError, quoted
 from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import Finding
@@ -87,9 +87,9 @@ def read(path: Path, options: ImportOptions) -> Recording:
         reason = f"the file has no topic {topic_of[missing[0]]!r}, which the mapping names"
         raise FlightLogError(str(path), None, None, reason)
     messages = _on_one_clock(chosen, findings)
-    findings += _motor_count(messages)
     signals, more_findings = _signals(messages, str(path))
-    return Recording(str(path), signals, (*findings, *more_findings), motor_side)
+    findings += _motor_count(messages)
+    return Recording(str(path), signals, (*findings, *more_findings), motor_side, has_seconds=True)
 
 
 def _choices(
@@ -98,7 +98,7 @@ def _choices(
     """Return the topics that a mapping file selects, by kind, and the positions of its motors."""
     if map_path is None:
         return {}, None
-    top, topics, motor_side = read_toml(map_path), {}, None
+    top, topics, motor_side = read_toml(map_file(map_path)), {}, None
     if top.has("topics"):
         table = top.table("topics")
         topics = {kind: table.text(kind) for kind in KINDS if table.has(kind)}
@@ -212,7 +212,7 @@ def _signals(
     signals, findings = collect(parts, name)
     if "vel" in signals and "quat" in signals:
         signals["vel"] = in_world(signals["vel"], signals["quat"])
-    return signals, findings
+    return without_empty(signals), findings
 
 
 def _xyz(vector: Any) -> list[float]:

@@ -109,7 +109,9 @@ def read(path: Path, options: ImportOptions) -> Recording:
     signals, more_findings = collect(parts, str(path))
     info = log.msg_info_dict
     about = {key: str(info[key]) for key in ("sys_name", "ver_hw", "ver_sw") if key in info}
-    return Recording(str(path), signals, (*findings, *more_findings), motor_side, about)
+    return Recording(
+        str(path), signals, (*findings, *more_findings), motor_side, about, has_seconds=True
+    )
 
 
 class _TruncationSafeReader(io.BufferedReader):

@@ -69,13 +69,23 @@ class Late(NamedTuple):
         )
 
 
-def check_time(rows: Rows) -> list[Finding]:
-    """Return a finding where the time between rows is impossible in seconds."""
+def check_time(rows: Rows, fastest: float | None = None) -> list[Finding]:
+    """Return a finding where the time between rows is impossible in seconds.
+
+    Args:
+        rows: `time` (T,), of the slowest signal.
+        fastest: time between samples of the fastest signal, in the same unit; None: of the rows.
+    """
     step = float(np.median(np.diff(rows["time"])))
-    low, high = STEPS_S
-    if low <= step <= high:
+    fastest, (low, high) = step if fastest is None else fastest, STEPS_S
+
+    def fitting(*steps: float) -> list[str]:
+        return [u for u, factor in TIMES.items() if all(low <= s * factor <= high for s in steps)]
+
+    # A signal may be slower than any row, so the fastest one decides where no unit fits both.
+    possible_units = fitting(step, fastest) or fitting(fastest)
+    if "s" in possible_units:
         return []
-    possible_units = [unit for unit, factor in TIMES.items() if low <= step * factor <= high]
     figures = f"rows are {step:.3g} apart, which is no distance in s"
     if len(possible_units) != 1:
         return [Finding("doubt", "time", f"{figures}, ms, us or ns", "time_unit", step, 0.95)]

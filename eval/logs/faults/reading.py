@@ -46,6 +46,8 @@ _ORDER = re.compile(r"^[1-4](,[1-4]){3}$")
 _ANGLES = ("-roll", "-pitch", "-yaw")
 ORDERS = ("xyzw", "wxyz", "ned-xyzw", "ned-wxyz")
 """Steps that change the order of a quaternion's columns."""
+BY_ATTITUDE = ("from-body", "from-world", "plus-gravity")
+"""Steps that need an attitude."""
 _QUAT_STEPS = (*ORDERS, "inverse", "ned", "frd", *_ANGLES)
 Readings = tuple[tuple[str, str], ...]
 """(signal, steps) in the order of application."""
@@ -63,12 +65,14 @@ def parse_readings(texts: Sequence[str]) -> Readings:
         if not equals or signal not in (*QUATS, *VECTORS, *MOTORS, *SCALARS, "time"):
             names = ", ".join((*QUATS, *VECTORS, *MOTORS, *SCALARS, "time"))
             raise ValueError(f"--read {text!r}: give SIGNAL=STEPS; signals are {names}")
-        for step in steps.split("+"):
+        for step in _split(steps):
             if not _allowed(signal, step):
                 raise ValueError(
                     f"--read {text!r}: {step!r} is no step of {signal}; allowed are a factor, "
                     "x,-y,-z for vectors, 2,1,4,3 for motors, and what docs/import.md lists"
                 )
+            if step != steps and (signal == "time" or step == "drop"):
+                raise ValueError(f"--read {text!r}: {step!r} stands alone; leave the others out")
         readings.append((signal, steps))
     return tuple(readings)
 
@@ -96,8 +100,8 @@ def read_as(
         quat: function that returns the attitude (N, 4) wxyz at the same times; needed by
             `from-body`, `from-world` and `plus-gravity`.
     """
-    for step in steps.split("+"):
-        if step in ("from-body", "from-world", "plus-gravity"):
+    for step in _split(steps):
+        if step in BY_ATTITUDE:
             assert quat is not None
             value = _turned(value, step, quat())
         elif step == "1000-2000":
@@ -132,6 +136,11 @@ def axes_matrix(step: str) -> np.ndarray:
     for row, part in enumerate(step.split(",")):
         matrix[row, "xyz".index(part[-1])] = -1.0 if part[0] == "-" else 1.0
     return matrix
+
+
+def _split(steps: str) -> list[str]:
+    """Return the steps of a reading; the plus of a factor such as 1e+3 divides none."""
+    return re.split(r"(?<![0-9.][eE])\+", steps)
 
 
 def _allowed(signal: str, step: str) -> bool:

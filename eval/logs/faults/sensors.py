@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import rotate
@@ -64,8 +65,9 @@ def check_accelerometer_bias(rows: Rows) -> list[Finding]:
     acc_up = rotate(rows["quat"], rows["acc"])[:, 2] - GRAVITY
     both = np.stack([acc_up, up * load**2], axis=1)
     count = max(1, round(SPAN_S / float(np.median(np.diff(time_s)))))
-    sums = np.cumsum(both, axis=0)
-    acc_up, power = ((sums[count:] - sums[:-count]) / count).T
+    if len(time_s) <= count:
+        return []
+    acc_up, power = sliding_window_view(both, count, axis=0).mean(axis=-1)[1:].T
     error_up = acc_up - (vel[count:, 2] - vel[:-count, 2]) / (time_s[count:] - time_s[:-count])
     good = np.isfinite(error_up) & np.isfinite(power)
     if good.sum() < 5 * count or min(np.std(power[good]), np.std(error_up[good])) < 1e-6:
@@ -98,7 +100,7 @@ def check_barometer(rows: Rows) -> list[Finding]:
     drive = next((n for n in ("throttle", "pwm", "motor") if n in rows), None)
     if height is None or drive is None:
         return []
-    load = np.nanmean(np.abs(rows[drive]), axis=1)
+    load = np.mean(np.abs(rows[drive]), axis=1)
     running = load > 0.3 * np.nanquantile(load, 0.9)
     if running.all() or not running.any():
         text = "the log has no row before the motors start"

@@ -84,26 +84,27 @@ def test_what_a_reader_quotes_of_a_damaged_file_is_one_line(tmp_path, monkeypatc
     assert str(met.value).isprintable() and len(os.listdir("/proc/self/fd")) == len(held)
 
 
-@pytest.mark.parametrize("rate", ["missing", "three numbers", "a header"])
+@pytest.mark.parametrize("rate", ["missing", "three numbers", "a header", "no speeds"])
 def test_messages_of_another_definition_are_refused(tmp_path, monkeypatch, rate):
     """What was written under the true definition is read under the other one."""
     path = made.write_mcap(tmp_path / "log.mcap", span=(0, 2))
     from mcap_ros2.decoder import DecoderFactory
 
+    kind = "actuator_msgs/Actuators" if rate == "no speeds" else "sensor_msgs/Imu"
     decoder_for = DecoderFactory.decoder_for
 
     class Odd:
         def __init__(self, message):
             self.header = message.header
-            if rate != "missing":
+            if rate not in ("missing", "no speeds"):
                 self.angular_velocity = [0.0] * 3 if rate == "three numbers" else message.header
 
     def other(self, encoding, schema):
         decode: Any = decoder_for(self, encoding, schema)
-        return (lambda data: Odd(decode(data))) if schema.name.endswith("Imu") else decode
+        return (lambda data: Odd(decode(data))) if schema.name.endswith(kind[-3:]) else decode
 
     monkeypatch.setattr(DecoderFactory, "decoder_for", other)
-    with pytest.raises(FlightLogError, match="differ from the definition of sensor_msgs/Imu"):
+    with pytest.raises(FlightLogError, match=f"differ from the definition of {kind}"):
         import_log(path)
 
 

@@ -1,6 +1,7 @@
 """Logs of PX4, Betaflight, ArduPilot, Crazyflie and ROS 2, made from a flight that is known."""
 
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -101,6 +102,19 @@ def test_motors_are_where_each_firmware_has_them():
     x = ((front, right), (rear, left), (front, left), (rear, right))
     assert px4.QUAD_X == ardupilot.QUAD_X == x
     assert ardupilot.QUAD_PLUS == ((0, right), (0, left), (front, 0), (rear, 0))
+    assert ardupilot.MOTOR_SIDES[18] == ardupilot.MOTOR_SIDES[12] == betaflight.MOTOR_SIDE
+    anticlockwise = ((front, right), (front, left), (rear, left), (rear, right))
+    assert ardupilot.MOTOR_SIDES[13] == anticlockwise
+    assert ardupilot.MOTOR_SIDES[14] == (anticlockwise[0], *anticlockwise[:0:-1])
+
+
+@pytest.mark.parametrize(
+    ("frame_type", "told"), [(14, "the file's 1, 2, 3, 4"), (19, "TYPE 19 is")]
+)
+def test_the_type_of_an_ardupilot_frame_orders_its_motors(tmp_path, frame_type, told):
+    truth = known_flight.fly(np.arange(0.0, 1.5, 0.01))
+    path = write_bin(tmp_path / "log.bin", truth, frame_type=frame_type)
+    assert told in text(import_log(path, None, PARTIAL)[1], "motors")
 
 
 def test_a_map_of_columns_and_an_odd_number_of_poles_are_not_for_betaflight(tmp_path):
@@ -197,6 +211,8 @@ def test_mcap_topics_are_chosen_by_a_map(tmp_path):
     chosen.write_text('[topics]\nodometry = "/imu"\n')
     with pytest.raises(FlightLogError, match="'/imu' has no nav_msgs/Odometry"):
         import_log(path, None, ImportOptions(map=chosen))
+    with pytest.raises(ValueError, match=r"mappings/crazyswarm2\.toml: .* unknown"):
+        import_log(path, None, ImportOptions(map=Path("crazyswarm2")))
 
 
 def test_mcap_motors_are_put_in_order_by_a_map(tmp_path):
@@ -301,6 +317,13 @@ def test_rotors_without_a_turn_are_not_counted_and_speeds_are_of_the_poles():
     columns["eRPM[4]"][1] = 1.0
     betaflight._motors(box, 14, findings)
     assert "motor_count" in {finding.fault for finding in findings}
+
+
+def test_a_hexacopter_is_counted_by_its_outputs_where_it_logs_no_speeds(tmp_path):
+    path = made.write_blackbox(tmp_path / "log.csv", span=(0, 2), rate=250.0)
+    path.write_text(path.read_text().replace("eRPM[0], eRPM[1]", "motor[4], motor[5]"))
+    path.write_text(path.read_text().replace("eRPM[", "other["))
+    assert "6 motors of the log turn" in text(import_log(path, None, PARTIAL)[1], "motors")
 
 
 @pytest.mark.parametrize(

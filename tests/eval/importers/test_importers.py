@@ -16,7 +16,7 @@ from eval.logs.faults.finding import Finding, finding_lines
 from eval.logs.flight_log import read_flight, write_flight
 from tests.support import foreign_logs as made
 from tests.support import known_flight
-from tests.support.imported import flight, near, write
+from tests.support.imported import flight, near, text, write
 from tests.support.vehicles import PLAIN
 
 FULL = ImportOptions(full_thrust=30.0)
@@ -126,6 +126,20 @@ def test_a_recording_becomes_a_log_that_says_where_it_is_from():
     assert log.about["findings"] == [finding._asdict() for finding in findings]
 
 
+@pytest.mark.parametrize(("scale", "known"), [(1.0, False), (1e3, False), (1.0, True)])
+def test_a_slow_pose_leaves_the_unit_of_time_to_faster_signals(scale, known):
+    parts = flight(end=30.0)
+    time_s = parts.pop("time") * scale
+    rows = {name: slice(None, None, 100 if name in ("pos", "quat") else 1) for name in parts}
+    signals = {n: Signal(time_s[rows[n]], value[rows[n]]) for n, value in parts.items()}
+    if known:  # no faster signal
+        signals = {name: signals[name] for name in ("pos", "quat")}
+    asked = ImportOptions(vehicle=PLAIN, partial=True, fix=False)
+    log, findings = assemble(Recording("log", signals, has_seconds=known), "made", asked)
+    assert log.duration_s == pytest.approx(29.5)
+    assert ("time_unit" in {f.fault for f in findings}) is (scale != 1.0)
+
+
 def test_start_and_end_cut_more_than_the_time_on_the_ground():
     parts = dict(recording().signals)
     del parts["cmd_thrust"], parts["cmd_rate"]
@@ -144,6 +158,29 @@ def test_start_and_end_cut_more_than_the_time_on_the_ground():
     kept, _ = assemble(Recording("log", parts), "made", replace(asked, trim=False))
     assert kept.duration_s == pytest.approx(1.5, abs=0.02)
     near(kept.rate_b, known_flight.fly(kept.time_s + 0.1).rate, 1e-6)
+
+
+def test_start_counts_from_the_files_first_sample_and_not_from_the_poses():
+    parts = flight(end=8.0)
+    time_s = parts.pop("time")
+    rows = {name: slice(600 if name in ("pos", "quat") else 0, None) for name in parts}
+    signals = {n: Signal(time_s[rows[n]], value[rows[n]]) for n, value in parts.items()}
+    log, _ = assemble(Recording("log", signals), "made", ImportOptions(start_s=4.0, end_s=6.0))
+    near(log.pos_w, known_flight.fly(log.time_s + 4.0).pos, 1e-9)
+    assert log.duration_s == pytest.approx(2.0, abs=0.01)
+
+
+def test_readings_come_before_a_pose_is_aligned_and_unused_ones_are_noted(tmp_path):
+    parts = flight()
+    truth, time_s = known_flight.fly(np.arange(1, 7, 0.01)), parts["time"] * 1e3
+    pose = {"time": truth.time, "pos": truth.pos, "quat": truth.quat[:, [1, 2, 3, 0]]}
+    for name in ("pos", "quat", "vel"):
+        del parts[name]
+    read = (("time", "ms"), ("quat", "xyzw"), ("motor", "0.5"))
+    options = ImportOptions(pose=write(tmp_path / "pose.csv", pose), read=read, fix=False)
+    log, findings = import_log(write(tmp_path / "log.csv", parts | {"time": time_s}), None, options)
+    near(log.rot_w, known_flight.fly(log.time_s + 1.0).rot, 1e-4)
+    assert "--read motor=0.5 is not used: the log has no motor" in text(findings, "file")
 
 
 @pytest.mark.parametrize(

@@ -153,6 +153,16 @@ def test_broken_and_short_lists_are_refused_by_column_and_row(tmp_path, truth, c
         imported(tmp_path, POSE, columns, partial=True)
 
 
+def test_a_velocity_without_an_attitude_is_left_out_and_a_mode_has_no_mean(tmp_path, truth):
+    columns, half = parts(truth), len(truth.time) // 2
+    columns["q"][half:] = [""] * half
+    columns["v"] = [""] * (half + 20) + cells(truth.vel[half + 20 :])
+    columns["mode"] = [str(2 + (k > 151)) for k in range(2 * half)]
+    mapping = f'keep = ["mode"]\n{POSE}vel = {{column = "v", axes = "body"}}\n'
+    log, _ = imported(tmp_path, mapping, columns, partial=True, rate_hz=20.0)
+    assert log.velocity_derived and set(log.extra["mode"]) == {2.0, 3.0}
+
+
 def test_the_first_time_that_is_there_counts(tmp_path, truth):
     times = 'time = [{column = "stamp"}, {column = "t"}]\n'
     log, _ = imported(tmp_path, times + POSE, parts(truth), partial=True)

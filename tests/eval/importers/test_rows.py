@@ -8,14 +8,14 @@ from eval.importers import import_log
 from eval.importers.checks.airborne import airborne
 from eval.importers.checks.glitches import clean
 from eval.importers.options import ImportOptions
-from eval.importers.pose import align, grid
+from eval.importers.pose import _in_seconds, align, with_pose
 from eval.importers.rows import averaged, row_times, smoothed
 from eval.importers.signals import Recording, Signal, make_signal, median_step
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.reading import read_as
 from tests.support import foreign_logs as made
 from tests.support import known_flight
-from tests.support.imported import flight, of, write
+from tests.support.imported import flight, of, text, write
 
 
 def test_differing_rates_jitter_and_holes(tmp_path):
@@ -101,8 +101,6 @@ def test_samples_that_are_ages_apart_are_no_rows():
     assert pose is not None
     with pytest.raises(FlightLogError, match=r"1e\+07 s apart.* at most 4,000,000: is its clock"):
         row_times(Recording("log", {"pos": pose}), 100.0, 0.0, None)
-    with pytest.raises(FlightLogError, match=r"1\.99e\+09 s, allowed are .* to align clocks by"):
-        grid(time, "log")
 
 
 def test_two_flights_in_one_file_are_refused(tmp_path):
@@ -131,6 +129,8 @@ def test_unknown_samples_and_steps_of_time_that_are_none_are_left_out():
 def test_a_time_that_goes_back_often_is_refused_and_few_known_samples_are_no_signal():
     with pytest.raises(FlightLogError, match=r"row 2: .* 9 of 10 samples of 'gyro'"):
         make_signal(np.arange(10.0)[::-1], np.zeros((10, 3)), "log", "gyro")
+    with pytest.raises(FlightLogError, match="row 4: "):
+        make_signal(np.arange(10.0)[::-1], np.array([np.nan] * 2 + [0.0] * 8), "log", "gyro")
     assert make_signal(np.full(3, np.nan), np.zeros(3), "log", "gyro") == (None, None)
     assert median_step(np.array([0.0, 0.5, 1.0, 9.0])) == 0.5 and median_step(np.zeros(1)) == np.inf
 
@@ -163,6 +163,14 @@ def test_a_jump_of_position_and_one_of_speed_are_left_out(signals):
     assert len(cleaned.signals["pos"].time_s) == 599
     assert np.abs(cleaned.signals["vel"].time_s - 3.2).min() > 0.005
     assert {finding.signal for finding in findings} == {"position", "velocity"}
+
+
+def test_a_lone_position_does_not_end_the_check_of_velocities(signals):
+    kept = np.delete(np.arange(600), [*range(400, 425), *range(426, 450)])
+    signals["pos"] = Signal(*(part[kept] for part in signals["pos"]))
+    signals["vel"].value[320] += [1.0, 0.0, 0.0]
+    cleaned, _ = clean(Recording("log", signals))
+    assert 599 == len(cleaned.signals["vel"].time_s)
 
 
 def test_repeated_poses_are_left_out_with_what_is_logged_with_them(signals):
@@ -217,6 +225,20 @@ def test_without_motors_or_without_a_take_off_nothing_is_cut():
     assert span == (-np.inf, np.inf) and finding.status == "ok"
     span, (finding,) = airborne(Recording("log", {"pos": signals["pos"]}))
     assert span == (-np.inf, np.inf) and "no signal shows when the motors" in finding.evidence
+
+
+def test_positions_that_miss_the_flight_move_neither_end_of_it():
+    signals = recording().signals
+    late = TIME < 1.2
+    pos = Signal(TIME[late], signals["pos"].value[late])
+    span, _ = airborne(Recording("log", {"pos": pos, "pwm": signals["pwm"]}))
+    np.testing.assert_allclose(span, (1.75, 8.15), atol=0.02)
+
+
+def test_speeds_with_the_sign_of_their_spin_show_the_flight():
+    speed = np.where((TIME > 2.0) & (TIME < 8.0), 700.0, 50.0)[:, None] * [1.0, -1.0, 1.0, -1.0]
+    span, _ = airborne(Recording("log", {"motor": Signal(TIME, speed)}))
+    np.testing.assert_allclose(span, (2.0, 8.0), atol=0.02)
 
 
 def _gyro(span, rate=500.0, bias=0.0, noise=0.0):
@@ -294,6 +316,30 @@ def test_faults_of_the_poses_are_corrected(tmp_path):
     truth = known_flight.fly(log.time_s + 1.0003)
     np.testing.assert_allclose(log.pos_w, truth.pos, atol=2e-3)
     np.testing.assert_allclose(np.abs(np.sum(log.quat_wxyz * truth.quat, 1)), 1.0, atol=1e-5)
+
+
+def test_attitudes_of_zeros_are_dropouts_and_a_velocity_in_the_logs_world_is_dropped(tmp_path):
+    path = made.write_mocap(tmp_path / "pose.csv", span=(1, 7), offset=4.0)
+    lines = path.read_text().splitlines()
+    lines[200:210] = [",".join([*line.split(",")[:4], "0,0,0,0"]) for line in lines[200:210]]
+    path.write_text("\n".join(lines))
+    usd = made.write_usd(tmp_path / "log00")
+    log, findings = import_log(usd, None, ImportOptions(pose=path, full_thrust=30.0))
+    found = text(findings, "attitude") + text(findings, "pose")
+    assert "10 samples of 'quat' are zeros" in found and "vel of the log are in another" in found
+    truth = known_flight.fly(log.time_s + 1.0)
+    assert log.velocity_derived and np.isfinite(log.quat_wxyz).mean() > 0.95
+    off = 1.0 - np.abs(np.sum(log.quat_wxyz * truth.quat, 1))
+    assert np.nanmax(off) < 1e-4
+
+
+def test_slow_poses_are_no_fast_ones_in_a_smaller_unit_and_the_long_file_is_named(tmp_path):
+    poses = _poses((0, 60), 2.0, 0.0, 0.0)
+    assert _in_seconds(Recording("pose", {"quat": poses}))[1] == []
+    fast = Signal(np.arange(0, 8e6, 5e3), known_flight.fly(np.arange(0, 8, 0.005)).rate)
+    with pytest.raises(FlightLogError, match=r"^log: column time: lasts 7.995e\+06 s, more"):
+        path = made.write_mocap(tmp_path / "pose.csv", span=(0, 8))
+        with_pose(Recording("log", {"rate": fast}), ImportOptions(pose=path))
 
 
 def test_a_turned_marker_body_is_corrected(tmp_path):

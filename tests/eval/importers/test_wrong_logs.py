@@ -61,7 +61,7 @@ def imported(folder, lacks, change=lambda parts: parts, mapping=("", ""), vehicl
     truth = known_flight.fly(np.arange(0.0, 16.0, 0.01))
     log = FlightLog("known", truth.time, truth.pos, truth.quat, truth.vel, truth.rate, truth.thrust,
                     known_flight.fly(truth.time + 0.05).cmd_rate, truth.motor)  # fmt: skip
-    written = write_table(folder, change(flight_signals(log, PLAIN, np.random.default_rng(1))), 0.0)
+    written = write_table(folder, change(flight_signals(log, PLAIN, np.random.default_rng(1))))
     tables = written.options.map.read_text(encoding="utf-8").replace(*mapping).split("\n[")
     text = "\n[".join(t for t in tables if t.split("]")[0] not in lacks)
     written.options.map.write_text(text, encoding="utf-8")

@@ -97,6 +97,16 @@ def test_files_that_are_no_logs_are_refused(tmp_path):
             read_flight(path)
 
 
+@pytest.mark.parametrize("length", [200_000, 3_000_000])
+def test_a_csv_with_long_metadata_and_columns_without_a_name_is_read(tmp_path, length):
+    log = log_from_columns(columns(), {"notes": "x" * length}, "a")
+    path = write_flight(tmp_path / "a.csv", log)
+    path.write_text(path.read_text().replace("\n", ",,\n"))
+    again = read_flight(path)
+    assert_same(log, again)
+    assert again.about["notes"] == log.about["notes"]
+
+
 def test_a_last_line_that_was_cut_is_left_out_with_a_warning(tmp_path):
     path = write_table(tmp_path / "cut.csv", columns())
     path.write_text(path.read_text().rstrip("\n").rsplit(",", 3)[0])
@@ -196,6 +206,12 @@ BAD = [
     (drop("time", "timestamp"), "time", None, "did you mean 'timestamp'"),
     (drop("vel_y"), "vel_y", None, "missing"),
     (drop("cmd_thrust"), "cmd_thrust", None, "cmd_rate_x needs it"),
+    (
+        spoil("cmd_thrust", slice(None), np.nan),
+        "cmd_thrust",
+        None,
+        "in every row; cmd_rate_x needs",
+    ),
     (drop("cmd_rate_y"), "cmd_rate_y", None, "missing"),
 ]
 
@@ -238,6 +254,9 @@ def test_less_than_a_second_no_rows_and_no_command_are_refused():
         log_from_columns(columns(rows=0), {}, "a")
     with pytest.raises(FlightLogError, match="neither cmd_thrust .* motor_4"):
         log_from_columns(columns(groups=STATE), {}, "a")
+    motors = columns(groups=(*STATE, "motor")) | {"motor_4": np.full(150, np.nan)}
+    with pytest.raises(FlightLogError, match="is there; missing in every row: motor_4"):
+        log_from_columns(motors, {}, "a")
     for name in ("quat_y", "cmd_thrust"):
         with pytest.raises(FlightLogError, match=name):
             log_from_columns(columns() | {name: np.full(150, np.nan)}, {}, "a")

@@ -76,6 +76,11 @@ def check_throttle(rows: Rows) -> list[Finding]:
             findings.append(Finding("doubt", subject, text, "throttle_range", top, 0.95))
             continue
         range_in_words, span, _, reading = fits[0]
+        if not reading:
+            text = f"{figures}: it goes from 0 to 1, with {np.sum(flying > 1.5)} rows of outliers"
+            about = ("throttle_range", top, 0.6, "leave these rows out of the file")
+            findings.append(Finding("doubt", subject, text, *about))
+            continue
         text = f"{figures}: it goes from {range_in_words}, not from 0 to 1"
         findings.append(Finding("corrected", subject, text, "throttle_range", span, 0.98,
                              option((name, reading))))  # fmt: skip

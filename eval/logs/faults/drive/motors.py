@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from itertools import permutations
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import conjugate, rotate
@@ -163,8 +164,7 @@ def _torques(
     if size < CALM_TURN:
         return f"turns change by {size:.2g} rad/s^2 only, too little to check their order by"
     # Mean thrust over the same time, with the delay that correlates best.
-    thrust_sums = np.concatenate([np.zeros((1, 4)), np.cumsum(thrust, axis=0)])
-    mean = (thrust_sums[count:-1] - thrust_sums[: -1 - count]) / count
+    mean = sliding_window_view(thrust, count, axis=0).mean(axis=-1)[:-1]
     step = float(np.median(np.diff(time_s)))
     delayed_means = [np.roll(mean, round(lag / step), axis=0) for lag in LAGS_S]
     mean = max(

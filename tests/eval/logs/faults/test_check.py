@@ -1,11 +1,27 @@
-"""Findings that an import stored in a log, when the log is checked again."""
+"""Readings of a log, and findings that an import stored in it."""
 
 from dataclasses import replace
 
+import numpy as np
+import pytest
+
 from eval.logs.faults.check import CheckContext, check_log
 from eval.logs.faults.finding import Finding
+from eval.logs.faults.reading import parse_readings, read_rows
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN
+
+
+@pytest.mark.parametrize("text", ["time=ms+us", "rate=drop+2", "quat=drop+xyzw"])
+def test_a_unit_of_time_and_a_drop_stand_alone(text):
+    with pytest.raises(ValueError, match="'ms' stands alone|'drop' stands alone"):
+        parse_readings([text])
+
+
+def test_the_exponent_of_a_factor_may_have_a_plus():
+    readings = parse_readings(["rate=1e+3+x,-y,z"])
+    rows = read_rows({"rate": np.ones((1, 3))}, readings)
+    np.testing.assert_array_equal(rows["rate"], [[1e3, -1e3, 1e3]])
 
 
 def test_a_stored_finding_on_another_vehicle_file_is_not_repeated_and_one_on_the_log_is():

@@ -93,6 +93,23 @@ def test_a_fault_is_named_and_its_fix_restores_the_flight(name):
                 np.testing.assert_allclose(fixed[signal], right[signal], rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["motors 3 and 4 swapped", "accelerometer's bias with throttle"])
+def test_a_gap_of_a_signal_leaves_its_check(name):
+    wrong = inject(KINDS[name], good(end=10.0), VEHICLE)
+    for signal in ("motor", "pwm", "throttle", "acc"):
+        wrong[signal][100:120] = np.nan
+    assert named(checked(wrong)[0]) & set(KINDS[name].names)
+
+
+@pytest.mark.parametrize("name", ["throttle", "pwm"])
+def test_an_outlier_is_no_other_range(name):
+    parts = good(end=10.0)
+    parts[name][300] = 3.0
+    findings, readings = checked(parts)
+    (found,) = (f for f in findings if f.fault == "throttle_range")
+    assert "1 rows of outliers" in found.evidence and not found.is_open and not readings
+
+
 @pytest.mark.parametrize("end", [8.0, 12.0, 16.0])
 @pytest.mark.parametrize("wrong", ["acc=-x,-y,-z", "acc=x,-y,-z"])
 def test_an_axis_without_force_does_not_show_its_sign(wrong, end):
