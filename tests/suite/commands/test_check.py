@@ -88,3 +88,16 @@ def test_what_an_import_left_open_is_repeated_and_findings_of_earlier_versions_a
     assert "6 motors turn" in refused(capsys, *line, lines=3)
     old = {"level": "doubt", "subject": "attitude", "text": "39 % off"}
     assert findings_of({"findings": [old, "odd"]}) == (Finding("doubt", "attitude", "39 % off"),)
+
+
+def test_no_log_is_overwritten_by_its_correction_or_by_that_of_another(tmp_path, capsys, flight):
+    first, second = flight(1.0), tmp_path / "b/flight.parquet"
+    second.parent.mkdir()
+    second.write_bytes(first.read_bytes())
+    for flights, out, reason in (
+        ([tmp_path], tmp_path, "is also an input"),
+        ([tmp_path, second], second.parent, "is also an input"),
+        ([tmp_path, second], tmp_path / "out", f"{first} and {second}"),
+    ):
+        assert reason in refused(capsys, "check", *flights, "--fix", "--out", out)
+    assert first.read_bytes() == second.read_bytes() and not (tmp_path / "out").exists()
