@@ -93,4 +93,4 @@ def multiply_adds(spec: PolicySpec) -> int:
     count = rows * columns * 4 * first
     count += (rows - 2) * (columns - 2) * 9 * first * second
     count += (rows - 4) * (columns - 4) * third * (9 * second + hidden)
-    return count + hidden * (spec.state_size + 6 * hidden + 3)
+    return count + hidden * (spec.state_size + 6 * hidden + spec.action.size)

@@ -91,13 +91,13 @@ def c_project(
 def native_actions(
     params: Mapping[str, np.ndarray], spec: PolicySpec, observed: Observed
 ) -> np.ndarray:
-    """Return the actions (T, 3) of the policy in JAX for T observations."""
+    """Return the actions (T, size) of the policy in JAX for T observations."""
     policy = dataclasses.replace(native_policy(params, spec, "policy"), block=1, rows=1)
     return actions_of(policy, observed)
 
 
 def actions_of(policy: Policy, observed: Observed) -> np.ndarray:
-    """Return a policy's actions (T, 3); its memory is cleared where a flight begins."""
+    """Return a policy's actions (T, size); its memory is cleared where a flight begins."""
     hidden, actions = policy.start(1), []
     for state, image, fresh in zip(*observed, strict=True):
         action, hidden = policy.act(hidden, state[None], image[None], np.array([fresh]))

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch
 
+from policies.formats.c.arrays import multiply_adds
 from policies.formats.c.c_file import load_c
 from policies.formats.c.compiler import find_compiler
 from policies.formats.c.project import random_observations
 from policies.formats.export import export_policy
 from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.policy import load_policy
-from policies.spec import PolicySpec
+from policies.spec import ActionSpec, PolicySpec
 from suite.judging.deploy import exporting, latency, parity
 from tests.support.commands import answer, refused, run
 from tests.support.pilots import Steady
@@ -136,13 +137,19 @@ def test_what_a_policy_is_given_on_flights_is_kept_but_for_rows_in_which_nothing
 
 
 @needs_cc
-def test_the_engines_that_are_timed_are_one_policy(folder, tmp_path):
+@pytest.mark.parametrize("kind", ["acceleration", "ctbr"])
+def test_the_engines_that_are_timed_are_one_policy(kind, tmp_path):
+    spec = replace(SPEC, action=ActionSpec(kind))
+    folder = save_policy(tmp_path / "tiny", lively(spec, 2), spec, seed=1)
     export_policy(folder, tmp_path, ["c"])
+    more = spec.action.size - SPEC.action.size  # also of the last action in the state
+    assert multiply_adds(spec) - multiply_adds(SPEC) == 2 * more * spec.hidden_size
     checkpoint = load_policy_checkpoint(folder)
     in_c = latency.c_step(load_c(tmp_path, trust=True))
     usual, _ = latency.onnx_steps(checkpoint)
     in_torch = latency.torch_step(checkpoint)
     for _ in range(3):
         action = in_c()
+        assert action.shape == (1, spec.action.size)
         np.testing.assert_allclose(action, np.asarray(usual()), atol=1e-4)
         np.testing.assert_allclose(action, torch.as_tensor(in_torch()).numpy(), atol=1e-4)
