@@ -15,6 +15,8 @@ from policies.spec import CHANNEL_BLOCK, PolicySpec
 
 BLOCK = CHANNEL_BLOCK
 """Number of outputs in a block."""
+DTYPES = ("float32", "int8")
+"""Types of the weights."""
 LAYERS = ("conv2", "conv3", "image", "gru_input", "gru_hidden")
 """Names of the large layers, which have nearly all weights. Int8 quantises them; the other layers
 are always float."""

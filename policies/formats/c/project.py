@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from policies.formats.c.arrays import float_text
+from policies.formats.c.arrays import DTYPES, float_text
 from policies.formats.c.forward import Observed
 from policies.formats.c.quantised import Quantised, quantise
 from policies.formats.c.quantised import actions as quantised_actions
@@ -24,8 +24,6 @@ from policies.policy import Policy
 from policies.spec import PolicyError, PolicySpec
 from tracks.common.names import printable, unknown_name
 
-DTYPES = ("float32", "int8")
-"""Types of the weights."""
 VECTORS = 12
 """Number of successive steps in vectors.h, in which the policy keeps its memory."""
 TOLERANCE = {"float32": 1e-4, "int8": 0.05}

@@ -17,6 +17,7 @@ from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.policy import load_policy
 from policies.spec import ActionSpec, PolicySpec
 from suite.judging.deploy import exporting, latency, parity
+from suite.judging.flying import default_policy
 from tests.support.commands import answer, refused, run
 from tests.support.pilots import Steady
 from tests.support.policy_files import SPEC, lively, small_checkpoint
@@ -61,6 +62,8 @@ def test_what_cannot_be_exported_or_would_write_over_the_card_of_a_policy_is_ref
     for args, message in (
         ("--format onnx --dtype int8", "supports float32 only"),
         ("--policy race-paper", "give one"),
+        ("--format c --dtype int9", "unknown type 'int9'. Did you mean 'int8'"),
+        ("--format", "no format"),
     ):
         assert message in refused(capsys, f"export {args} --out {tmp_path}", folder)
     assert list(tmp_path.iterdir()) == []
@@ -70,6 +73,15 @@ def test_what_cannot_be_exported_or_would_write_over_the_card_of_a_policy_is_ref
     assert "card.md is also an input and would be overwritten" in said
     names = {path.name for path in folder.iterdir()}
     assert {path.name for path in own.iterdir()} == {*names, exporting.CARD}
+
+
+def test_an_entry_of_the_folder_with_a_formats_name_is_no_policy(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(exporting, "export", lambda *args: asked.append(args) or {"written": []})
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "onnx").mkdir()
+    assert run("export") == 0
+    assert asked[0][0] == default_policy() and asked[0][2] == ("torch", "onnx")
 
 
 @pytest.mark.parametrize(("wanted", "file"), [("onnx", "policy.onnx"), ("c", "policy.c")])
