@@ -47,6 +47,17 @@ def test_a_fault_is_reported_with_its_fix_and_put_right(tmp_path, capsys, flight
     assert not [f for f in again["findings"] if f["status"] == "doubt"]
 
 
+def test_a_throttle_that_the_log_keeps_as_another_column_is_put_right(tmp_path, capsys, flight):
+    throttle = good(end=10.0)["throttle"].ravel()
+    path = flight(1.0, extra={"throttle": 1000.0 + 1000.0 * throttle})
+    answered = checked(tmp_path, capsys, path, "--fix", "--out", tmp_path / "checked")
+    assert ("throttle_range", "corrected") in {
+        (finding["fault"], finding["status"]) for finding in answered["findings"]
+    }
+    fixed = read_flight(answered["written"][0]).extra["throttle"]
+    np.testing.assert_allclose(fixed, throttle, atol=1e-12)
+
+
 def gyro_scale(answered):
     """Return the one finding about the gyro's scale."""
     (found,) = (f for f in answered["findings"] if f["fault"] == "gyro_scale")
