@@ -98,7 +98,8 @@ def test_what_an_import_left_open_is_repeated_and_findings_of_earlier_versions_a
     line = ("diagnose --vehicle", tmp_path / "plain.toml", "--out", tmp_path / "out", path)
     assert "6 motors turn" in refused(capsys, *line, lines=3)
     old = {"level": "doubt", "subject": "attitude", "text": "39 % off"}
-    assert findings_of({"findings": [old, "odd"]}) == (Finding("doubt", "attitude", "39 % off"),)
+    odd = ["odd", doubt._asdict() | {"confidence": "high"}, doubt._asdict() | {"fault": [1]}]
+    assert findings_of({"findings": [old, *odd]}) == (Finding("doubt", "attitude", "39 % off"),)
 
 
 def test_no_log_is_overwritten_by_its_correction_or_by_that_of_another(tmp_path, capsys, flight):
