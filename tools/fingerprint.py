@@ -23,7 +23,7 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from pathlib import Path
 from typing import Any
 
@@ -75,18 +75,20 @@ def weights_digest(folder: Path) -> str:
     return array_digest({f"{f.name}/{k}": v for f in files for k, v in load_file(f).items()})
 
 
-def json_digest(path: Path) -> str:
-    """Return the digest of a JSON file without the keys of `STAMPS`."""
+def json_digest(path: Path, ignored: Container[str] = STAMPS) -> str:
+    """Return the digest of a JSON or JSON Lines file without the keys `ignored`."""
 
     def without_stamps(value: Any) -> Any:
-        """Return contents of a JSON file without the keys of STAMPS; of a path only the name."""
+        """Return contents of a JSON file without the keys `ignored`; of a path only the name."""
         if isinstance(value, dict):
-            return {k: without_stamps(v) for k, v in value.items() if k not in STAMPS}
+            return {k: without_stamps(v) for k, v in value.items() if k not in ignored}
         if isinstance(value, str) and "/" in value:  # a path in the folder of the run
             return value.rsplit("/", 1)[1]
         return [without_stamps(v) for v in value] if isinstance(value, list) else value
 
-    text = json.dumps(without_stamps(json.loads(path.read_text())), sort_keys=True)
+    text = path.read_text()
+    rows = text.splitlines() if path.suffix == ".jsonl" else [text]
+    text = "".join(json.dumps(without_stamps(json.loads(row)), sort_keys=True) for row in rows)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

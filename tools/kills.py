@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import os
 import random
 import signal
@@ -26,7 +25,8 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+
+from fingerprint import json_digest, parquet_digest
 
 EASY = "--track zigzag --difficulty 0"
 """Options of short flights."""
@@ -70,26 +70,12 @@ def digest(out: Path) -> str:
 
 
 def _content(path: Path) -> bytes:
-    """Return the contents of a file without metadata and ignored keys."""
+    """Return the contents of weights, or the digest of another file without its stamps."""
     if path.suffix == ".parquet":
-        import pyarrow.parquet
-
-        return repr(pyarrow.parquet.ParquetFile(path).read().to_pydict()).encode()
-    if path.suffix == ".json":
-        return json.dumps(_without_ignored(json.loads(path.read_text()))).encode()
-    if path.suffix == ".jsonl":
-        rows = path.read_text().splitlines()
-        return json.dumps([_without_ignored(json.loads(row)) for row in rows]).encode()
+        return parquet_digest(path).encode()
+    if path.suffix in (".json", ".jsonl"):
+        return json_digest(path, IGNORED_KEYS).encode()
     return path.read_bytes()
-
-
-def _without_ignored(value: Any) -> Any:
-    """Return contents of a JSON file without the ignored keys."""
-    if isinstance(value, dict):
-        return {
-            key: _without_ignored(entry) for key, entry in value.items() if key not in IGNORED_KEYS
-        }
-    return [_without_ignored(entry) for entry in value] if isinstance(value, list) else value
 
 
 def finish(command: str, out: Path) -> float:

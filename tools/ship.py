@@ -13,10 +13,13 @@ import argparse
 import json
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+from policies import contract
 from policies.formats.checkpoint import CONFIG, WEIGHTS
 from policies.formats.policy_file import load_policy_checkpoint
+from policies.formats.spec_json import spec_to_json
 from suite.common import curve
 from suite.common.charts import curves_chart
 from suite.common.console import duration
@@ -87,8 +90,11 @@ def main() -> None:
         shutil.copy(policy / WEIGHTS, new / WEIGHTS)
         config = json.loads((policy / CONFIG).read_text(encoding="utf-8"))
         if options.speed is not None:
-            config["spec"]["speed"] = options.speed
+            spec = replace(load_policy_checkpoint(policy).spec, speed=options.speed)
+            new_contract = contract.contract_of(spec, (spec.hidden_size,)).to_json()
+            config |= {"spec": spec_to_json(spec), contract.KEY: new_contract}
         write_json(new / CONFIG, config)
+        load_policy_checkpoint(new)  # refuses it before it replaces the shipped one
         (new / "curve.png").write_bytes(curves_chart({"training": curve.read(options.run)}))
         text = card(options.name, options.run, options.eval)
         (new / "card.md").write_text(text, encoding="utf-8")

@@ -87,13 +87,12 @@ def save_arrays(
     return folder
 
 
-def load_arrays(folder: Path, *, kind: str, finite: bool = True) -> Stored:
+def load_arrays(folder: Path, *, kind: str) -> Stored:
     """Read a checkpoint back.
 
     Args:
         folder: the checkpoint's folder.
         kind: the required kind.
-        finite: refuse NaN and infinity in the arrays.
 
     Raises:
         PolicyError: where a file is missing, cut short, changed, of another kind or a newer
@@ -131,8 +130,7 @@ def load_arrays(folder: Path, *, kind: str, finite: bool = True) -> Stored:
         raise PolicyError(
             f"{path}: not a safetensors file ({error}); train or copy again"
         ) from None
-    if finite:
-        check_finite(path, arrays)
+    check_finite(path, arrays)
     return Stored(arrays, config)
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from policies import contract, shipped
+from policies.formats.c.arrays import DTYPES
 from policies.formats.policy_file import PolicyCheckpoint, load_policy_checkpoint
 from policies.formats.program_inputs import INPUTS
 from policies.formats.spec_json import labels
@@ -143,12 +144,17 @@ def main_file(name: str, format: str) -> str:
     return "policy.c" if format == "c" else f"{name}{_WRITERS[format][0]}"
 
 
-def check_formats(formats: Iterable[str], dtype: str = "float32") -> None:
+def check_formats(formats: Sequence[str], dtype: str = "float32") -> None:
     """Refuse formats and types that cannot be written.
 
     Raises:
-        ValueError: for an unknown format or type, or a type that the format does not support.
+        ValueError: for no format, an unknown format or type, or a type that the format does not
+            support.
     """
+    if not formats:
+        raise ValueError(f"no format is given; allowed are one or more of {', '.join(FORMATS)}")
+    if dtype not in DTYPES:
+        raise unknown_name("type", dtype, DTYPES)
     for format in formats:
         if format not in FORMATS:
             raise unknown_name("format", format, FORMATS)

@@ -152,12 +152,11 @@ def load_library(ctypes: Any, path: bytes, labels: list[str]) -> Loaded:
 
     def run(feed: dict[str, Any]) -> list[Any]:
         words = feed["memory"]
-        rows = len(words)
         memory = np.ascontiguousarray(words.view(np.uint8)[:, :state_bytes])
         fresh = feed["fresh"].astype(np.uint8)
         action = np.empty(feed["action"].shape, np.float32)
         arrays = (memory, fresh, feed["state"], feed["image"], action)
-        library.suite_rows(rows, *(ctypes.c_void_p(array.ctypes.data) for array in arrays))
+        library.suite_rows(*action.shape, *(ctypes.c_void_p(array.ctypes.data) for array in arrays))
         next_words = np.zeros(words.shape, np.float32)
         next_words.view(np.uint8)[:, :state_bytes] = memory
         return [action, next_words]

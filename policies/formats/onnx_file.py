@@ -9,17 +9,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import onnx
 import onnx.inliner
 
-from policies.block_policy import BlockPolicy, verify_rows
+from policies.block_policy import BlockPolicy
 from policies.formats.model_process import ModelProcess
 from policies.formats.program_inputs import (
     INPUTS,
     check_inputs,
     check_memory,
-    dropped_inputs,
+    program_policy,
 )
 from policies.formats.spec_json import extract
 from policies.spec import PolicyError
@@ -40,32 +39,16 @@ def load_onnx(path: Path) -> BlockPolicy:
     """
     proto = read_checked(path)
     metadata = extract({entry.key: entry.value for entry in proto.metadata_props}, str(path))
-    spec = metadata.spec
     loaded = ModelProcess(proto.SerializeToString(), str(path), "onnx")
     for value in (*loaded.inputs, *loaded.outputs):
         if value.kind != "tensor(float)":
             raise PolicyError(f"{path}: {value.name!r} is {value.kind}, expected tensor(float)")
     shapes = {value.name: value.shape for value in loaded.inputs}
     order = sorted(shapes, key=(*INPUTS, *shapes).index)
-    block, hidden_shape = check_inputs({name: shapes[name] for name in order}, spec, str(path))
+    ordered = {name: shapes[name] for name in order}
+    block, hidden_shape = check_inputs(ordered, metadata.spec, str(path))
     check_memory(metadata, hidden_shape, str(path))
-    notes = (*metadata.notes, *dropped_inputs(shapes, str(path)))
-    outputs = [value.name for value in loaded.outputs]
-    if len(outputs) != 1 + (hidden_shape != (0,)):
-        raise PolicyError(
-            f"{path}: outputs are {', '.join(outputs)}; expected the action and, where there is an "
-            "input 'hidden', its new value, in this order; see docs/policies.md"
-        )
-
-    def model(
-        state: np.ndarray, image: np.ndarray, hidden: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        feed = {"state": state, "image": image, "hidden": hidden}
-        action, *next_hidden = loaded.run({name: feed[name] for name in shapes})
-        return action, next_hidden[0] if next_hidden else hidden
-
-    policy = BlockPolicy(path.name, spec, model, hidden_shape, block, block, notes)
-    return verify_rows(policy, str(path))
+    return program_policy(loaded, path, metadata, hidden_shape, block)
 
 
 def read_checked(path: Path) -> onnx.ModelProto:

@@ -6,7 +6,7 @@ match measured ones. A policy is stored with its `PolicySpec` (rate, camera, sca
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,14 @@ from typing import Any
 import numpy as np
 
 from policies import contract
-from policies.formats.checkpoint import CONFIG, WEIGHTS, check_shapes, load_arrays, save_arrays
+from policies.formats.checkpoint import (
+    CONFIG,
+    WEIGHTS,
+    Stored,
+    check_shapes,
+    load_arrays,
+    save_arrays,
+)
 from policies.formats.spec_json import spec_from_json, spec_to_json
 from policies.spec import PolicyError, PolicySpec, check_network
 
@@ -96,65 +103,32 @@ def expected_shapes(spec: PolicySpec, where: str) -> dict[str, tuple[int, ...]]:
     Raises:
         PolicyError: where the suite's network does not support such an image or such channels.
     """
-    import jax
-
     from policies.networks import network
 
     try:
         check_network(spec)
     except ValueError as error:
         raise PolicyError(f"{where}: {error}") from None
-    shapes = jax.eval_shape(lambda key: network.init(key, spec), jax.random.key(0))
-    return {name: tuple(value.shape) for name, value in shapes.items()}
+    return _shapes(network.init, spec)
 
 
-@dataclass(frozen=True)
-class DeltaCheckpoint:
-    """A Delta Action network as it was stored."""
-
-    params: dict[str, np.ndarray]
-    """The network's parameters, float32, with the names and shapes of `delta_network.init`."""
-    config: dict[str, Any]
-    """The object of config.json; its key "fit" has the configuration and results of the fit."""
-
-
-def save_delta(
-    folder: Path,
-    params: Mapping[str, Any],
-    *,
-    seed: int | None,
-    fit: Mapping[str, Any] | None = None,
-) -> Path:
-    """Write a Delta Action network; a kill at any moment leaves the old one or the new one.
-
-    Args:
-        folder: the checkpoint's folder.
-        params: the network's parameters.
-        seed: the fit's seed.
-        fit: the resolved configuration and results of the fit.
-
-    Returns:
-        `folder`.
-
-    Raises:
-        OSError: where the files cannot be written; an existing checkpoint is kept.
-    """
-    return save_arrays(folder, params, kind=DELTA, seed=seed, extra={"fit": dict(fit or {})})
-
-
-def load_delta(folder: Path) -> DeltaCheckpoint:
-    """Read a Delta Action network.
+def load_delta(folder: Path) -> Stored:
+    """Read a Delta Action network; key "fit" of its config has the fit's configuration and results.
 
     Raises:
         PolicyError: where the checkpoint is damaged, of another kind, not finite, or its arrays
             do not have the names and shapes of the network's parameters.
     """
-    import jax
-
     from policies.networks import delta_network
 
     stored = load_arrays(folder, kind=DELTA)
-    shapes = jax.eval_shape(delta_network.init, jax.random.key(0))
-    expected = {name: tuple(value.shape) for name, value in shapes.items()}
-    check_shapes(folder / WEIGHTS, stored.arrays, expected)
-    return DeltaCheckpoint(stored.arrays, stored.config)
+    check_shapes(folder / WEIGHTS, stored.arrays, _shapes(delta_network.init))
+    return stored
+
+
+def _shapes(init: Callable[..., dict[str, Any]], *args: Any) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the parameters that `init(key, *args)` makes."""
+    import jax
+
+    shapes = jax.eval_shape(lambda key: init(key, *args), jax.random.key(0))
+    return {name: tuple(value.shape) for name, value in shapes.items()}

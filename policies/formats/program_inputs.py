@@ -1,12 +1,19 @@
-"""Check the inputs of a policy file that was made outside the suite: names, shapes and memory."""
+"""Check the inputs of a policy file that was made outside the suite, and make its policy.
+
+The checks are those of names, shapes and memory.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
-from policies.block_policy import BLOCK
+import numpy as np
+
+from policies.block_policy import BLOCK, BlockPolicy, verify_rows
+from policies.formats.model_process import ModelProcess
 from policies.formats.spec_json import KEY, PolicyMetadata
 from policies.spec import EXTRAS, Note, PolicyError, PolicySpec
 
@@ -88,6 +95,41 @@ def dropped_inputs(names: Iterable[str], where: str) -> tuple[Note, ...]:
         )
         for name in missing
     )
+
+
+def program_policy(
+    loaded: ModelProcess,
+    path: Path,
+    metadata: PolicyMetadata,
+    hidden_shape: tuple[int, ...],
+    block: int = BLOCK,
+) -> BlockPolicy:
+    """Return the policy of a loaded program, which runs `block` rows in each call.
+
+    `hidden_shape` is the shape of a row's hidden state; (0,) for a program without one.
+
+    Raises:
+        PolicyError: where the outputs are not the action, and the hidden state if there is one.
+    """
+    names = [port.name for port in loaded.inputs]
+    has_memory = hidden_shape != (0,)
+
+    def model(
+        state: np.ndarray, image: np.ndarray, hidden: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        feed = {"state": state, "image": image, "hidden": hidden}
+        outputs = loaded.run({name: feed[name] for name in names})
+        if len(outputs) != 1 + has_memory:
+            raise PolicyError(
+                f"{path}: gives {len(outputs)} outputs, expected the tensors action"
+                f"{' and hidden' if has_memory else ''}; see docs/policies.md"
+            )
+        action, *next_hidden = outputs
+        return action, next_hidden[0] if has_memory else hidden
+
+    notes = (*metadata.notes, *dropped_inputs(names, str(path)))
+    policy = BlockPolicy(path.name, metadata.spec, model, hidden_shape, block, block, notes)
+    return verify_rows(policy, str(path))
 
 
 def inputs_message(where: str, names: tuple[str, ...]) -> str:

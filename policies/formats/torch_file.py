@@ -13,12 +13,16 @@ import io
 import zipfile
 from pathlib import Path
 
-import numpy as np
-
 from policies import contract
-from policies.block_policy import BlockPolicy, Model, verify_rows
+from policies.block_policy import BlockPolicy
 from policies.formats.model_process import ModelProcess
-from policies.formats.program_inputs import INPUTS, check_inputs, check_memory, inputs_message
+from policies.formats.program_inputs import (
+    INPUTS,
+    check_inputs,
+    check_memory,
+    inputs_message,
+    program_policy,
+)
 from policies.formats.spec_json import KEY, extract
 from policies.spec import NeedsTrust, PolicyError
 from tracks.input.reading import MODEL_BYTES, InputError, read_bytes, reason
@@ -33,13 +37,11 @@ def load_program(path: Path, trust: bool = False) -> BlockPolicy:
     """
     loaded = _loaded(path, "program", "a torch exported program", trust)
     metadata = extract(loaded.labels, str(path))
-    spec, shapes = metadata.spec, {port.name: port.shape for port in loaded.inputs}
+    shapes = {port.name: port.shape for port in loaded.inputs}
     _check_names(path, tuple(shapes))
-    block, hidden_shape = check_inputs(shapes, spec, str(path))
+    block, hidden_shape = check_inputs(shapes, metadata.spec, str(path))
     check_memory(metadata, hidden_shape, str(path))
-    model = _as_model(loaded, path, hidden_shape)
-    policy = BlockPolicy(path.name, spec, model, hidden_shape, block, block, metadata.notes)
-    return verify_rows(policy, str(path))
+    return program_policy(loaded, path, metadata, hidden_shape, block)
 
 
 def load_script(path: Path, trust: bool = False) -> BlockPolicy:
@@ -51,13 +53,10 @@ def load_script(path: Path, trust: bool = False) -> BlockPolicy:
     """
     loaded = _loaded(path, "script", "TorchScript", trust)
     metadata = extract(loaded.labels, str(path))
-    spec, names = metadata.spec, tuple(port.name for port in loaded.inputs)
+    names = tuple(port.name for port in loaded.inputs)
     _check_names(path, names)
-    hidden_shape = (spec.hidden_size,) if names == INPUTS else (0,)
-    model = _as_model(loaded, path, hidden_shape)
-    return verify_rows(
-        BlockPolicy(path.name, spec, model, hidden_shape, notes=metadata.notes), str(path)
-    )
+    hidden_shape = (metadata.spec.hidden_size,) if names == INPUTS else (0,)
+    return program_policy(loaded, path, metadata, hidden_shape)
 
 
 def _loaded(path: Path, kind: str, words: str, trust: bool) -> ModelProcess:
@@ -95,23 +94,3 @@ def _is_weights(data: bytes) -> bool:
         return False
     pickled = any(name.endswith("data.pkl") for name in names)
     return pickled and not any("/code/" in name for name in names)
-
-
-def _as_model(loaded: ModelProcess, path: Path, hidden_shape: tuple[int, ...]) -> Model:
-    """Return the function that runs the process's model; it checks the number of outputs."""
-    has_memory = hidden_shape != (0,)
-
-    def model(
-        state: np.ndarray, image: np.ndarray, hidden: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        feed = {"state": state, "image": image}
-        outputs = loaded.run({**feed, "hidden": hidden} if has_memory else feed)
-        if len(outputs) != 1 + has_memory:
-            raise PolicyError(
-                f"{path}: gives {len(outputs)} outputs, expected the tensors action"
-                f"{' and hidden' if has_memory else ''}; see docs/policies.md"
-            )
-        action, *next_hidden = outputs
-        return action, next_hidden[0] if has_memory else hidden
-
-    return model

@@ -35,13 +35,15 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         ValueError: if the policy was not trained by the suite, or a format or type is unknown.
     """
     from policies import shipped
+    from policies.formats.export import FORMATS
     from suite.judging.deploy.exporting import export
     from suite.judging.flying import default_policy
 
     if config.name and config.policy and config.name != config.policy:
         raise ValueError(f"--policy {config.policy}: NAME is {config.name}; give one of them")
     policy, formats = config.policy or config.name, config.formats
-    if not policy and (formats[-1] in shipped.names() or Path(formats[-1]).exists()):
+    last = formats[-1] if formats else FORMATS[0]
+    if not policy and last not in FORMATS and (last in shipped.names() or Path(last).exists()):
         # In `--format c race` the list takes all words after it, also the policy's name.
         *formats, policy = formats
     answer = export(policy or default_policy(), config.out, formats, config.dtype, console)

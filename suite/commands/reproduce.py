@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from suite.common.console import Console
-from suite.common.options import Advanced, Command
+from suite.common.options import Advanced, Command, options
 from suite.common.work import WorkersOption, read_workers_option
 from suite.experiments import EXPERIMENTS, OVER_ALL
 from tracks.common.grid import rich_table
@@ -55,11 +55,15 @@ def config_of(args: Sequence[str]) -> tuple[Any, str, list[str]]:
         ValueError: for an unknown page.
     """
     pages = {**EXPERIMENTS, **OVER_ALL}
-    name = next((word for word in args if word in pages), "")
-    if not name:
+    # The word after such an option is its value, also the `gpu` of `--out gpu`.
+    valued = {option.flag for option in options(Config) if option.bare is not bool}
+    pairs = enumerate(zip(["", *args], args, strict=False))
+    index = next((k for k, (last, word) in pairs if word in pages and last not in valued), None)
+    if index is None:
         if args and not args[0].startswith("-"):
             raise unknown_name("page", args[0], pages)
         return Config, "", list(args)
+    name = args[index]
     if name in OVER_ALL:
         from suite.experiments import published
 
@@ -69,7 +73,6 @@ def config_of(args: Sequence[str]) -> tuple[Any, str, list[str]]:
     field = ("experiment", experiment, experiment())
     namespace = {"__doc__": experiment.__doc__}
     kind = make_dataclass("Config", [field], bases=(Config,), namespace=namespace, frozen=True)
-    index = list(args).index(name)
     return kind, name, [*args[:index], *args[index + 1 :]]
 
 

@@ -147,7 +147,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         dynamics = resolved.quadrotor or resolved.physics
         fit = stored.config.get("fit", {})
         check_corrects(fit, dynamics, resolved.spec.rate_hz, config.delta)
-        delta = jax.tree.map(jax.numpy.asarray, stored.params)
+        delta = jax.tree.map(jax.numpy.asarray, stored.arrays)
     mirror = tensorboard(config.out) if config.tensorboard and not member.number else None
     outcome = train(resolved, config.out, console, params, delta, mirror=mirror)
     if member.number:

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from eval.logs.flight_log import FlightLog, read_flights
-from policies.formats.policy_file import save_delta
+from policies.formats.checkpoint import save_arrays
+from policies.formats.policy_file import DELTA
 from suite.common.console import Console
 from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.stages import Estimate, announce
@@ -174,7 +175,7 @@ def fit_delta(
     }
     write_run_record(out, config, config.seed)
     stored = {**plain(config), **description, "rate_hz": rate_hz}
-    save_delta(out / "delta", result.params, seed=config.seed, fit=stored)
+    save_arrays(out / "delta", result.params, kind=DELTA, seed=config.seed, extra={"fit": stored})
     write_json(out / "delta.json", plain(summary))
     write_text(out / "table.md", table(result, config.horizon_s))
     return result

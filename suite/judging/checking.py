@@ -83,6 +83,8 @@ def check_flight_files(
     )
     all_findings: list[tuple[Finding, str | None]] = [(f, None) for f in check_files(context)]
     files = flight_files(flights) if flights else []
+    if out is not None:
+        _check_outputs(files, out)
     logs, warnings = read_flights(files, partial=True, limits=False) if files else ([], [])
     for warning in warnings:
         console.note(f"warning: {warning}")
@@ -92,7 +94,6 @@ def check_flight_files(
         all_findings += [(finding, log.name) for finding in findings]
         if out is not None:
             path = out / Path(log.name).name
-            check_no_input(path, flights, "--out")
             records = [finding._asdict() for finding in findings]
             fixed = with_fixes(log, readings)
             fixed = replace(fixed, about={**fixed.about, "findings": records})
@@ -116,6 +117,19 @@ def check_flight_files(
         "not_identifiable": not_identifiable([finding for finding, _ in all_findings]),
         "written": written,
     }
+
+
+def _check_outputs(files: Sequence[Path], out: Path) -> None:
+    """Refuse flights whose correction in `out` would overwrite a flight or another correction."""
+    names: dict[str, Path] = {}
+    for file in files:
+        check_no_input(out / file.name, files, "--out")
+        if file.name in names:
+            raise ValueError(
+                f"{names[file.name]} and {file}: both would be written to {out / file.name}; "
+                "rename one of them, or correct them one at a time with another --out each"
+            )
+        names[file.name] = file
 
 
 def policy_findings(policy: Policy, trials: int, console: Console) -> list[dict[str, Any]]:

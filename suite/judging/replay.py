@@ -18,7 +18,8 @@ from suite.judging.evaluate import file_digests
 from suite.judging.flying import default_policy, load_in_manner, manners
 from suite.judging.requests import Evaluation
 from suite.judging.trials import custom_tracks, parse_levels, parse_tracks, trial_list
-from tracks.input.ranges import check_ranges, shown
+from tracks.common.toml_table import Table
+from tracks.input.ranges import check_ranges
 from tracks.input.reading import read_json
 
 if TYPE_CHECKING:
@@ -44,8 +45,7 @@ def read_evaluation(folder: Path) -> Evaluation:
     """
     path = folder / "run.json"
     try:
-        record = read_json(path)
-        config: dict[str, Any] = record["config"]
+        config: dict[str, Any] = dict(read_json(path)["config"])
         if "world" in config:  # its name before version 0.2
             config["simulator"] = config.pop("world")
         names = {field.name for field in dataclasses.fields(Evaluation)}
@@ -54,25 +54,7 @@ def read_evaluation(folder: Path) -> Evaluation:
         raise ValueError(f"{path}: not the record of a run ({error})") from error
     if not fits:
         raise ValueError(f"{path}: not a run of suite eval; give the --out of one")
-    policies = config["policies"]
-    if not isinstance(policies, list) or not all(isinstance(name, str) for name in policies):
-        raise ValueError(f"{path}: policies is {shown(policies)}, allowed is a list of names")
-    speeds = config.get("speed", [])
-    if not isinstance(speeds, list) or not all(isinstance(s, (int, float)) for s in speeds):
-        raise ValueError(f"{path}: speed is {shown(speeds)}, allowed is a list of numbers")
-    config |= {"policies": tuple(policies), "speed": tuple(speeds)}
-    evaluation = Evaluation(**config)
-    for name, value in vars(evaluation).items():
-        default = getattr(Evaluation, name)
-        # Fields with default None are numbers; JSON may have a whole number for a float.
-        allowed_type: type | tuple[type, ...] = type(default)
-        if default is None or isinstance(default, float):
-            allowed_type = (int, float, type(default))
-        # In Python a bool is also an int.
-        if not isinstance(value, allowed_type) or (
-            isinstance(value, bool) and default is not False
-        ):
-            raise ValueError(f"{path}: {name} is {shown(value)}, expected one like {default!r}")
+    evaluation = Table(str(path), "config", config).read(Evaluation)
     check_ranges(evaluation, f"{path}: ")
     return evaluation
 

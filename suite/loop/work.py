@@ -312,7 +312,7 @@ def _tuning(run: LoopRun, variant: Variant) -> Tuning:
     start = training.load_start_params(str(run.policy(first)), tuning.spec)
     delta = None
     if variant.delta is not None:
-        delta = load_delta(run.out / variant.delta / "delta").params
+        delta = load_delta(run.out / variant.delta / "delta").arrays
     return Tuning(tuning, jax.tree.map(np.asarray, start), delta)
 
 

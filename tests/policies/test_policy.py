@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -14,11 +15,13 @@ from hypothesis import strategies as st
 
 from policies import shipped
 from policies.formats import torch_file
+from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.native import load_native, native_policy
 from policies.networks import network
 from policies.policy import load_policy
 from policies.spec import PolicyError
 from tests.support.policy_files import SPEC, InProcess
+from tests.support.tools import program
 
 
 @pytest.fixture
@@ -75,6 +78,18 @@ def test_what_is_shipped_is_whole_small_and_has_its_card(name):
     assert load_policy(name).name == name
     assert (folder / "card.md").read_text().strip()
     assert sum(file.stat().st_size for file in folder.iterdir()) < 5_000_000
+
+
+def test_a_policy_is_shipped_with_another_usual_speed(tmp_path, monkeypatch, root):
+    spec = replace(SPEC, speed_input=True)
+    save_policy(tmp_path / "run/policy", network.init(jax.random.key(0), spec), spec, seed=1)
+    ship = program(root / "tools/ship.py")
+    monkeypatch.setattr(ship, "SHELF", tmp_path)
+    monkeypatch.setattr(ship, "card", lambda *_: "a card")
+    monkeypatch.setattr(ship, "curves_chart", lambda _: b"")
+    monkeypatch.setattr(sys, "argv", ["ship", str(tmp_path / "run"), "--speed", "0.85"])
+    ship.main()
+    assert load_policy_checkpoint(tmp_path / "race").spec == replace(spec, speed=0.85)
 
 
 def test_a_checkpoint_is_named_and_flies_as_its_parameters_do(checkpoint, params):

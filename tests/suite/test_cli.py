@@ -117,6 +117,9 @@ def test_a_list_may_have_commas_or_spaces_and_some_options_may_be_given_again():
     assert cli.parse("export", ["--format=c,onnx"])[1].formats == ("c", "onnx")
     config = cli.parse("reproduce", "simulators --simulator mjx --simulator rotorpy".split())[1]
     assert config.experiment.simulator == ("mjx", "rotorpy")
+    for line in ("--out gpu table2 --trials 2", "--cache=a table2 --trials 2 --out gpu"):
+        config = cli.parse("reproduce", line.split())[1]
+        assert (str(config.out), config.experiment.trials) == ("gpu", 2)
     # As a shell expands runs/seed*/policy.
     for line in ("--policy a --policy b", "--policy a b --seed 3"):
         assert cli.parse("eval", line.split())[1].flown.policies == ("a", "b")

@@ -71,7 +71,8 @@ def test_a_node_killed_after_a_third_leaves_the_table_as_it_is(flown, tmp_path, 
     ],
     ids=lambda command: command.split()[0],
 )
-def test_a_command_comes_to_the_same_on_a_cluster(command, tmp_path, root):
+def test_a_command_comes_to_the_same_on_a_cluster(command, tmp_path, root, monkeypatch):
+    monkeypatch.syspath_prepend(root / "tools")
     digest = program(root / "tools" / "kills.py").digest
     here, there = tmp_path / "here", tmp_path / "there"
     again = ["blind run"] if command.startswith("blind") else []

@@ -192,7 +192,7 @@ def check_no_input(
         ValueError: naming the file, and the option to change.
     """
     for input_path in inputs:
-        if input_path and os.path.exists(input_path) and os.path.exists(path):
+        if input_path and os.path.exists(path) and os.path.exists(input_path):
             if os.path.samefile(input_path, path):
                 raise ValueError(
                     f"{option}: {os.fspath(path)} is also an input and would be overwritten; give "

@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import UnionType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -141,7 +141,7 @@ class Table:
     def _typed(self, key: str, value: Any, kind: Any) -> Any:
         """Return `value` converted to the type `kind`, or refuse it."""
         parts = get_args(kind)
-        if isinstance(kind, UnionType):  # a type or None
+        if get_origin(kind) in (Union, UnionType):  # a type or None
             return None if value is None else self._typed(key, value, parts[0])
         if dataclasses.is_dataclass(kind) and isinstance(kind, type):
             if not isinstance(value, Mapping):

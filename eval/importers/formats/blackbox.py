@@ -10,7 +10,7 @@ voltage in 0.01 V (from Betaflight 4 on), eRPM in hundreds, and motor outputs in
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -26,17 +26,9 @@ MISSING = (
     "blackbox_decode and import the CSV"
 )
 """Reason of the error if the decoder is not installed."""
-
-
-class Decoded(NamedTuple):
-    """One decoded log of a raw file."""
-
-    columns: dict[str, np.ndarray]
-    """Columns by the names of `blackbox_decode`; the name ends with an unusual unit in brackets."""
-    header: dict[str, Any]
-    """The settings in the log's header."""
-    findings: tuple[Finding, ...]
-    """Notes on several logs in one file, and on damaged frames."""
+Decoded = tuple[dict[str, np.ndarray], dict[str, Any], list[Finding]]
+"""Columns by the names of `blackbox_decode` (an unusual unit in brackets ends a name), the settings
+in the log's header, and notes on several logs in one file and on damaged frames."""
 
 
 def decode(path: Path) -> Decoded:
@@ -76,7 +68,7 @@ def _longest(decoder: Any, raw: bytes) -> Decoded:
         findings.append(Finding("note", "file", text))
     table = np.array(parser.main_frames, dtype=np.float64).T
     columns = dict(zip(parser.main_field_names, table, strict=True))
-    return Decoded(_in_units(columns, parser.sys_config), parser.sys_config, tuple(findings))
+    return _in_units(columns, parser.sys_config), parser.sys_config, findings
 
 
 def _in_units(columns: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, np.ndarray]:

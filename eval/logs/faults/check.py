@@ -180,8 +180,9 @@ def check_log(
 def with_fixes(log: FlightLog, readings: Readings) -> FlightLog:
     """Return a log with its signals read in another way; missing values are kept."""
     columns = columns_from_log(log)
+    signals = {**GROUPS, "throttle": ("throttle",)}  # a checked column that no group has
     rows = {"time": log.time_s}
-    for group, names in GROUPS.items():
+    for group, names in signals.items():
         if group != "time" and all(name in columns for name in names):
             rows[group] = np.stack([columns[name] for name in names], axis=1)
     filled_quat = filled(log.time_s, rows["quat"]) if "quat" in rows else None
@@ -190,7 +191,7 @@ def with_fixes(log: FlightLog, readings: Readings) -> FlightLog:
     )
     if filled_quat is not None:
         corrected["quat"] = read_rows({"time": log.time_s, "quat": rows["quat"]}, readings)["quat"]
-    for group, names in GROUPS.items():
+    for group, names in signals.items():
         if group in rows and group not in corrected:
             columns = {name: value for name, value in columns.items() if name not in names}
         elif group in rows and group != "time":

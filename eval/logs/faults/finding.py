@@ -76,6 +76,11 @@ def findings_of(about: Mapping[str, Any]) -> tuple[Finding, ...]:
             continue
         fields = {new_names.get(key, key): value for key, value in record.items()}
         fields = {key: value for key, value in fields.items() if key in Finding._fields}
-        if {"status", "signal", "evidence"} <= fields.keys() and fields["status"] in STATUSES:
+        typed = all(
+            isinstance(value, float | int | None if key in ("size", "confidence") else str)
+            for key, value in fields.items()
+        )
+        needed = {"status", "signal", "evidence"} <= fields.keys()
+        if typed and needed and fields["status"] in STATUSES:
             findings.append(Finding(**fields))
     return tuple(findings)

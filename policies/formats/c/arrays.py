@@ -15,6 +15,8 @@ from policies.spec import CHANNEL_BLOCK, PolicySpec
 
 BLOCK = CHANNEL_BLOCK
 """Number of outputs in a block."""
+DTYPES = ("float32", "int8")
+"""Types of the weights."""
 LAYERS = ("conv2", "conv3", "image", "gru_input", "gru_hidden")
 """Names of the large layers, which have nearly all weights. Int8 quantises them; the other layers
 are always float."""
@@ -93,4 +95,4 @@ def multiply_adds(spec: PolicySpec) -> int:
     count = rows * columns * 4 * first
     count += (rows - 2) * (columns - 2) * 9 * first * second
     count += (rows - 4) * (columns - 4) * third * (9 * second + hidden)
-    return count + hidden * (spec.state_size + 6 * hidden + 3)
+    return count + hidden * (spec.state_size + 6 * hidden + spec.action.size)

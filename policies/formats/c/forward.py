@@ -70,7 +70,7 @@ def step(
 def actions(
     small: Mapping[str, np.ndarray], spec: PolicySpec, layer: Layer, observed: Observed
 ) -> np.ndarray:
-    """Return the actions (T, 3) for T observations; the memory is cleared where a flight begins."""
+    """Return the actions (T, size) for T observations; memory is cleared where a flight begins."""
     width = small["state_bias"].shape[1]
     hidden, outputs = np.zeros(width, np.float32), []
     for state, image, fresh in zip(*observed, strict=True):

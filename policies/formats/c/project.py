@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from policies.formats.c.arrays import float_text
+from policies.formats.c.arrays import DTYPES, float_text
 from policies.formats.c.forward import Observed
 from policies.formats.c.quantised import Quantised, quantise
 from policies.formats.c.quantised import actions as quantised_actions
@@ -24,8 +24,6 @@ from policies.policy import Policy
 from policies.spec import PolicyError, PolicySpec
 from tracks.common.names import printable, unknown_name
 
-DTYPES = ("float32", "int8")
-"""Types of the weights."""
 VECTORS = 12
 """Number of successive steps in vectors.h, in which the policy keeps its memory."""
 TOLERANCE = {"float32": 1e-4, "int8": 0.05}
@@ -91,13 +89,13 @@ def c_project(
 def native_actions(
     params: Mapping[str, np.ndarray], spec: PolicySpec, observed: Observed
 ) -> np.ndarray:
-    """Return the actions (T, 3) of the policy in JAX for T observations."""
+    """Return the actions (T, size) of the policy in JAX for T observations."""
     policy = dataclasses.replace(native_policy(params, spec, "policy"), block=1, rows=1)
     return actions_of(policy, observed)
 
 
 def actions_of(policy: Policy, observed: Observed) -> np.ndarray:
-    """Return a policy's actions (T, 3); its memory is cleared where a flight begins."""
+    """Return a policy's actions (T, size); its memory is cleared where a flight begins."""
     hidden, actions = policy.start(1), []
     for state, image, fresh in zip(*observed, strict=True):
         action, hidden = policy.act(hidden, state[None], image[None], np.array([fresh]))

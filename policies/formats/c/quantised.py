@@ -109,7 +109,7 @@ def actions(
     layers: Mapping[str, Quantised],
     observed: Observed,
 ) -> np.ndarray:
-    """Return the actions (T, 3) of the quantised network for T observations."""
+    """Return the actions (T, size) of the quantised network for T observations."""
     small = small_arrays(params, spec)
 
     def layer(name: str, x: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from policies.formats.policy_file import PolicyCheckpoint
 from policies.spec import PolicySpec
 
 Step = Callable[[], Any]
-"""Makes one step on fixed inputs, and keeps the policy's memory; may return the action (1, 3)."""
+"""Makes one step on fixed inputs, and keeps the policy's memory; may return (1, size) actions."""
 BLOCK = 100
 """Number of timed steps of one engine before the next engine runs."""
 WARM = 10
@@ -57,7 +57,7 @@ def _timing(seconds: np.ndarray) -> Timing:
 def c_step(policy: CPolicy) -> Step:
     """Return a step of a policy in C, whose functions are called as on a flight controller."""
     state, image = _inputs(policy.spec)
-    memory, action = policy.start(1), np.zeros((1, 3), np.float32)
+    memory, action = policy.start(1), np.zeros((1, policy.spec.action.size), np.float32)
     arrays = (memory, state, image, action)
     library = ctypes.CDLL(str(policy.library))
     library.policy_reset(ctypes.c_void_p(memory.ctypes.data))
@@ -86,11 +86,12 @@ def onnx_steps(checkpoint: PolicyCheckpoint) -> tuple[Step, Step]:
     session = onnxruntime.InferenceSession(onnx_file(checkpoint, {}), options, providers=providers)
     state, image = _inputs(checkpoint.spec)
     hidden = np.zeros((1, checkpoint.spec.hidden_size), np.float32)
+    action = np.zeros((1, checkpoint.spec.action.size), np.float32)
     feed: dict[str, Any] = {"state": state, "image": image, "hidden": hidden}
     binding = session.io_binding()
     for name, value in feed.items():
         binding.bind_ortvalue_input(name, onnxruntime.OrtValue.ortvalue_from_numpy(value))
-    for name, value in (("action", np.zeros((1, 3), np.float32)), ("hidden_next", hidden)):
+    for name, value in (("action", action), ("hidden_next", hidden)):
         binding.bind_ortvalue_output(name, onnxruntime.OrtValue.ortvalue_from_numpy(value))
 
     def usual_step() -> Any:

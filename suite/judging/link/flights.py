@@ -78,7 +78,7 @@ def fly_simulated(
     try:
         with console.progress("flights", len(trial_set.trials)) as update:
             for number, trial in enumerate(trial_set.trials, 1):
-                flight = _fly_trial(policy, trial, trial_set, rules, limits, out, vehicle)
+                flight = _fly_trial(policy, trial, trial_set, rules, limits, out, vehicle, console)
                 yield flight
                 successes += flight.row["success"]
                 update(number, f"{successes} of {number} finished")
@@ -94,6 +94,7 @@ def _fly_trial(
     limits: Limits,
     out: Path,
     vehicle: VehicleProcess,
+    console: Console,
 ) -> Flight:
     """Fly one trial with the vehicle's process, and write the companion's log into `out`."""
     # Open both ends of the link.
@@ -128,7 +129,7 @@ def _fly_trial(
         "late_actions": companion.late_answers,
         "bad_actions": companion.bad_actions,
         "missed_decisions": companion.missed_decisions,
-        "file": write_log(companion, trial_row, out),
+        "file": write_log(companion, trial_row, out, console),
     }
     return Flight(row, companion.rows)
 
@@ -160,10 +161,13 @@ def fly_link(
                 return
 
 
-def write_log(companion: Companion, about: dict[str, Any], out: Path) -> str | None:
+def write_log(
+    companion: Companion, about: dict[str, Any], out: Path, console: Console
+) -> str | None:
     """Write a flight's log into `out` and return its name; None if it is no valid flight log.
 
-    `about` has the track, level and seed, and is stored in the log.
+    `about` has the track, level and seed, and is stored in the log. `console` shows why a log is
+    not written.
     """
     log = log_of(companion, about)
     name = log_name(about["track"], about["difficulty"], about["seed"])
@@ -171,8 +175,8 @@ def write_log(companion: Companion, about: dict[str, Any], out: Path) -> str | N
         if log is not None:
             write_flight(out / name, log)
             return name
-    except FlightLogError:
-        pass
+    except FlightLogError as error:
+        console.note(f"warning: the flight's log is not written: {error}")
     return None
 
 

@@ -175,7 +175,7 @@ def _fly_real_vehicle(
     finally:
         link.close()
         row = {**trial._asdict(), "handed_over": companion.over}
-        file = write_log(companion, row, out)
+        file = write_log(companion, row, out, console)
     if not companion.rows:
         reason = f"no vehicle sent a state (ODOMETRY) and a depth image within {WAIT_S:g} s"
         if companion.over is not None:
@@ -183,7 +183,7 @@ def _fly_real_vehicle(
         elif companion.wrong_image_size:
             reason += f" ({companion.wrong_image_size})"
         raise WorkFailed(f"{address}: {reason}; see docs/fly.md, 'When it hands over'")
-    console.say(f"handed over: {companion.over}; log: {file}")
+    console.say(f"handed over: {companion.over}; log: {file or 'none'}")
     if link.strangers:
         console.note(f"{link.strangers} datagrams from other senders were ignored")
     _warn_of_missed_decisions(companion.missed_decisions, console)

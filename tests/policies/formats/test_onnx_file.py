@@ -135,7 +135,7 @@ def test_inputs_and_outputs_that_do_not_fit_are_refused(tmp_path):
     state, image = port("state", "n", 12), port("image", "n", 24, 32)
     double = port("image", "n", 24, 32, kind=TensorProto.DOUBLE)
     for inputs, said in (
-        ([state, image, port("hidden", "n", 4)], "outputs are action; expected the action and"),
+        ([state, image, port("hidden", "n", 4)], "gives 1 outputs, expected .* action and hidden"),
         ([state, double], r"'image' is tensor\(double\)"),
     ):
         refused(save_onnx(tmp_path, onnx_model(inputs=inputs)), said)

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from policies.formats import spec_json
-from policies.formats.checkpoint import CONFIG
-from policies.formats.policy_file import load_delta, load_policy_checkpoint, save_delta, save_policy
+from policies.formats.checkpoint import CONFIG, save_arrays
+from policies.formats.policy_file import load_delta, load_policy_checkpoint, save_policy
 from policies.formats.spec_json import KEY, extract, labels, spec_from_json, spec_to_json
 from policies.networks import delta_network
 from policies.spec import DepthEncoding, PolicyError, PolicySpec
@@ -75,14 +76,15 @@ def test_a_policy_without_a_spec_and_weights_of_another_network_are_refused(tmp_
 
 def test_a_delta_comes_back_and_a_policy_is_none(tmp_path, params):
     delta = delta_network.init(jax.random.key(0))
-    back = load_delta(save_delta(tmp_path / "d", delta, seed=1, fit={"epochs": 2}))
+    saved = partial(save_arrays, tmp_path / "d", kind="delta", seed=1, extra={"fit": {"epochs": 2}})
+    back = load_delta(saved(delta))
     assert back.config["fit"] == {"epochs": 2}
     for name, value in delta.items():
-        np.testing.assert_array_equal(back.params[name], value)
+        np.testing.assert_array_equal(back.arrays[name], value)
     with pytest.raises(PolicyError, match="kind is 'policy', expected 'delta'"):
         load_delta(save_policy(tmp_path / "p", params, SPEC, seed=None))
     with pytest.raises(PolicyError, match=r"'output.bias' is float32 \(4,\)"):
-        load_delta(save_delta(tmp_path / "d", delta | {"output.bias": jnp.zeros(4)}, seed=1))
+        load_delta(saved(delta | {"output.bias": jnp.zeros(4)}))
 
 
 @given(

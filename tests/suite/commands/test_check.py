@@ -47,6 +47,17 @@ def test_a_fault_is_reported_with_its_fix_and_put_right(tmp_path, capsys, flight
     assert not [f for f in again["findings"] if f["status"] == "doubt"]
 
 
+def test_a_throttle_that_the_log_keeps_as_another_column_is_put_right(tmp_path, capsys, flight):
+    throttle = good(end=10.0)["throttle"].ravel()
+    path = flight(1.0, extra={"throttle": 1000.0 + 1000.0 * throttle})
+    answered = checked(tmp_path, capsys, path, "--fix", "--out", tmp_path / "checked")
+    assert ("throttle_range", "corrected") in {
+        (finding["fault"], finding["status"]) for finding in answered["findings"]
+    }
+    fixed = read_flight(answered["written"][0]).extra["throttle"]
+    np.testing.assert_allclose(fixed, throttle, atol=1e-12)
+
+
 def gyro_scale(answered):
     """Return the one finding about the gyro's scale."""
     (found,) = (f for f in answered["findings"] if f["fault"] == "gyro_scale")
@@ -87,4 +98,18 @@ def test_what_an_import_left_open_is_repeated_and_findings_of_earlier_versions_a
     line = ("diagnose --vehicle", tmp_path / "plain.toml", "--out", tmp_path / "out", path)
     assert "6 motors turn" in refused(capsys, *line, lines=3)
     old = {"level": "doubt", "subject": "attitude", "text": "39 % off"}
-    assert findings_of({"findings": [old, "odd"]}) == (Finding("doubt", "attitude", "39 % off"),)
+    odd = ["odd", doubt._asdict() | {"confidence": "high"}, doubt._asdict() | {"fault": [1]}]
+    assert findings_of({"findings": [old, *odd]}) == (Finding("doubt", "attitude", "39 % off"),)
+
+
+def test_no_log_is_overwritten_by_its_correction_or_by_that_of_another(tmp_path, capsys, flight):
+    first, second = flight(1.0), tmp_path / "b/flight.parquet"
+    second.parent.mkdir()
+    second.write_bytes(first.read_bytes())
+    for flights, out, reason in (
+        ([tmp_path], tmp_path, "is also an input"),
+        ([tmp_path, second], second.parent, "is also an input"),
+        ([tmp_path, second], tmp_path / "out", f"{first} and {second}"),
+    ):
+        assert reason in refused(capsys, "check", *flights, "--fix", "--out", out)
+    assert first.read_bytes() == second.read_bytes() and not (tmp_path / "out").exists()

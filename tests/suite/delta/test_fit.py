@@ -75,7 +75,7 @@ def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(tmp_path, monke
     held_out = [row["held_out_m"] for row in result.curve]
     assert held_out[-1] == pytest.approx(result.with_delta.position_m, rel=1e-5)
     assert held_out[-1] < 0.5 * held_out[0] and len(shown) == len(held_out)
-    stored = load_delta(tmp_path / "out" / "delta").params
+    stored = load_delta(tmp_path / "out" / "delta").arrays
     jax.tree.map(np.testing.assert_array_equal, stored, result.params)
     said = (tmp_path / "out" / "table.md").read_text()
     assert said == table(result, 0.6) and "| point mass with Delta Action Model |" in said

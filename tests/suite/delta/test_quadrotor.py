@@ -140,7 +140,7 @@ def test_a_fit_cuts_the_error_and_says_what_it_corrects(logs, tmp_path, monkeypa
     stored = load_delta(tmp_path / "out" / "delta")
     assert stored.config["fit"]["model"] == "quad"
     for name, value in result.params.items():
-        np.testing.assert_array_equal(stored.params[name], value)
+        np.testing.assert_array_equal(stored.arrays[name], value)
     assert "| quadrotor with Delta Action Model |" in (tmp_path / "out" / "table.md").read_text()
 
 

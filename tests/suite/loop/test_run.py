@@ -18,8 +18,8 @@ from eval.judging.results import read_trials
 from eval.logs.flight_log import read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import with_effects
-from policies.formats.checkpoint import WEIGHTS
-from policies.formats.policy_file import load_policy_checkpoint, save_delta
+from policies.formats.checkpoint import WEIGHTS, save_arrays
+from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks import delta_network
 from suite import cli
 from suite.common.console import Quiet
@@ -187,7 +187,8 @@ class Stub(Small):
         params = delta_network.init(jax.random.key(0))
         shift = 0.01 if "com_offset" in quad.vehicle.effects else 0.02
         params = {k: np.asarray(v) + shift for k, v in params.items()}
-        save_delta(out / "delta", params, seed=0, fit={"model": "quad"})
+        fit = {"model": "quad"}
+        save_arrays(out / "delta", params, kind="delta", seed=0, extra={"fit": fit})
         errors = {"position_m": 0.1, "velocity_m_s": 0.2}
         stored = {"without": errors, "delta_action": errors}
         (out / "delta.json").write_text(json.dumps(stored))

@@ -19,7 +19,7 @@ const char *suite_json(void)
 #endif
 }
 
-void suite_rows(int rows, policy_state *states, const unsigned char *fresh,
+void suite_rows(int rows, int action_size, policy_state *states, const unsigned char *fresh,
                 const float *observations, const float *images, float *actions)
 {
     for (int k = 0; k < rows; k++) {
@@ -28,6 +28,6 @@ void suite_rows(int rows, policy_state *states, const unsigned char *fresh,
         }
         policy_step(states + k, observations + (size_t)k * POLICY_STATE_SIZE,
                     images + (size_t)k * POLICY_IMAGE_HEIGHT * POLICY_IMAGE_WIDTH,
-                    actions + (size_t)k * 3);
+                    actions + (size_t)k * (size_t)action_size);
     }
 }

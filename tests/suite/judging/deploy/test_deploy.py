@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 import torch
 
+from policies.formats.c.arrays import multiply_adds
 from policies.formats.c.c_file import load_c
 from policies.formats.c.compiler import find_compiler
 from policies.formats.c.project import random_observations
 from policies.formats.export import export_policy
 from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.policy import load_policy
-from policies.spec import PolicySpec
+from policies.spec import ActionSpec, PolicySpec
 from suite.judging.deploy import exporting, latency, parity
+from suite.judging.flying import default_policy
 from tests.support.commands import answer, refused, run
 from tests.support.pilots import Steady
 from tests.support.policy_files import SPEC, lively, small_checkpoint
@@ -60,6 +62,8 @@ def test_what_cannot_be_exported_or_would_write_over_the_card_of_a_policy_is_ref
     for args, message in (
         ("--format onnx --dtype int8", "supports float32 only"),
         ("--policy race-paper", "give one"),
+        ("--format c --dtype int9", "unknown type 'int9'. Did you mean 'int8'"),
+        ("--format", "no format"),
     ):
         assert message in refused(capsys, f"export {args} --out {tmp_path}", folder)
     assert list(tmp_path.iterdir()) == []
@@ -69,6 +73,15 @@ def test_what_cannot_be_exported_or_would_write_over_the_card_of_a_policy_is_ref
     assert "card.md is also an input and would be overwritten" in said
     names = {path.name for path in folder.iterdir()}
     assert {path.name for path in own.iterdir()} == {*names, exporting.CARD}
+
+
+def test_an_entry_of_the_folder_with_a_formats_name_is_no_policy(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(exporting, "export", lambda *args: asked.append(args) or {"written": []})
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "onnx").mkdir()
+    assert run("export") == 0
+    assert asked[0][0] == default_policy() and asked[0][2] == ("torch", "onnx")
 
 
 @pytest.mark.parametrize(("wanted", "file"), [("onnx", "policy.onnx"), ("c", "policy.c")])
@@ -136,13 +149,19 @@ def test_what_a_policy_is_given_on_flights_is_kept_but_for_rows_in_which_nothing
 
 
 @needs_cc
-def test_the_engines_that_are_timed_are_one_policy(folder, tmp_path):
+@pytest.mark.parametrize("kind", ["acceleration", "ctbr"])
+def test_the_engines_that_are_timed_are_one_policy(kind, tmp_path):
+    spec = replace(SPEC, action=ActionSpec(kind))
+    folder = save_policy(tmp_path / "tiny", lively(spec, 2), spec, seed=1)
     export_policy(folder, tmp_path, ["c"])
+    more = spec.action.size - SPEC.action.size  # also of the last action in the state
+    assert multiply_adds(spec) - multiply_adds(SPEC) == 2 * more * spec.hidden_size
     checkpoint = load_policy_checkpoint(folder)
     in_c = latency.c_step(load_c(tmp_path, trust=True))
     usual, _ = latency.onnx_steps(checkpoint)
     in_torch = latency.torch_step(checkpoint)
     for _ in range(3):
         action = in_c()
+        assert action.shape == (1, spec.action.size)
         np.testing.assert_allclose(action, np.asarray(usual()), atol=1e-4)
         np.testing.assert_allclose(action, torch.as_tensor(in_torch()).numpy(), atol=1e-4)

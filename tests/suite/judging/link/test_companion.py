@@ -6,6 +6,7 @@ import pytest
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialSpec
 from policies.spec import NoAnswer, PolicySpec
+from suite.common.console import Console
 from suite.judging.link.flights import write_log
 from suite.judging.link.messages import OperatorText, SetPoint, State, Wire, dialect
 from suite.judging.link.watchdog import Limits, jump_fault
@@ -151,7 +152,7 @@ def no_answer():
         (lambda: np.full((1, 3), np.nan, np.float32), "the policy's answer is not finite"),
     ],
 )
-def test_a_policy_that_fails_hands_over_and_leaves_its_log(answer, reason, bench, tmp_path):
+def test_a_policy_that_fails_hands_over_and_leaves_its_log(answer, reason, bench, tmp_path, capsys):
     class Failing(Steady):
         def act(self, hidden, state, image, fresh):
             hidden = hidden + 1
@@ -162,7 +163,11 @@ def test_a_policy_that_fails_hands_over_and_leaves_its_log(answer, reason, bench
         one.fly(40)
     (note,) = one.tell()
     assert isinstance(note, OperatorText) and one.companion.over == reason and one.tell() == []
-    assert write_log(one.companion, TrialSpec("zigzag", 0, 0)._asdict(), tmp_path)
+    about = TrialSpec("zigzag", 0, 0)._asdict()
+    assert write_log(one.companion, about, tmp_path, Console())
+    one.companion.rows[1] = one.companion.rows[0]
+    assert write_log(one.companion, about, tmp_path, Console()) is None
+    assert "row 2: " in capsys.readouterr().err
 
 
 def test_late_answers_are_not_flown_and_hand_over_where_they_go_on(bench):

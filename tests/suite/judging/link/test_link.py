@@ -13,6 +13,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec, track_of
 from policies.block_policy import BlockPolicy
 from policies.policy import load_policy
+from suite.common.console import Console
 from suite.judging.link import fly, server
 from suite.judging.link.companion import Companion, Row
 from suite.judging.link.flights import Flight, delays, fly_link, totals, warm_up, write_log
@@ -141,7 +142,7 @@ def test_both_ends_agree_on_the_flight(flown, tmp_path):
     assert found["deadlines_missed"] == 0 and found["state_age_ms"]["max"] < 3.0
     # The camera keeps time with the decisions: no image waits for a whole period.
     assert found["image_age_ms"]["max"] <= 10.0 + 1e-6
-    name = write_log(companion, sim.result("pursuit")._asdict(), tmp_path)
+    name = write_log(companion, sim.result("pursuit")._asdict(), tmp_path, Console())
     log = read_flight(tmp_path / name)
     assert log.about["handed_over"] is None and log.about["events"]
     assert log.action_b is not None and log.action_b.shape == (len(rows), 3)
