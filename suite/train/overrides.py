@@ -109,6 +109,8 @@ def check_owned(changes: Iterable[str], owned: Mapping[str, str], option: str = 
     """
     for change in changes:
         path = change.partition("=")[0].strip()
+        if path.startswith(PREFIX):  # the same setting, from one phase on
+            path = path.removeprefix(PREFIX).partition(".")[2].strip()
         for owned_path, advice in owned.items():
             if is_within(path, owned_path):
                 raise ValueError(f"{option} {shown(change)}: this command sets {path}; {advice}")

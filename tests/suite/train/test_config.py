@@ -67,8 +67,9 @@ def test_settings_that_would_do_nothing_or_that_the_command_sets_itself_are_refu
         both = [change, f"{need}={given}"]
         assert override(run, both) == override(run, both[::-1])
     check_owned(["loss.progress=1"], {"loss.prog": "", "spec": ""})
-    with pytest.raises(ValueError, match=r"'spec.rate_hz=30': this command sets spec.*; take"):
-        check_owned(["spec.rate_hz=30"], {"spec": "take another policy"})
+    for change in ("spec.rate_hz=30", "phases.2.spec.rate_hz=30"):
+        with pytest.raises(ValueError, match=rf"'{change}': this command sets spec.*; take"):
+            check_owned([change], {"spec": "take another policy"})
 
 
 @pytest.mark.parametrize(
