@@ -37,6 +37,7 @@ def test_every_experiment_is_listed_and_has_help_for_every_option(capsys):
         ("schemes --training-seeds 1 1", "--training-seeds is 1 1"),
         ("schemes --worlds 5", "allowed with PPO are multiples of its 2 minibatches"),
         ("schemes --set loss.progress=1.2", "this command sets loss.progress; give --progress"),
+        ("faults --workers 10.0.0.1:8786", "--workers is tcp://10.0.0.1:8786; allowed"),
         ("gpu", "JAX finds no GPU here"),
         ("gpu --worlds 4 8 --train-worlds 6", "allowed are those of --worlds: 4 8"),
     ],
