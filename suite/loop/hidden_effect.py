@@ -155,7 +155,7 @@ def describe_hidden(config: HiddenLoopConfig) -> list[str]:
     simulated, true = load_vehicle(config.vehicle), load_vehicle(config.hidden_vehicle)
     effects = hidden_effects(simulated, true)
     sentences = [f"Differences of the hidden vehicle's file to the simulation's: {effects}."]
-    if simulated == true:
+    if not effects:
         sentences = ["The hidden vehicle's file is that of the simulation."]
     if config.simulator not in EXACT_SIMULATORS:
         listed = "; ".join(differences(config.simulator, true)) or "none"

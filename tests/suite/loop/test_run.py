@@ -291,9 +291,12 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
     effects, simulator = describe_hidden(config)
     assert "rotor_drag (coefficient 7.8e-05 kg/rad)" in effects and "no linear_drag" in effects
     assert "the rotors' drag acts at each hub" in simulator
-    effects, simulator = describe_hidden(same)
-    assert effects == "The hidden vehicle's file is that of the simulation."
-    assert "linear_drag: RotorPy's drag is proportional to the rotors' speed" in simulator
+    copied = replace(load_vehicle("reference"), name="copied")
+    save_vehicle(copied, tmp_path / "copied.toml", "")
+    for one in (same, replace(same, hidden_vehicle=str(tmp_path / "copied.toml"))):
+        effects, simulator = describe_hidden(one)
+        assert effects == "The hidden vehicle's file is that of the simulation."
+        assert "linear_drag: RotorPy's drag is proportional to the rotors' speed" in simulator
 
 
 @pytest.mark.parametrize(
