@@ -334,10 +334,8 @@ def short_training(
     seconds = time.perf_counter() - started
     curve = read(folder)
     warm = [row for row in curve if not row["cold"]] or curve
-    request = judging.TrialRequest(
-        judging.Setup(str(outcome.policy), vehicle),
-        _trials(config.trials, config.seed),
-    )
+    trials = _trials(config.trials, config.seed)
+    request = judging.TrialRequest(str(outcome.policy), vehicle, trials)
     results = judging.fly_trials({0: request}, workspace, console, "judging the short training")[0]
     speeds = [result.v_max for result in results if result.success]
     return {
