@@ -19,7 +19,7 @@ from suite.delta.run import errors_by_name
 from suite.judging.trials import parse_tracks
 from suite.loop.charts import COLOURS, delta_chart, success_chart
 from suite.loop.compare import BEFORE, PolicyResult, policy_results
-from suite.loop.config import DeltaLoopConfig, LoopConfig
+from suite.loop.config import LoopConfig
 from suite.loop.report import errors_row
 from suite.loop.tables import cell_grid, overall_grid, points, significance
 from suite.loop.variants import DeltaModel, Findings, Loop, ShownPolicy, Variant
@@ -38,7 +38,6 @@ def summarise(
     config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResult]]
 ) -> Findings:
     """Return the results of the finished loop in `out`."""
-    assert isinstance(config, DeltaLoopConfig)
     policies, trials = policy_results(results, REFERENCES), config.trials * config.cells
     fitted = json.loads((out / "delta" / "delta.json").read_text(encoding="utf-8"))
     return Findings(
@@ -94,7 +93,7 @@ def _delta_section(fitted: Mapping) -> Section:
     )
 
 
-def _training_section(out: Path, config: DeltaLoopConfig) -> Section:
+def _training_section(out: Path, config: LoopConfig) -> Section:
     """Return the section with the learning curves of the training and the fine-tunings."""
     folders = {BEFORE: "train", WITHOUT: "tuned-without", WITH: "tuned-with"}
     labels = {**LABELS, BEFORE: "training"}

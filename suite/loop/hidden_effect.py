@@ -30,7 +30,7 @@ from suite.common.report import Links, Picture, Section
 from suite.diagnose.report.summary import components, grid
 from suite.loop.charts import COLOURS, success_chart
 from suite.loop.compare import BEFORE, PolicyResult, policy_results
-from suite.loop.config import EXACT_SIMULATORS, HiddenLoopConfig, LoopConfig
+from suite.loop.config import EXACT_SIMULATORS, LoopConfig
 from suite.loop.report import errors_row
 from suite.loop.tables import cell_grid, overall_grid, points, significance
 from suite.loop.variants import DeltaModel, Findings, Loop, ShownPolicy, Variant
@@ -61,7 +61,6 @@ def summarise(
     config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResult]]
 ) -> Findings:
     """Return the results of the finished loop in `out`."""
-    assert isinstance(config, HiddenLoopConfig)
     diagnosis, trials = read_diagnosis(out), config.trials * config.cells
     policies = policy_results(results, REFERENCES)
     keys = ("verdict", "effects", "gap", "unexplained")
@@ -79,7 +78,7 @@ def summarise(
             "tracks": config.track,
             "levels": config.difficulty,
             "simulation's vehicle": config.vehicle,
-            "hidden vehicle": config.hidden_vehicle,
+            "hidden vehicle": config.true_vehicle,
             "flown in": config.simulator,
         },
         chart=Picture(success_chart(policies, LABELS), "Bars: 95 % intervals over trials."),
@@ -91,7 +90,7 @@ def summarise(
     )
 
 
-def vehicle_phrase(config: HiddenLoopConfig) -> str:
+def vehicle_phrase(config: LoopConfig) -> str:
     """Return how sentences name what differs from the simulation: the vehicle, or the simulator."""
     if config.simulator in EXACT_SIMULATORS:
         return "the hidden vehicle"
@@ -128,7 +127,7 @@ def verdict(
     )
 
 
-def _diagnosis_section(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -> Section:
+def _diagnosis_section(config: LoopConfig, diagnosis: Mapping[str, Any]) -> Section:
     """Return the section with the result of the diagnosis, and with what is hidden in truth."""
     gap = diagnosis["gap"]
     rows = [
@@ -150,9 +149,9 @@ def _diagnosis_section(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -
     )
 
 
-def describe_hidden(config: HiddenLoopConfig) -> list[str]:
+def describe_hidden(config: LoopConfig) -> list[str]:
     """Return sentences on the differences between the hidden vehicle and that of the simulation."""
-    simulated, true = load_vehicle(config.vehicle), load_vehicle(config.hidden_vehicle)
+    simulated, true = load_vehicle(config.vehicle), load_vehicle(config.true_vehicle)
     effects = hidden_effects(simulated, true)
     sentences = [f"Differences of the hidden vehicle's file to the simulation's: {effects}."]
     if not effects:
@@ -201,7 +200,6 @@ def _delta_section(out: Path) -> Section:
 
 def _training_section(out: Path, config: LoopConfig) -> Section:
     """Return the section with the learning curves of the fine-tunings."""
-    assert isinstance(config, HiddenLoopConfig)
     tuned = (CONTROL, DELTA, NAMED, BOTH) if config.delta else (CONTROL, NAMED)
     curves = {LABELS[name]: curve.read(out / f"tuned-{name}") for name in tuned}
     chart = curves_chart(curves, COLOURS[2:])

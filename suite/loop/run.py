@@ -15,7 +15,7 @@ from eval.judging.results import read_trials
 from suite.common.console import Console
 from suite.common.stages import claim, run_stages
 from suite.loop import delta_action, hidden_effect
-from suite.loop.config import HiddenLoopConfig, LoopConfig, loop_by_content
+from suite.loop.config import LoopConfig, loop_by_content
 from suite.loop.report import write_loop_report
 from suite.loop.tables import CAVEAT
 from suite.loop.work import LoopRun, plan
@@ -48,7 +48,7 @@ def run_loop(
             nothing to correct.
     """
     loop = delta_action.LOOP
-    if isinstance(config, HiddenLoopConfig):
+    if config.hidden_vehicle is not None:
         loop = hidden_effect.LOOP if config.delta else hidden_effect.WITHOUT_DELTA
     run = LoopRun(loop, config, Path(out), console, workers)
     claim(run.out, loop_by_content(config), config.seed)

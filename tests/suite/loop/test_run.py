@@ -28,7 +28,7 @@ from suite.delta.replay import nominal_model
 from suite.delta.run import flight_files
 from suite.loop import hidden_effect, work
 from suite.loop.compare import policy_results
-from suite.loop.config import HiddenLoopConfig, resolve
+from suite.loop.config import resolve
 from suite.loop.hidden_effect import LABELS, LOOP, describe_hidden, hidden_effects
 from suite.loop.measured import CONTACT_MARGIN_S, Noise
 from suite.loop.tables import CAVEAT
@@ -281,7 +281,6 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
         resolve(recipe="quick", simulator="rotorpy", hidden_vehicle=name)
         for name in ("examples/rotorpy.toml", None)
     )
-    assert isinstance(config, HiddenLoopConfig) and isinstance(same, HiddenLoopConfig)
     run = work.LoopRun(LOOP, config, tmp_path, Quiet())
     judged = [work._evaluation(run, variant) for variant in LOOP.variants]
     flown = [(one.simulator, one.vehicle) for one in judged]
