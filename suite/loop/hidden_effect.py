@@ -23,16 +23,15 @@ from eval.effects import EFFECTS
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import differences
-from eval.worlds.trial import TrialResult
 from suite.common import curve
 from suite.common.charts import curves_chart
 from suite.common.report import Links, Picture, Section
 from suite.diagnose.report.summary import components, grid
-from suite.loop.charts import COLOURS, success_chart
-from suite.loop.compare import BEFORE, PolicyResult, policy_results
+from suite.loop.charts import COLOURS
+from suite.loop.compare import BEFORE, PolicyResult
 from suite.loop.config import EXACT_SIMULATORS, LoopConfig
 from suite.loop.report import errors_row
-from suite.loop.tables import cell_grid, overall_grid, points, significance
+from suite.loop.tables import points, significance
 from suite.loop.variants import DeltaModel, Findings, Loop, ShownPolicy, Variant
 from suite.loop.work import named_effects, read_diagnosis
 from tracks.common.files import to_json
@@ -57,31 +56,24 @@ JUDGED = "judging the one fine-tuned {}, on the same seeds"
 """Description of the judging of a fine-tuned policy."""
 
 
-def summarise(
-    config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResult]]
-) -> Findings:
+def summarise(config: LoopConfig, out: Path, policies: Sequence[PolicyResult]) -> Findings:
     """Return the results of the finished loop in `out`."""
     diagnosis, trials = read_diagnosis(out), config.trials * config.cells
-    policies = policy_results(results, REFERENCES)
     keys = ("verdict", "effects", "gap", "unexplained")
     return Findings(
         verdict=verdict(policies, diagnosis, trials, vehicle_phrase(config)),
-        tables=[overall_grid(policies, REFERENCES, LABELS, trials), cell_grid(policies, LABELS)],
         errors=[
             f"Delta Action Model of the {quadrotor} quadrotor\n\n"
             + (out / f"delta-{name}" / "table.md").read_text(encoding="utf-8")
             for name, quadrotor in MODELS.items()
             if config.delta
         ],
-        numbers={"standings": policies, "diagnosis": {key: diagnosis[key] for key in keys}},
+        numbers={"diagnosis": {key: diagnosis[key] for key in keys}},
         facts={
-            "tracks": config.track,
-            "levels": config.difficulty,
             "simulation's vehicle": config.vehicle,
             "hidden vehicle": config.true_vehicle,
             "flown in": config.simulator,
         },
-        chart=Picture(success_chart(policies, LABELS), "Bars: 95 % intervals over trials."),
         sections=[
             _diagnosis_section(config, diagnosis),
             *([_delta_section(out)] if config.delta else []),
@@ -262,6 +254,8 @@ LOOP = Loop(
             NAMED, "fine-tuned with the named effect", "Flights fine-tuned with the named effect"
         ),
     ),
+    labels=LABELS,
+    references=REFERENCES,
     summarise=summarise,
     reading=f"{READING}quadrotor; the others through it with its Delta Action Model, through the "
     "quadrotor corrected by the named effect, and through the latter with a Delta Action Model of "
