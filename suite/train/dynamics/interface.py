@@ -72,5 +72,7 @@ def make_dynamics(config: TrainConfig) -> Dynamics:
     decay = config.loss.gradient_decay
     return Dynamics(
         start=lambda constants, *state: point_mass.start(*state),
-        step=lambda *arguments: point_mass.step(*arguments[:-1], decay),  # it needs no keys
+        step=lambda body, constants, action_b, target_w, keys: point_mass.step(
+            body, constants, action_b, target_w, decay
+        ),
     )
