@@ -83,7 +83,7 @@ def test_the_ablation_from_one_command_and_again(tmp_path, monkeypatch, small_sc
     assert field["over"]["success_cross"]["most"] == field["pooled"]["success_cross"]["low"] == 0
     assert field["over"]["collision_free"]["least"] == 1 and field["over"]["v_max"]["mean"] > 0
     assert "| without, L_p^norm | 6.4 | diverged | - |" in text and "| 1 of 1 |" in text
-    monkeypatch.setattr(training_run, "make_update", None)
+    monkeypatch.setattr(training_run, "make_update", pytest.fail)
     assert reproduce(tmp_path, "ablation", *args) == 0, "nothing is trained again"
     assert (tmp_path / "docs" / "ablation.md").read_text() == text
 
