@@ -16,7 +16,7 @@ from suite.common.options import Advanced, Command
 from suite.common.running.hosts import ProcessOptions, connect, read_member
 from suite.common.startup import use_device
 from suite.train.config import TrainConfig
-from suite.train.overrides import check_phases, with_changes
+from suite.train.overrides import check_phases, phase_configs, with_changes
 from suite.train.recipes import (
     finetune,
     named_recipe,
@@ -144,9 +144,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         params = load_start_params(config.init_from, resolved.spec)
     if config.delta is not None:
         stored = load_delta(config.delta)
-        dynamics = resolved.quadrotor or resolved.physics
         fit = stored.config.get("fit", {})
-        check_corrects(fit, dynamics, resolved.spec.rate_hz, config.delta)
+        for phase in phase_configs(resolved):
+            dynamics = phase.quadrotor or phase.physics
+            check_corrects(fit, dynamics, phase.spec.rate_hz, config.delta)
         delta = jax.tree.map(jax.numpy.asarray, stored.arrays)
     mirror = tensorboard(config.out) if config.tensorboard and not member.number else None
     outcome = train(resolved, config.out, console, params, delta, mirror=mirror)

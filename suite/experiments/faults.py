@@ -40,6 +40,7 @@ from suite.experiments.pages.document import PageContents
 from suite.experiments.study.cache import Workspace, code_digest, digest
 from suite.judging.collect import collect
 from suite.judging.requests import Collection
+from tracks.common.files import write_text
 from tracks.common.grid import Grid, table
 from tracks.common.provenance import git_commit
 from tracks.common.work import run_pieces
@@ -47,6 +48,8 @@ from tracks.input.ranges import Range, Seed
 
 FLIGHT_LOG = "flight log"
 """Label of the suite's format of flight logs."""
+CODE = ("suite/experiments/injected", "eval/importers", "eval/logs/faults")
+"""Folders with the code that injects and finds faults."""
 FORMATS = (*WRITERS, FLIGHT_LOG)
 """Formats of the simulated logs."""
 POLICY_HZ = 30.0
@@ -88,9 +91,19 @@ class Case:
 
 
 def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
-    """Return the contents of the page; missing flights and checks are made first."""
+    """Return the contents of the page; missing flights and checks are made first.
+
+    Raises:
+        ValueError: for a cluster, since the logs are files of this machine, and for a vehicle
+            without a flight of 4 s.
+    """
+    if isinstance(workspace.workers, str):
+        raise ValueError(
+            f"--workers is {workspace.workers}; allowed for this page is a number of processes, "
+            "because the logs are files of this machine"
+        )
     vehicle = load_vehicle(config.vehicle)
-    inputs = [config.vehicle, config.seed, git_commit(), code_digest("eval")]
+    inputs = [vehicle, config.seed, git_commit(), code_digest("eval")]
     folder = workspace.cache / f"faults-{digest(inputs)}"
     flights = _fly(config, vehicle, folder, console)
     faulty = list(_simulated_cases(config, flights))
@@ -148,6 +161,11 @@ def _fly(config: Config, vehicle: Vehicle, folder: Path, console: Console) -> li
     paths = [
         folder / "flights" / row["file"] for row in flights if row["file"] and row["time_s"] > 4
     ]
+    if not paths:
+        raise ValueError(
+            f"--vehicle {config.vehicle}: no flight of {len(flights)} lasts more than 4 s; give a "
+            "vehicle that the shipped policy can fly"
+        )
     order = np.random.default_rng(config.seed).permutation(len(paths))
     return [paths[k] for k in order][:count]
 
@@ -202,9 +220,12 @@ def _check_cases(
     cases: Sequence[Case], config: Config, folder: Path, console: Console, workspace: Workspace
 ) -> dict[Case, Answer]:
     """Return the answer to every case; those of an interrupted run are read from its file."""
-    path = folder / f"checked-{code_digest('suite/experiments/injected', 'eval/importers')}.jsonl"
-    keys = {f"{c.kind}|{c.format}|{c.path.parent.name}/{c.path.name}": c for c in cases}
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    path = folder / f"checked-{code_digest(*CODE)}.jsonl"
+    keys = {f"{c.kind}|{c.format}|{c.path.parent.name}/{c.path.name}|{c.number}": c for c in cases}
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    # If a kill left an incomplete last line, it is dropped.
+    lines = text.splitlines(keepends=True)[: text.count("\n")]
+    write_text(path, "".join(lines))
     answers = {k: a for k, a in map(json.loads, lines) if k in keys}
     missing = [key for key in keys if key not in answers]
     with (

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -83,19 +83,6 @@ class Config:
     """Seed of the training, and of the first judged trial."""
 
 
-class Row(NamedTuple):
-    """Speed of the training for one model and one number of worlds."""
-
-    model: str
-    """A key of MODELS."""
-    worlds: int
-    """Worlds in a gradient step."""
-    seconds: float
-    """Time of a gradient step [s]."""
-    operations: float
-    """Floating-point operations of a gradient step."""
-
-
 def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
     """Return the contents of the page, after all measurements.
 
@@ -119,21 +106,23 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     # 2. Training and judging. Another process flies the same trials on the CPU at the same time.
     with worker_pool(1) as cpu_process:
         cpu_results = cpu_process.submit(fly_on_cpu, config, vehicle)
-        programs = compile_programs(config, vehicle, console)
-        rows = trainer_speeds(config, programs.updates, console)
+        started = time.perf_counter()
+        updates, results = compile_programs(config, vehicle)
+        compile_s = time.perf_counter() - started
+        console.say(f"every program compiled: {compile_s:.0f} s")
+        trainer = trainer_speeds(config, updates, console)
         judge = [judge_speed(config, vehicle, worlds, console) for worlds in config.worlds]
-        comparison = compare_with_cpu(programs.results, cpu_results.result(), console)
+        comparison = compare_with_cpu(results, cpu_results.result(), console)
     # 3. The short training.
-    step_s = {row.worlds: row.seconds for row in rows if row.model == "quadrotor"}
+    step_s = {row["worlds"]: row["seconds"] for row in trainer if row["model"] == "quadrotor"}
     short_result = short_training(config, vehicle, step_s[config.train_worlds], workspace, console)
-    trainer = [row._asdict() for row in rows]
     memory = peak_memory()
     facts = {
         "device": f"{len(jax.devices())} x {device.device_kind}",
         "a product of matrices": f"{peak_rate / 1e12:.1f} TFLOP/s, float32 unrounded",
         "a gradient step": f"of the recipe gpu's last phase, {_steps(config)} decisions per world",
         "most memory held": "unknown" if memory is None else f"{memory / 1e9:.1f} GB",
-        "compiling": f"{programs.seconds:.0f} s, all programs at once",
+        "compiling": f"{compile_s:.0f} s, all programs at once",
     }
     curve = Picture(curves_chart({"training": short_result["curve"]}), "The short training's curve")
     parts: dict[str, Sequence[Grid | Picture]] = {
@@ -145,7 +134,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     numbers = {
         "device": device.device_kind,
         "multiplying_rate": peak_rate,
-        "compile_s": programs.seconds,
+        "compile_s": compile_s,
         "memory_bytes": memory,
         "trainer": trainer,
         "judge": judge,
@@ -173,22 +162,17 @@ def _steps(config: Config) -> int:
     return last_phase(config, "quadrotor", 1).episode.steps
 
 
-class Compiled(NamedTuple):
-    """The compiled programs, and the results of running them once."""
-
-    updates: Mapping[tuple[str, int], Callable[[], Any]]
-    """Gradient steps by model and number of worlds."""
-    results: list[TrialResult]
-    """Results on this device of the trials that the CPU flies as well."""
-    seconds: float
-    """Time of compiling [s]."""
-
-
-def compile_programs(config: Config, vehicle: Vehicle, console: Console) -> Compiled:
+def compile_programs(
+    config: Config, vehicle: Vehicle
+) -> tuple[dict[tuple[str, int], Callable[[], Any]], list[TrialResult]]:
     """Run every program once, so that it is compiled before its time is measured.
 
     All compile at the same time, since compiling takes most of the time. The programs of the short
     training are among them, so that training does not compile them again.
+
+    Returns:
+        Gradient steps by model and number of worlds, and the results on this device of the trials
+        that the CPU flies as well.
     """
     measured = {
         (model, worlds): last_phase(config, model, worlds)
@@ -196,7 +180,6 @@ def compile_programs(config: Config, vehicle: Vehicle, console: Console) -> Comp
         for model in MODELS
     }
     phases = phase_configs(recipe(config, config.train_worlds))
-    started = time.perf_counter()
     with ThreadPoolExecutor(len(measured) + len(phases) + len(config.worlds)) as pool:
         judged = [pool.submit(_fly_timed, config, vehicle, worlds) for worlds in config.worlds]
         results = pool.submit(_fly_paired, config, vehicle, "mjx")
@@ -204,9 +187,7 @@ def compile_programs(config: Config, vehicle: Vehicle, console: Console) -> Comp
         updates = dict(zip(measured, pool.map(_compile_update, measured.values()), strict=True))
         for future in (*judged, *earlier_phases):
             future.result()
-        programs = Compiled(updates, results.result(), time.perf_counter() - started)
-    console.say(f"every program compiled: {programs.seconds:.0f} s")
-    return programs
+        return updates, results.result()
 
 
 def _compile_update(phase: TrainConfig) -> Callable[[], Any]:
@@ -231,13 +212,14 @@ def repeated_worlds(config: TrainConfig) -> Worlds:
 
 def trainer_speeds(
     config: Config, updates: Mapping[tuple[str, int], Callable[[], Any]], console: Console
-) -> list[Row]:
-    """Return the speed of each gradient step, in the order of the number of worlds."""
+) -> list[dict[str, Any]]:
+    """Return model, worlds, seconds and operations of each gradient step, by number of worlds."""
     operations = {model: _operations_per_world(config, model) for model in MODELS}
     rows = []
     for (model, worlds), update in sorted(updates.items(), key=lambda entry: entry[0][1]):
         seconds = best_time(update)
-        rows.append(Row(model, worlds, seconds, worlds * operations[model]))
+        count = worlds * operations[model]
+        rows.append({"model": model, "worlds": worlds, "seconds": seconds, "operations": count})
         console.say(f"trainer, {worlds} {MODELS[model]}: {seconds:.3f} s per gradient step")
     return rows
 
@@ -334,10 +316,8 @@ def short_training(
     seconds = time.perf_counter() - started
     curve = read(folder)
     warm = [row for row in curve if not row["cold"]] or curve
-    request = judging.TrialRequest(
-        judging.Setup(str(outcome.policy), vehicle),
-        _trials(config.trials, config.seed),
-    )
+    trials = _trials(config.trials, config.seed)
+    request = judging.TrialRequest(str(outcome.policy), vehicle, trials)
     results = judging.fly_trials({0: request}, workspace, console, "judging the short training")[0]
     speeds = [result.v_max for result in results if result.success]
     return {

@@ -76,15 +76,10 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
         "trainings at once": workspace.at_once,
     }
     measured = [row for row in rows if row.at]
-    chart = [Picture(curves_chart(measured, FIGURE), "Learning curves over steps and over time")]
-    # Without a measured scheme the page has no chart: the slice below is then empty.
-    parts = {
-        "Learning curves": [
-            *chart[: len(measured)],
-            _end_grid(measured),
-            _time_grid(measured, compile_s),
-        ],
-    }
+    tables = [_end_grid(measured), _time_grid(measured, compile_s)]
+    title = "Learning curves over steps and over time"
+    chart = [Picture(curves_chart(measured, FIGURE), title)] if measured else []
+    parts = {"Learning curves": [*chart, *tables]}
     numbers = [
         {
             "scheme": row.key,

@@ -58,8 +58,9 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
 
     policy = config.policy or default_policy()
     name, policies = judging.policy_name(policy), judging.policy_facts({OURS: policy})
-    setup = judging.Setup(policy, load_vehicle(config.vehicle), load_sensors(config.sensors))
-    request = judging.TrialRequest(setup, judging.judged_trials(config, LEVELS))
+    vehicle, sensors = load_vehicle(config.vehicle), load_sensors(config.sensors)
+    trials = judging.judged_trials(config, LEVELS)
+    request = judging.TrialRequest(policy, vehicle, trials, sensors)
     rows = judging.fly_trials({OURS: request}, workspace, console, "judging all levels")[OURS]
     cells = summarise([row._replace(policy=OURS) for row in rows])["cells"]
     seeds = options.judged_seeds(config)

@@ -62,8 +62,11 @@ HIDDEN_SIZES = {"quick": LoopSize(20, 3, 200, 100), "": LoopSize(25, 3, 200, 60)
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """Settings of every loop."""
+    """Settings of a loop, with a hidden vehicle or without one."""
 
+    training: TrainConfig
+    """Settings of the first training, if no policy is given. Without a hidden vehicle the Delta
+    Action Model corrects its dynamics: the point mass or a quadrotor."""
     tuning: TrainConfig
     """Settings of the fine-tunings, which differ only in their dynamics."""
     fit: FitConfig
@@ -86,6 +89,13 @@ class LoopConfig:
     """Seed of the trainings and of the first judged trial."""
     digests: dict[str, str]
     """SHA-256 of the vehicles, the sensors and the given policy (if there is one), by name."""
+    hidden_vehicle: str | None = None
+    """The true vehicle's file, if it is another than the simulation's; the loop uses only its
+    flights."""
+    simulator: str = EXACT_SIMULATORS[0]
+    """The simulator of the true vehicle."""
+    delta: bool = True
+    """Whether Delta Action Models are fitted, and policies are fine-tuned with them."""
 
     @property
     def recorded_from(self) -> int:
@@ -100,43 +110,7 @@ class LoopConfig:
     @property
     def true_vehicle(self) -> str:
         """The vehicle that flies trials and recorded flights: a shipped name or a vehicle file."""
-        return self.vehicle
-
-    @property
-    def true_simulator(self) -> str:
-        """The simulator of the true vehicle."""
-        return EXACT_SIMULATORS[0]
-
-
-@dataclass(frozen=True)
-class DeltaLoopConfig(LoopConfig):
-    """A loop without a hidden vehicle, which shows the effect of a Delta Action Model."""
-
-    training: TrainConfig
-    """Settings of the first training. The Delta Action Model corrects its dynamics: the point mass
-    or a quadrotor."""
-
-
-@dataclass(frozen=True)
-class HiddenLoopConfig(LoopConfig):
-    """A loop whose true vehicle differs from the simulation's vehicle file."""
-
-    hidden_vehicle: str
-    """The true vehicle's file; the loop uses only its flights."""
-    simulator: str = EXACT_SIMULATORS[0]
-    """The simulator in which the hidden vehicle flies."""
-    delta: bool = True
-    """Whether Delta Action Models are fitted as well, and policies are fine-tuned with them."""
-
-    @property
-    def true_vehicle(self) -> str:
-        """The hidden vehicle's file."""
-        return self.hidden_vehicle
-
-    @property
-    def true_simulator(self) -> str:
-        """The simulator of the true vehicle."""
-        return self.simulator
+        return self.vehicle if self.hidden_vehicle is None else self.hidden_vehicle
 
 
 def loop_by_content(config: LoopConfig) -> LoopConfig:
@@ -153,10 +127,8 @@ def loop_by_content(config: LoopConfig) -> LoopConfig:
     if policy is not None and policy not in shipped.names():
         policy = "a file"
     vehicle, sensors = without_path(config.vehicle), without_path(config.sensors)
-    config = replace(config, policy=policy, vehicle=vehicle, sensors=sensors)
-    if isinstance(config, HiddenLoopConfig):
-        return replace(config, hidden_vehicle=without_path(config.hidden_vehicle))
-    return config
+    hidden = config.hidden_vehicle and without_path(config.hidden_vehicle)
+    return replace(config, policy=policy, vehicle=vehicle, sensors=sensors, hidden_vehicle=hidden)
 
 
 def default_recipe(policy: str | None) -> str:
@@ -260,6 +232,7 @@ def resolve(
     fit_steps = size.fit_iterations if fit_iterations is None else fit_iterations
     check(tuning)
     config = LoopConfig(
+        training=training,
         tuning=tuning,
         fit=FitConfig(iterations=fit_steps, seed=seed),
         policy=policy,
@@ -271,14 +244,13 @@ def resolve(
         sensors=sensors,
         seed=seed,
         digests=digests,
+        hidden_vehicle=true_vehicle if hidden else None,
+        simulator=simulator,
+        delta=delta,
     )
     check_ranges(config)
     _check_seeds(config)
-    if not hidden:
-        return DeltaLoopConfig(training=training, **vars(config))
-    return HiddenLoopConfig(
-        hidden_vehicle=true_vehicle, simulator=simulator, delta=delta, **vars(config)
-    )
+    return config
 
 
 def _check_changes(changes: Sequence[str], policy: str | None, iterations: int | None) -> None:

@@ -11,17 +11,15 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from eval.worlds.trial import TrialResult
 from suite.common import curve
 from suite.common.charts import curves_chart
 from suite.common.report import Picture, Section
 from suite.delta.run import errors_by_name
-from suite.judging.trials import parse_tracks
-from suite.loop.charts import COLOURS, delta_chart, success_chart
-from suite.loop.compare import BEFORE, PolicyResult, policy_results
-from suite.loop.config import DeltaLoopConfig, LoopConfig
+from suite.loop.charts import COLOURS, delta_chart
+from suite.loop.compare import BEFORE, PolicyResult
+from suite.loop.config import LoopConfig
 from suite.loop.report import errors_row
-from suite.loop.tables import cell_grid, overall_grid, points, significance
+from suite.loop.tables import points, significance
 from suite.loop.variants import DeltaModel, Findings, Loop, ShownPolicy, Variant
 from tracks.common.grid import table
 
@@ -34,27 +32,14 @@ JUDGED = "judging the one fine-tuned {} the Delta Action Model, on the same seed
 """Description of the judging of a fine-tuned policy."""
 
 
-def summarise(
-    config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResult]]
-) -> Findings:
+def summarise(config: LoopConfig, out: Path, policies: Sequence[PolicyResult]) -> Findings:
     """Return the results of the finished loop in `out`."""
-    assert isinstance(config, DeltaLoopConfig)
-    policies, trials = policy_results(results, REFERENCES), config.trials * config.cells
     fitted = json.loads((out / "delta" / "delta.json").read_text(encoding="utf-8"))
     return Findings(
-        verdict=verdict(policies, trials),
-        tables=[overall_grid(policies, REFERENCES, LABELS, trials), cell_grid(policies, LABELS)],
+        verdict=verdict(policies, config.trials * config.cells),
         errors=[(out / "delta" / "table.md").read_text(encoding="utf-8")],
-        numbers={
-            "standings": policies,
-            "delta": {key: value for key, value in fitted.items() if key != "curve"},
-        },
-        facts={
-            "tracks": ", ".join(parse_tracks(config.track)),
-            "levels": config.difficulty,
-            "vehicle": config.vehicle,
-        },
-        chart=Picture(success_chart(policies, LABELS), "Bars: 95 % intervals over trials."),
+        numbers={"delta": {key: value for key, value in fitted.items() if key != "curve"}},
+        facts={"vehicle": config.vehicle},
         sections=[_delta_section(fitted), _training_section(out, config)],
     )
 
@@ -94,7 +79,7 @@ def _delta_section(fitted: Mapping) -> Section:
     )
 
 
-def _training_section(out: Path, config: DeltaLoopConfig) -> Section:
+def _training_section(out: Path, config: LoopConfig) -> Section:
     """Return the section with the learning curves of the training and the fine-tunings."""
     folders = {BEFORE: "train", WITHOUT: "tuned-without", WITH: "tuned-with"}
     labels = {**LABELS, BEFORE: "training"}
@@ -124,6 +109,8 @@ LOOP = Loop(
         ShownPolicy(BEFORE, "before", "Flights before fine-tuning"),
         ShownPolicy(WITH, "tuned with delta", "Flights, fine-tuned with delta"),
     ),
+    labels=LABELS,
+    references=REFERENCES,
     summarise=summarise,
     reading="All three policies fly the same trials in the MuJoCo quadrotor, without the Delta "
     "Action Model (delta). The policy tuned without delta is the control: it has the same number "

@@ -23,16 +23,15 @@ from eval.effects import EFFECTS
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import differences
-from eval.worlds.trial import TrialResult
 from suite.common import curve
 from suite.common.charts import curves_chart
 from suite.common.report import Links, Picture, Section
 from suite.diagnose.report.summary import components, grid
-from suite.loop.charts import COLOURS, success_chart
-from suite.loop.compare import BEFORE, PolicyResult, policy_results
-from suite.loop.config import EXACT_SIMULATORS, HiddenLoopConfig, LoopConfig
+from suite.loop.charts import COLOURS
+from suite.loop.compare import BEFORE, PolicyResult
+from suite.loop.config import EXACT_SIMULATORS, LoopConfig
 from suite.loop.report import errors_row
-from suite.loop.tables import cell_grid, overall_grid, points, significance
+from suite.loop.tables import points, significance
 from suite.loop.variants import DeltaModel, Findings, Loop, ShownPolicy, Variant
 from suite.loop.work import named_effects, read_diagnosis
 from tracks.common.files import to_json
@@ -57,32 +56,24 @@ JUDGED = "judging the one fine-tuned {}, on the same seeds"
 """Description of the judging of a fine-tuned policy."""
 
 
-def summarise(
-    config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResult]]
-) -> Findings:
+def summarise(config: LoopConfig, out: Path, policies: Sequence[PolicyResult]) -> Findings:
     """Return the results of the finished loop in `out`."""
-    assert isinstance(config, HiddenLoopConfig)
     diagnosis, trials = read_diagnosis(out), config.trials * config.cells
-    policies = policy_results(results, REFERENCES)
     keys = ("verdict", "effects", "gap", "unexplained")
     return Findings(
         verdict=verdict(policies, diagnosis, trials, vehicle_phrase(config)),
-        tables=[overall_grid(policies, REFERENCES, LABELS, trials), cell_grid(policies, LABELS)],
         errors=[
             f"Delta Action Model of the {quadrotor} quadrotor\n\n"
             + (out / f"delta-{name}" / "table.md").read_text(encoding="utf-8")
             for name, quadrotor in MODELS.items()
             if config.delta
         ],
-        numbers={"standings": policies, "diagnosis": {key: diagnosis[key] for key in keys}},
+        numbers={"diagnosis": {key: diagnosis[key] for key in keys}},
         facts={
-            "tracks": config.track,
-            "levels": config.difficulty,
             "simulation's vehicle": config.vehicle,
-            "hidden vehicle": config.hidden_vehicle,
+            "hidden vehicle": config.true_vehicle,
             "flown in": config.simulator,
         },
-        chart=Picture(success_chart(policies, LABELS), "Bars: 95 % intervals over trials."),
         sections=[
             _diagnosis_section(config, diagnosis),
             *([_delta_section(out)] if config.delta else []),
@@ -91,7 +82,7 @@ def summarise(
     )
 
 
-def vehicle_phrase(config: HiddenLoopConfig) -> str:
+def vehicle_phrase(config: LoopConfig) -> str:
     """Return how sentences name what differs from the simulation: the vehicle, or the simulator."""
     if config.simulator in EXACT_SIMULATORS:
         return "the hidden vehicle"
@@ -128,7 +119,7 @@ def verdict(
     )
 
 
-def _diagnosis_section(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -> Section:
+def _diagnosis_section(config: LoopConfig, diagnosis: Mapping[str, Any]) -> Section:
     """Return the section with the result of the diagnosis, and with what is hidden in truth."""
     gap = diagnosis["gap"]
     rows = [
@@ -150,12 +141,12 @@ def _diagnosis_section(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -
     )
 
 
-def describe_hidden(config: HiddenLoopConfig) -> list[str]:
+def describe_hidden(config: LoopConfig) -> list[str]:
     """Return sentences on the differences between the hidden vehicle and that of the simulation."""
-    simulated, true = load_vehicle(config.vehicle), load_vehicle(config.hidden_vehicle)
+    simulated, true = load_vehicle(config.vehicle), load_vehicle(config.true_vehicle)
     effects = hidden_effects(simulated, true)
     sentences = [f"Differences of the hidden vehicle's file to the simulation's: {effects}."]
-    if simulated == true:
+    if not effects:
         sentences = ["The hidden vehicle's file is that of the simulation."]
     if config.simulator not in EXACT_SIMULATORS:
         listed = "; ".join(differences(config.simulator, true)) or "none"
@@ -201,7 +192,6 @@ def _delta_section(out: Path) -> Section:
 
 def _training_section(out: Path, config: LoopConfig) -> Section:
     """Return the section with the learning curves of the fine-tunings."""
-    assert isinstance(config, HiddenLoopConfig)
     tuned = (CONTROL, DELTA, NAMED, BOTH) if config.delta else (CONTROL, NAMED)
     curves = {LABELS[name]: curve.read(out / f"tuned-{name}") for name in tuned}
     chart = curves_chart(curves, COLOURS[2:])
@@ -264,6 +254,8 @@ LOOP = Loop(
             NAMED, "fine-tuned with the named effect", "Flights fine-tuned with the named effect"
         ),
     ),
+    labels=LABELS,
+    references=REFERENCES,
     summarise=summarise,
     reading=f"{READING}quadrotor; the others through it with its Delta Action Model, through the "
     "quadrotor corrected by the named effect, and through the latter with a Delta Action Model of "

@@ -6,35 +6,46 @@ policy in it and compares the policies. The findings are the results of this com
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from suite.common.console import duration
 from suite.common.report import Details, Links, Picture, Report, Section, write_report
+from suite.judging.trials import parse_tracks
 from suite.loop.config import LoopConfig
 from suite.loop.tables import CAVEAT
 from suite.loop.variants import Findings, Loop
 from tracks.common.files import to_json
-from tracks.common.grid import table
+from tracks.common.grid import Grid, table
 from tracks.common.provenance import VERSION, git_commit
 
 
 def write_loop_report(
-    out: Path, loop: Loop, config: LoopConfig, findings: Findings, seconds: Mapping[str, float]
+    out: Path,
+    loop: Loop,
+    config: LoopConfig,
+    findings: Findings,
+    results: Sequence[Grid | Picture],
+    seconds: Mapping[str, float],
 ) -> None:
-    """Write report.html of the finished loop in `out`; `seconds` are the times of its stages."""
+    """Write report.html of the finished loop in `out`.
+
+    `results` are chart and tables of the policies, and `seconds` the times of the stages.
+    """
     report = Report(
         title=loop.title,
         lead=findings.verdict,
         facts={
             "trials": f"{config.trials * config.cells} of each policy",
+            "tracks": ", ".join(parse_tracks(config.track)),
+            "levels": config.difficulty,
             **findings.facts,
             "started from": config.policy or "training",
             "seed": str(config.seed),
             "version": f"{VERSION}, {(git_commit() or 'no commit')[:10]}",
         },
         sections=[
-            Section("On the same seeds", [loop.reading, findings.chart, *findings.tables, CAVEAT]),
+            Section("On the same seeds", [loop.reading, *results, CAVEAT]),
             *findings.sections,
             *_flight_sections(out, loop),
             _files_section(out, loop, config, seconds),

@@ -13,11 +13,14 @@ from typing import Any
 
 from eval.judging.results import read_trials
 from suite.common.console import Console
+from suite.common.report import Picture
 from suite.common.stages import claim, run_stages
 from suite.loop import delta_action, hidden_effect
-from suite.loop.config import HiddenLoopConfig, LoopConfig, loop_by_content
+from suite.loop.charts import success_chart
+from suite.loop.compare import policy_results
+from suite.loop.config import LoopConfig, loop_by_content
 from suite.loop.report import write_loop_report
-from suite.loop.tables import CAVEAT
+from suite.loop.tables import CAVEAT, cell_grid, overall_grid
 from suite.loop.work import LoopRun, plan
 from tracks.common.files import plain, write_json, write_text
 from tracks.common.grid import markdown, rich_table
@@ -48,7 +51,7 @@ def run_loop(
             nothing to correct.
     """
     loop = delta_action.LOOP
-    if isinstance(config, HiddenLoopConfig):
+    if config.hidden_vehicle is not None:
         loop = hidden_effect.LOOP if config.delta else hidden_effect.WITHOUT_DELTA
     run = LoopRun(loop, config, Path(out), console, workers)
     claim(run.out, loop_by_content(config), config.seed)
@@ -62,16 +65,28 @@ def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any
     loop, config, out, console = run.loop, run.config, run.out, run.console
     folders = {variant.name: out / f"eval-{variant.name}" for variant in loop.variants}
     results = {name: read_trials(folder / "trials.parquet") for name, folder in folders.items()}
-    findings = loop.summarise(config, out, results)
+    policies, trials = policy_results(results, loop.references), config.trials * config.cells
+    grids = [
+        overall_grid(policies, loop.references, loop.labels, trials),
+        cell_grid(policies, loop.labels),
+    ]
+    chart = Picture(success_chart(policies, loop.labels), "Bars: 95 % intervals over trials.")
+    findings = loop.summarise(config, out, policies)
     # Write table.md, loop.json and report.html.
     header = stamp(1, config.seed)
     comment = "; ".join(f"{key}: {value}" for key, value in header.items())
-    tables = map(markdown, findings.tables)
-    texts = [findings.verdict, *tables, CAVEAT, *findings.errors, f"<!-- {comment} -->\n"]
+    texts = [
+        findings.verdict,
+        *map(markdown, grids),
+        CAVEAT,
+        *findings.errors,
+        f"<!-- {comment} -->\n",
+    ]
     write_text(out / "table.md", "\n\n".join(text.strip("\n") for text in texts) + "\n")
     answer = {
         **header,
         "verdict": findings.verdict,
+        "standings": policies,
         **findings.numbers,
         "seeds": seeds(run),
         "stage_seconds": {name: round(value, 1) for name, value in seconds.items()},
@@ -79,10 +94,10 @@ def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any
         "files": {name: name for name in FILES},
     }
     write_json(out / "loop.json", answer)
-    write_loop_report(out, loop, config, findings, seconds)
+    write_loop_report(out, loop, config, findings, [chart, *grids], seconds)
     # Print the same tables, the verdict and where the files are.
-    for table in findings.tables:
-        console.show(rich_table(table))
+    for grid in grids:
+        console.show(rich_table(grid))
     errors = [] if loop.hidden else [text.strip("\n") for text in findings.errors]
     console.say("\n\n".join([CAVEAT, *errors, findings.verdict]) + "\n")
     console.say(f"table:     {out / 'table.md'}")

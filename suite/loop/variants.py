@@ -20,10 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from eval.worlds.trial import TrialResult
-from suite.common.report import Picture, Section
+from suite.common.report import Section
+from suite.loop.compare import PolicyResult
 from suite.loop.config import LoopConfig
-from tracks.common.grid import Grid
 
 
 @dataclass(frozen=True)
@@ -74,16 +73,12 @@ class Findings:
 
     verdict: str
     """The result in a few sentences."""
-    tables: Sequence[Grid]
-    """Tables of the policies."""
     errors: Sequence[str]
     """Tables of the Delta Action Models' errors, as Markdown."""
     numbers: Mapping[str, Any]
     """Results for loop.json, by key."""
     facts: Mapping[str, str]
-    """Conditions of the trials for the report, by name, such as the tracks."""
-    chart: Picture
-    """Chart of the policies."""
+    """Further conditions of the trials for the report, by name, such as the vehicle."""
     sections: Sequence[Section]
     """Sections of the report between the policies and the flights."""
 
@@ -101,10 +96,14 @@ class Loop:
     """The policies, in the order of tables and stages."""
     models: Sequence[DeltaModel]
     """The fits of Delta Action Models, in the order of the stages."""
+    labels: Mapping[str, str]
+    """Label of each policy in tables."""
+    references: Sequence[str]
+    """Policies with which the others are compared."""
     shown: Sequence[ShownPolicy]
     """The policy before the fine-tuning, and one after it."""
-    summarise: Callable[[LoopConfig, Path, Mapping[str, Sequence[TrialResult]]], Findings]
-    """(settings, folder of the loop, results by variant) -> the findings."""
+    summarise: Callable[[LoopConfig, Path, Sequence[PolicyResult]], Findings]
+    """(settings, folder of the finished loop, results of the policies) -> the findings."""
     reading: str
     """Explanation of the tables, for the report."""
     advice: str

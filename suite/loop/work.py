@@ -34,7 +34,7 @@ from suite.judging.replay import first_trials, fly_again
 from suite.judging.requests import Collection, Evaluation
 from suite.judging.trials import parse_levels
 from suite.loop.compare import BEFORE
-from suite.loop.config import EXACT_SIMULATORS, DeltaLoopConfig, LoopConfig
+from suite.loop.config import EXACT_SIMULATORS, LoopConfig
 from suite.loop.measured import add_measurement_noise, first_files
 from suite.loop.variants import DeltaModel, Loop, Variant
 from suite.train import run as training
@@ -109,7 +109,6 @@ def _first_policy_stage(run: LoopRun) -> Stage:
     """Return the stage that trains the first policy, or copies the given one."""
     config, policy = run.config, run.config.policy
     if policy is None:
-        assert isinstance(config, DeltaLoopConfig)
 
         def train(folder: Path) -> None:
             training.train(config.training, folder, run.console)
@@ -139,7 +138,7 @@ def _evaluation(run: LoopRun, variant: Variant) -> Evaluation:
         trials=config.trials,
         seed=config.seed,
         vehicle=config.vehicle if variant.simulated else config.true_vehicle,
-        simulator=EXACT_SIMULATORS[0] if variant.simulated else config.true_simulator,
+        simulator=EXACT_SIMULATORS[0] if variant.simulated else config.simulator,
         sensors=config.sensors,
     )
 
@@ -173,14 +172,14 @@ def _recording_stage(run: LoopRun) -> Stage:
         difficulty=config.difficulty,
         trials=config.flights,
         vehicle=config.true_vehicle,
-        simulator=config.true_simulator,
+        simulator=config.simulator,
         sensors=config.sensors,
         seed=config.recorded_from,
     )
     return Stage(
         "flights",
         "recording flights on other seeds",
-        _estimate_flights(run, config.flights * config.cells, config.true_simulator),
+        _estimate_flights(run, config.flights * config.cells, config.simulator),
         lambda folder: collect(collection, folder, Quiet(), run.workers),
     )
 

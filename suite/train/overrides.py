@@ -109,6 +109,8 @@ def check_owned(changes: Iterable[str], owned: Mapping[str, str], option: str = 
     """
     for change in changes:
         path = change.partition("=")[0].strip()
+        if path.startswith(PREFIX):  # the same setting, from one phase on
+            path = path.removeprefix(PREFIX).partition(".")[2].strip()
         for owned_path, advice in owned.items():
             if is_within(path, owned_path):
                 raise ValueError(f"{option} {shown(change)}: this command sets {path}; {advice}")
@@ -239,10 +241,14 @@ def with_changes(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
     Raises:
         ValueError: naming the setting, what is wrong with it and what is allowed.
     """
-    in_all_phases, phases = [], list(config.phases)
+    changes = [change.strip() for change in changes]
+    in_all_phases = [change for change in changes if not change.startswith(PREFIX)]
+    # These replace the recipe's own changes in its phases, but not the user's.
+    paths = {change.partition("=")[0].strip() for change in in_all_phases}
+    config = override(_without_phase_changes(config, paths), in_all_phases)
+    phases = list(config.phases)
     for change in changes:
         if not change.startswith(PREFIX):
-            in_all_phases.append(change)
             continue
         number, _, rest = change.removeprefix(PREFIX).partition(".")
         if not (number.isdecimal() and 1 <= int(number) <= len(phases)):
@@ -251,10 +257,8 @@ def with_changes(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
                 "VALUE with N from 1"
             )
         phase = phases[int(number) - 1]
-        phases[int(number) - 1] = replace(phase, set=(*phase.set, rest))
-    paths = {change.partition("=")[0].strip() for change in in_all_phases}
-    without = _without_phase_changes(replace(config, phases=tuple(phases)), paths)
-    return override(without, in_all_phases)
+        phases[int(number) - 1] = replace(phase, set=(*phase.set, rest.strip()))
+    return replace(config, phases=tuple(phases))
 
 
 def in_every_phase(config: TrainConfig, part: str, **values: Any) -> TrainConfig:
@@ -273,7 +277,7 @@ def _without_phase_changes(config: TrainConfig, paths: Iterable[str]) -> TrainCo
     removed = tuple(paths)
 
     def is_kept(change: str) -> bool:
-        return not any(is_within(change.partition("=")[0], path) for path in removed)
+        return not any(is_within(change.partition("=")[0].strip(), path) for path in removed)
 
     phases = (replace(phase, set=tuple(filter(is_kept, phase.set))) for phase in config.phases)
     return replace(config, phases=tuple(phases))

@@ -137,7 +137,7 @@ def train(
         )
         for phase, begin, end, before in zip(configs, begins, ends, specs_before, strict=True)
     ]
-    run = Run(config, config.seed, origin, folder, estimate(config), mirror)
+    run = Run(config, origin, folder, estimate(config), mirror)
     return train_in_folder(phases, run, start_state(configs[0], params), console, watch)
 
 

@@ -98,9 +98,7 @@ class Run(NamedTuple):
     """A run: its settings, its folder, and what must be the same to resume it."""
 
     config: Any
-    """All settings, a dataclass."""
-    seed: int
-    """Seed of the run, for its record."""
+    """All settings, a dataclass with the `seed` of the run."""
     origin: dict[str, Any]
     """The inputs, such as "config", that must be the same to resume the run of a folder."""
     folder: Path
@@ -137,7 +135,7 @@ def train_in_folder(
         seconds = run.estimate.seconds * (total - done) / total
         announce(console, title, replace(run.estimate, seconds=seconds))
         if done < total:
-            write_run_record(folder, run.config, run.seed, resumed=done > 0)
+            write_run_record(folder, run.config, run.config.seed, resumed=done > 0)
         state = _iterate(phases, run, state, console, watch)
     # The outcome, from the last tenth of the curve.
     rows = curve.read(folder)
@@ -291,13 +289,13 @@ def _save(run: Run, phase: RunPhase, state: Any) -> None:
     """Write the policy and the state to the run's folder."""
     training = {**run.origin, "iteration": int(state.iteration), "threads": threads()}
     policy = run.folder / "policy"
-    save_policy(policy, state.params, phase.spec, seed=run.seed, training=training)
+    save_policy(policy, state.params, phase.spec, seed=run.config.seed, training=training)
     # The state is written last. If it is on the disk, so are the policy and the curve up to it.
     save_arrays(
         run.folder / "state",
         tree_to_arrays(state),
         kind="training",
-        seed=run.seed,
+        seed=run.config.seed,
         extra={"training": training},
     )
 

@@ -6,7 +6,7 @@ Both sides of a benchmark run in turn in one process, so that they have the same
 from __future__ import annotations
 
 BENCHES: dict[str, str] = {
-    "train": "gradient steps per second against a plain torch-eager loop of the same method",
+    "train": "trained decisions per second against a plain torch-eager loop of the same method",
     "policy": "a step of the shipped policy exported as C against ONNX Runtime, on one thread",
     "judge": "trials per second of processor time against MuJoCo's own depth rays",
     "env": "decisions per second of 64 races in one vector environment against 64 in a loop",

@@ -22,7 +22,7 @@ class Figure:
     value: float
     """The rate or time, in `unit`."""
     unit: str
-    """Unit of the value, such as "gradient steps/s"."""
+    """Unit of the value, such as "decisions/s"."""
     less_is_better: bool = False
     """Whether the figure is a time, not a rate."""
 

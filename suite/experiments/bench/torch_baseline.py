@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 
@@ -19,7 +19,7 @@ from policies.formats.torch_twin import torch_twin
 from suite.experiments.bench import torch_scene
 from suite.experiments.bench.torch_scene import Tensor, to_local, to_world
 from suite.train.config import TrainConfig
-from suite.train.dynamics.point_mass import HEADING_RATE, PointMassParams
+from suite.train.dynamics.point_mass import HEADING_RATE, PointMassParams, PointMassState
 from suite.train.losses import BARRIER_HEIGHT, BARRIER_SLOPE, FIELD_DECAY, MAX_PULL, UNIT_FIELD
 from suite.train.recipes import paper
 from suite.train.step import BEYOND_M, PATH_SAMPLES
@@ -30,25 +30,6 @@ from tracks.geometry.scene import Gates
 
 SIZES = ("camera", "hidden_size", "channels")
 """Settings that may differ from those of the recipe: sizes of the network and of the image."""
-
-
-class TorchState(NamedTuple):
-    """State of the point mass as tensors, with the fields of `point_mass.PointMassState`."""
-
-    pos_w: Tensor
-    """(B, 3) position [m]."""
-    vel_w: Tensor
-    """(B, 3) velocity [m/s]."""
-    thrust_w: Tensor
-    """(B, 3) net acceleration by thrust and gravity, after the lag and without drag [m/s^2]."""
-    acc_w: Tensor
-    """(B, 3) net acceleration [m/s^2]."""
-    rot_w: Tensor
-    """(B, 3, 3) attitude, body to world."""
-    heading_w: Tensor
-    """(B, 3) wanted heading, horizontal unit vectors."""
-    commands_w: Tensor
-    """(B, 2, 3) the last two commands, latest first [m/s^2]."""
 
 
 def to_torch(tree: Any) -> Any:
@@ -82,12 +63,12 @@ def attitude(thrust_w: Tensor, heading_w: Tensor) -> Tensor:
 
 
 def step(
-    body: TorchState,
+    body: PointMassState,
     constants: PointMassParams,
     action: Tensor,
     target_w: Tensor,
     config: TrainConfig,
-) -> TorchState:
+) -> PointMassState:
     """Advance by one policy period; see `suite.train.dynamics.point_mass.step`."""
     dt = constants.time_step[:, None]
     # Delay and lag of the thrust: interpolate between the last commands, then filter.
@@ -111,7 +92,7 @@ def step(
         size = heading.norm(dim=-1, keepdim=True)
         heading = torch.where(size > 1e-3, heading / size.clamp(min=1e-3), body.heading_w)
         rot = attitude(thrust, heading)
-    return TorchState(pos, vel, thrust, acc, rot, heading, history[:, :2])
+    return PointMassState(pos, vel, thrust, acc, rot, heading, history[:, :2])
 
 
 class Baseline:
@@ -180,10 +161,10 @@ class Baseline:
             target = target + (passed & (target < worlds.scene.gates.center_w.shape[1]))
         return total / config.episode.steps
 
-    def start(self, worlds: Worlds) -> TorchState:
+    def start(self, worlds: Worlds) -> PointMassState:
         """Return the bodies at the start of a rollout."""
         zero = torch.zeros_like(worlds.pos_w)
-        return TorchState(
+        return PointMassState(
             worlds.pos_w, worlds.vel_w, zero, zero, attitude(zero, worlds.heading_w),
             worlds.heading_w, torch.zeros(len(zero), 2, 3),
         )  # fmt: skip
@@ -200,7 +181,7 @@ class Baseline:
         return gate, gate.center_w + beyond * gate.rot_w[:, :, 0]
 
     @torch.no_grad()
-    def render(self, worlds: Worlds, body: TorchState) -> Tensor:
+    def render(self, worlds: Worlds, body: PointMassState) -> Tensor:
         """Return the encoded images (B, height, width) with their noise."""
         camera, encoding = self.config.spec.camera, self.config.spec.depth
         axis = self.rays.mean(0)
@@ -213,8 +194,8 @@ class Baseline:
     def step_loss(
         self,
         worlds: Worlds,
-        before: TorchState,
-        body: TorchState,
+        before: PointMassState,
+        body: PointMassState,
         gate: Gates,
         target_w: Tensor,
     ) -> Tensor:

@@ -1,4 +1,4 @@
-"""The benchmark `train`: gradient steps per second against a plain torch-eager loop.
+"""The benchmark `train`: trained decisions per second against a plain torch-eager loop.
 
 Both sides make whole gradient steps (rollout, gradient, AdamW) on the same worlds of 64 solids with
 the recipe `paper`: batch 64, 150 steps, 24x32 images, two threads. A world is one simulated scene
@@ -28,8 +28,8 @@ SOLIDS = Counts(boxes=44, cylinders=8, capsules=6, spheres=6)
 BATCH, STEPS, THREADS = 64, 150, 2
 """Worlds, policy periods of a rollout, and threads of both sides."""
 UNTRUSTED_BELOW = 2000.0
-"""Environment steps per second that the baseline reaches at least on two cores without other load;
-fewer mean that the machine is too busy for a comparison [1/s]."""
+"""Decisions per second that the baseline reaches at least on two cores without other load; fewer
+mean that the machine is too busy for a comparison [1/s]."""
 ROUNDS = 4
 """Number of timed rounds."""
 OURS, BASELINE, QUADROTOR = "ours", "baseline", "quadrotor"
@@ -159,10 +159,10 @@ def _compare(batch: int, steps: int, rounds: int) -> Comparison:
     warnings = ()
     if baseline < UNTRUSTED_BELOW:
         warnings = (
-            f"the baseline makes {baseline:.0f} steps/s; two cores without other load make at "
+            f"the baseline makes {baseline:.0f} decisions/s; two cores without other load make at "
             f"least {UNTRUSTED_BELOW:.0f}. The figures are not reliable, run again without load",
         )
-    unit = "gradient steps/s"
+    unit = "decisions/s"
     details = {
         "solids": sum(SOLIDS),
         "batch": batch,

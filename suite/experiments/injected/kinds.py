@@ -96,16 +96,6 @@ def _linear_stick_map(signals: Signals, _: Vehicle) -> Signals:
     return {**signals, "cmd_rate": np.sign(command) * stick * largest}
 
 
-def _stop_motor_3(signals: Signals, _: Vehicle) -> Signals:
-    """Log a speed of 0 for the third motor."""
-    return {**signals, "motor": signals["motor"] * [1.0, 1.0, 0.0, 1.0]}
-
-
-def _thrust_in_newtons(signals: Signals, vehicle: Vehicle) -> Signals:
-    """Log the thrust command in newtons, instead of per mass [m/s^2]."""
-    return {**signals, "cmd_thrust": vehicle.mass * signals["cmd_thrust"]}
-
-
 def _log_commands_early(signals: Signals, _: Vehicle) -> Signals:
     """Log commands 150 ms before they act."""
     count = round(0.15 / float(np.median(np.diff(signals["time"]))))
@@ -187,12 +177,6 @@ def _other_curve(vehicle: Vehicle) -> Vehicle:
     )
 
 
-def _inertia_in_grams(vehicle: Vehicle) -> Vehicle:
-    """Return `vehicle` with an inertia in g m^2 instead of kg m^2."""
-    x, y, z = vehicle.inertia
-    return replace(vehicle, inertia=(1000.0 * x, 1000.0 * y, 1000.0 * z))
-
-
 def _with_rotors(vehicle: Vehicle, **changes: Any) -> Vehicle:
     """Return `vehicle` with other values for fields of its rotors."""
     return replace(vehicle, rotors=replace(vehicle.rotors, **changes))
@@ -265,7 +249,10 @@ KINDS: dict[str, Kind] = {
     "motors in the order 4, 1, 2, 3": Kind(("motor_order",), ("motor=4,1,2,3",), accepts_pwm=True),
     "motors 3 and 4 swapped": Kind(("motor_order",), ("motor=1,2,4,3",), accepts_pwm=True),
     "motor 3 never turns": Kind(
-        ("motor_dead",), change=_stop_motor_3, needs=("motor",), accepts_pwm=True
+        ("motor_dead",),
+        change=lambda p, _: {**p, "motor": p["motor"] * [1.0, 1.0, 0.0, 1.0]},
+        needs=("motor",),
+        accepts_pwm=True,
     ),
     "spin of all motors": Kind(
         ("motor_spin",),
@@ -277,7 +264,9 @@ KINDS: dict[str, Kind] = {
         ("thrust_command_unit",), (f"cmd_thrust={1.0 / GRAVITY}",), needs=("quat", "pos")
     ),
     "thrust command in newtons": Kind(
-        ("thrust_command_unit",), needs=("cmd_thrust", "quat", "pos"), change=_thrust_in_newtons
+        ("thrust_command_unit",),
+        change=lambda p, vehicle: {**p, "cmd_thrust": vehicle.mass * p["cmd_thrust"]},
+        needs=("cmd_thrust", "quat", "pos"),
     ),
     "thrust command with down positive": Kind(
         ("thrust_command_unit",), ("cmd_thrust=-1",), needs=("quat", "pos")
@@ -325,7 +314,9 @@ KINDS: dict[str, Kind] = {
     ),
     "inertia x 1000": Kind(
         ("vehicle_inertia",),
-        vehicle=_inertia_in_grams,
+        vehicle=lambda v: replace(
+            v, inertia=(1e3 * v.inertia[0], 1e3 * v.inertia[1], 1e3 * v.inertia[2])
+        ),
     ),
     "barometer falls on spin-up": Kind(
         ("barometer_spin_up",),

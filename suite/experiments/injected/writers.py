@@ -18,15 +18,11 @@ import numpy as np
 from eval.importers.formats.betaflight import DSHOT
 from eval.importers.frames import QUAT_HALF_TURN
 from eval.importers.options import ImportOptions
+from suite.experiments.injected.kinds import DEG, RPM, Signals
 
 FLIP = np.array([1.0, -1.0, -1.0])
 """Factors of a half turn about x. It converts the suite's world axes to north-east-down (PX4), and
 its body axes to forward-right-down, or back."""
-DEG, RPM = float(180.0 / np.pi), float(60.0 / (2.0 * np.pi))
-"""Degrees in a radian, and revolutions per minute in a radian per second."""
-Signals = Mapping[str, np.ndarray]
-"""Signal -> (T, C) values at T times in C components, in SI units and the suite's frames; `time` is
-(T,) [s]."""
 
 
 class Written(NamedTuple):

@@ -51,7 +51,7 @@ def digest(value: Any) -> str:
 
 @functools.cache
 def code_digest(*folders: str) -> str:
-    """Return a digest (16 hex digits) of the code in `folders`, without that of `NO_RESULT`.
+    """Return a digest (16 hex digits) of the code in `folders`, without `NO_RESULT` in them.
 
     Docstrings, comments and layout do not change it.
 
@@ -62,7 +62,7 @@ def code_digest(*folders: str) -> str:
     for folder in folders:
         for path in sorted((ROOT / folder).rglob("*.py")):
             name = path.relative_to(ROOT)
-            if not set(name.parts) & set(NO_RESULT):
+            if not set(path.relative_to(ROOT / folder).parts) & set(NO_RESULT):
                 tree = _tree_text(ast.parse(path.read_bytes()))
                 sha256.update(f"{name.as_posix()}\0{tree}\0".encode())
     return sha256.hexdigest()[:16]

@@ -22,7 +22,7 @@ from suite.experiments.study.conditions import (
     sweep_conditions,
     sweeps,
 )
-from suite.experiments.study.judging import Setup, TrialRequest, Workspace, fly_trials
+from suite.experiments.study.judging import TrialRequest, Workspace, fly_trials
 from suite.experiments.study.options import select
 
 
@@ -87,7 +87,7 @@ def fly_conditions(
     conditions = [*singles, *(point for points in by_sweep.values() for point in points)]
     requests = {
         (number, name): TrialRequest(
-            Setup(policy, condition.vehicle, condition.sensors, condition.simulator), trials
+            policy, condition.vehicle, trials, condition.sensors, condition.simulator
         )
         for name, policy in policies.items()
         for number, condition in enumerate(conditions)

@@ -12,10 +12,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from eval.judging.judge import MOST_A_PIECE, JudgeOptions, Task, fly_share
 from eval.judging.results import Journal
@@ -44,27 +44,19 @@ Key = TypeVar("Key", bound=Hashable)
 
 
 @dataclass(frozen=True)
-class Setup:
-    """Policy, vehicle, sensors and simulator; together with a trial they determine its outcome."""
+class TrialRequest:
+    """Trials, and the setup (all but the trial) that determines their outcome."""
 
     policy: str
     """A shipped policy's name, a checkpoint's folder, or a policy file."""
     vehicle: Vehicle
     """The vehicle that the policy flies."""
+    trials: Sequence[TrialSpec]
+    """Track, level and seed of each trial."""
     sensors: SensorSet = PERFECT
     """Errors in what the policy sees."""
     simulator: str = "mujoco"
     """A name of `suite list simulators`."""
-
-
-@dataclass(frozen=True)
-class TrialRequest:
-    """Trials of one setup."""
-
-    setup: Setup
-    """Policy, vehicle, sensors and simulator of the trials."""
-    trials: Sequence[TrialSpec]
-    """Track, level and seed of each trial."""
 
 
 def fly_trials(
@@ -75,7 +67,7 @@ def fly_trials(
     After an interrupt, finished trials stay in the cache.
 
     Args:
-        requests: trials of setups, by any key. Several requests may have the same setup.
+        requests: trials by any key. Several requests may have the same setup.
         workspace: folder of the journals, and the workers. Without workers, as many processes of
             this machine are started as shorten the work.
         console: shows progress.
@@ -85,11 +77,11 @@ def fly_trials(
         ValueError: for a policy that cannot be loaded, before the first flight.
     """
     # 1. Find the journal of each request. Requests with the same setup share one.
-    policies = {request.setup.policy for request in requests.values()}
+    policies = {request.policy for request in requests.values()}
     digests = {policy: policy_digest(policy) for policy in policies}
-    inputs = {key: _inputs(request.setup, digests) for key, request in requests.items()}
+    inputs = {key: _inputs(request, digests) for key, request in requests.items()}
     names = {key: digest(entry) for key, entry in inputs.items()}
-    setups = {names[key]: request.setup for key, request in requests.items()}
+    setups = {names[key]: request for key, request in requests.items()}
     # Trials of each journal: dictionaries as sets that keep their order.
     requested: dict[str, dict[TrialSpec, None]] = {name: {} for name in setups}
     for key, request in requests.items():
@@ -100,15 +92,18 @@ def fly_trials(
             for name, entry in {names[key]: entry for key, entry in inputs.items()}.items()
         }
         # 2. Read which trials are done, and fly the others in pieces of work.
-        missing = [journals[name].missing(list(trials)) for name, trials in requested.items()]
-        remaining, total = sum(map(len, missing)), sum(map(len, requested.values()))
+        missing = [
+            replace(setups[name], trials=journals[name].missing(list(trials)))
+            for name, trials in requested.items()
+        ]
+        remaining = sum(len(request.trials) for request in missing)
+        total = sum(map(len, requested.values()))
         if remaining < total:
             console.note(f"{title}: {total - remaining} of {total} trials were flown before")
         if remaining:
             useful_processes = max(1, remaining // TRIALS_A_PROCESS)
             workers = workspace.workers or min(usable_cores(), useful_processes)
-            costs = [relative_cost(setup.simulator) for setup in setups.values()]
-            cost = sum(c * len(trials) for c, trials in zip(costs, missing, strict=True))
+            cost = sum(relative_cost(one.simulator) * len(one.trials) for one in missing)
             announce(console, f"{title}: {remaining} trials", flying_estimate(cost, workers))
             trial_numbers, all_journals = count(total - remaining + 1), list(journals.values())
             with console.progress(title, total, begun=total - remaining) as update:
@@ -122,7 +117,7 @@ def fly_trials(
                     update(next(trial_numbers))
 
                 loaders = _loaders(policies, workers)
-                pieces = _pieces(list(setups.values()), missing, worker_count(workers))
+                pieces = _pieces(missing, worker_count(workers))
                 run_pieces(partial(_fly_piece, loaders), pieces, workers, keep)
     # 3. Collect the results of each request.
     return {
@@ -168,7 +163,7 @@ def judged_trials(config: Any, levels: Sequence[int] | None = None) -> list[Tria
     return trial_list(JUDGED, levels, config.trials, config.seed)
 
 
-def _inputs(setup: Setup, digests: Mapping[str, str]) -> dict[str, Any]:
+def _inputs(setup: TrialRequest, digests: Mapping[str, str]) -> dict[str, Any]:
     """Return everything except the trial that determines the outcome of a flight."""
     return {
         "policy_sha256": digests[setup.policy],
@@ -184,15 +179,8 @@ Loaders = dict[str, Callable[[], Policy]]
 """Policy -> function that loads it, called in the process that flies it."""
 
 
-class Share(NamedTuple):
-    """Trials of one setup in a piece of work."""
-
-    number: int
-    """Number of the setup in the order of all setups."""
-    setup: Setup
-    """Policy, vehicle, sensors and simulator of the trials."""
-    trials: Sequence[TrialSpec]
-    """Track, level and seed of each trial."""
+Share = tuple[int, TrialRequest]
+"""Number of a setup in the order of all setups, and trials of it in a piece of work."""
 
 
 def _loaders(policies: Iterable[str], workers: Workers) -> Loaders:
@@ -206,24 +194,22 @@ def _loaders(policies: Iterable[str], workers: Workers) -> Loaders:
     return {name: PolicyContent.of(name) for name in policies}
 
 
-def _pieces(
-    setups: Sequence[Setup], missing: Sequence[Sequence[TrialSpec]], processes: int
-) -> list[list[Share]]:
+def _pieces(requests: Sequence[TrialRequest], processes: int) -> list[list[Share]]:
     """Cut the trials of all setups into pieces of about equal size for `processes`.
 
     A piece may have trials of several setups, and a setup with many trials is in several pieces.
     """
-    total = sum(map(len, missing))
+    total = sum(len(request.trials) for request in requests)
     piece_limit = total if processes == 1 else min(MOST_A_PIECE, math.ceil(total / processes))
     pieces: list[list[Share]] = [[]]
     size = 0
-    for number, (setup, trials) in enumerate(zip(setups, missing, strict=True)):
-        share_count = math.ceil(len(trials) / piece_limit) if trials else 0
-        for share in (trials[k::share_count] for k in range(share_count)):
+    for number, request in enumerate(requests):
+        share_count = math.ceil(len(request.trials) / piece_limit)
+        for share in (request.trials[k::share_count] for k in range(share_count)):
             if size and size + len(share) > piece_limit:
                 pieces.append([])
                 size = 0
-            pieces[-1].append(Share(number, setup, share))
+            pieces[-1].append((number, replace(request, trials=share)))
             size += len(share)
     return pieces
 
@@ -234,10 +220,10 @@ def _fly_piece(loaders: Loaders, piece: Sequence[Share]) -> Iterator[tuple[int, 
     Each policy is loaded once.
     """
     loaded: dict[str, Policy] = {}
-    for number, setup, trials in piece:
-        if setup.policy not in loaded:
-            loaded[setup.policy] = loaders[setup.policy]()
-        options = JudgeOptions(workers=1, sensors=setup.sensors)
-        task = Task(loaded[setup.policy], setup.vehicle, setup.simulator, options)
-        for _, result, _ in fly_share(task, list(enumerate(trials))):
+    for number, request in piece:
+        if request.policy not in loaded:
+            loaded[request.policy] = loaders[request.policy]()
+        options = JudgeOptions(workers=1, sensors=request.sensors)
+        task = Task(loaded[request.policy], request.vehicle, request.simulator, options)
+        for _, result, _ in fly_share(task, list(enumerate(request.trials))):
             yield number, result

@@ -100,8 +100,8 @@ def four_gate_recipe(config: FourGateOptions) -> TrainConfig:
     """Return the recipe that `config` selects, on tracks of four gates.
 
     Raises:
-        ValueError: for an unknown recipe or change, and for a recipe without the vector field,
-            since the experiments compare training with the field and without it.
+        ValueError: for an unknown recipe or change, for a recipe with phases, and for one without
+            the vector field, since the experiments compare training with the field and without it.
     """
     from suite.train.overrides import check_phases, with_changes
     from suite.train.recipes import named_recipe, with_iterations
@@ -109,10 +109,16 @@ def four_gate_recipe(config: FourGateOptions) -> TrainConfig:
     owned = {"episode.batch": "give --worlds", "optimizer.iterations": "give --iterations"}
     check_owned(config.set, {**owned, "episode.gates": f"all fly {GATES}, as in the paper"})
     base = with_iterations(with_changes(named_recipe(config.recipe), config.set), config.iterations)
+    if base.phases:
+        raise ValueError(
+            f"--recipe {config.recipe} has {len(base.phases)} phases, allowed is a recipe without, "
+            "such as race-paper: PPO has none, and the steps of a page are of one length"
+        )
+    base = replace(base, episode=replace(base.episode, gates=GATES, batch=config.worlds))
     check_phases(base)
     if base.loss.field_gain == 0.0:
         raise ValueError("loss.field_gain is 0, allowed is a number above: the field is compared")
-    return replace(base, episode=replace(base.episode, gates=GATES, batch=config.worlds))
+    return base
 
 
 def recipe_fact(config: FourGateOptions) -> str:

@@ -69,19 +69,10 @@ def make_dynamics(config: TrainConfig) -> Dynamics:
         period = 1.0 / config.spec.rate_hz
         return Dynamics(*quadrotor_dynamics(config.quadrotor, period, config.loss.gradient_decay))
 
-    def start_point(
-        _: point_mass.PointMassParams, pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array
-    ) -> point_mass.PointMassState:
-        return point_mass.start(pos_w, vel_w, heading_w)
-
-    def step_point(
-        body: point_mass.PointMassState,
-        constants: point_mass.PointMassParams,
-        action_b: jax.Array,
-        target_w: jax.Array,
-        _: jax.Array,
-    ) -> point_mass.PointMassState:
-        decay = config.loss.gradient_decay
-        return point_mass.step(body, constants, action_b, target_w, decay)
-
-    return Dynamics(start_point, step_point)
+    decay = config.loss.gradient_decay
+    return Dynamics(
+        start=lambda constants, *state: point_mass.start(*state),
+        step=lambda body, constants, action_b, target_w, keys: point_mass.step(
+            body, constants, action_b, target_w, decay
+        ),
+    )

@@ -36,19 +36,19 @@ class PointMassParams(NamedTuple):
 class PointMassState(NamedTuple):
     """State of the point mass."""
 
-    pos_w: jax.Array
+    pos_w: Array
     """(B, 3) position [m]."""
-    vel_w: jax.Array
+    vel_w: Array
     """(B, 3) velocity [m/s]."""
-    thrust_w: jax.Array
+    thrust_w: Array
     """(B, 3) net acceleration by thrust and gravity, after the lag and without drag [m/s^2]."""
-    acc_w: jax.Array
+    acc_w: Array
     """(B, 3) net acceleration [m/s^2]."""
-    rot_w: jax.Array
+    rot_w: Array
     """(B, 3, 3) attitude, body to world."""
-    heading_w: jax.Array
+    heading_w: Array
     """(B, 3) wanted heading, horizontal unit vectors."""
-    commands_w: jax.Array
+    commands_w: Array
     """(B, 2, 3) the last two commands, latest first [m/s^2]."""
 
 

@@ -267,5 +267,5 @@ def train_ppo(
         note=functools.partial(flight_note, "reward"),
     )
     origin = {"config": plain(config), "from": None, "delta": None, "method": "ppo"}
-    run = Run(config, config.seed, origin, folder, estimate(config))
+    run = Run(config, origin, folder, estimate(config))
     return train_in_folder([phase], run, start_state(config), console, watch)

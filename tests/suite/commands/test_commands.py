@@ -2,13 +2,16 @@
 
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies import shipped
+from policies.formats import policy_file
 from suite.blind import make
 from suite.commands.train import Config, resolve
+from suite.delta.replay import describe_dynamics
 from suite.judging.flying import checkpoint_folder
 from suite.train import run as training
 from tests.support.commands import answer, refused, run
@@ -73,6 +76,17 @@ def test_training_goes_on_from_a_policy_by_its_name_and_does_not_write_over_it(
     own = shutil.copytree(shipped.folder("race-paper"), tmp_path / "policy")
     said = refused(capsys, "train --out", tmp_path, "--init-from", own)
     assert "config.json is also an input and would be overwritten" in said
+
+
+def test_a_delta_action_model_has_the_rate_of_every_phase(tmp_path, capsys, monkeypatch):
+    dynamics = resolve(Config()).quadrotor
+    assert dynamics is not None
+    config = {"fit": {"rate_hz": 15.0, **describe_dynamics(dynamics)}}
+    stored = SimpleNamespace(config=config, params={}, arrays={})
+    monkeypatch.setattr(policy_file, "load_delta", lambda folder: stored)
+    monkeypatch.setattr(training, "train", None)
+    said = refused(capsys, "train --delta", tmp_path, "--out", tmp_path / "run")
+    assert "with 15 decisions a second, and this run has 30" in said
 
 
 def test_the_command_line_asks_for_model_and_vehicle_together():

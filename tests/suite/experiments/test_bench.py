@@ -110,6 +110,14 @@ def test_bench_times_both_sides_in_turn():
     assert Comparison("a", *figures).ratio == pytest.approx(3.0)
 
 
+def test_the_speed_of_a_training_is_in_decisions_of_all_drones_in_a_second(monkeypatch):
+    for name in ("_ours", "_baseline", "bench_worlds"):
+        monkeypatch.setattr(train, name, lambda *_: None)
+    monkeypatch.setattr(train, "in_turn", lambda sides, *_, **__: {key: [3.0] for key in sides})
+    result = train._compare(6, 5, 1)
+    assert result.ours == Figure(10.0, "decisions/s") and "10 decisions/s" in result.warnings[0]
+
+
 def test_without_a_compiler_or_packages_it_says_what_to_install(monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(WorkFailed, match="no C compiler"):

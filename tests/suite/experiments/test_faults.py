@@ -8,10 +8,13 @@ import pytest
 from eval.importers import import_log
 from eval.logs.faults.reading import readings_in
 from eval.logs.flight_log import FlightLog, write_flight
+from eval.quadrotor.vehicle_file import save_vehicle
+from suite.common.console import Console
 from suite.experiments import faults
 from suite.experiments.injected.flights import flight_signals
 from suite.experiments.injected.kinds import KINDS, inject
 from suite.experiments.injected.writers import WRITERS
+from suite.experiments.study.cache import Workspace
 from tests.support import known_flight
 from tests.support.imported import near
 from tests.support.vehicles import PLAIN
@@ -54,6 +57,33 @@ def test_a_wrong_order_of_motors_holds_for_speeds_and_commands_and_the_printed_o
     (found,) = (f for f in findings if f.fault == "motor_order")
     _, findings = import_log(written.path, "px4", replace(options, read=readings_in(found.fix)))
     assert "motor_order" not in {f.fault for f in findings}
+
+
+def test_answers_are_kept_for_each_case_and_an_incomplete_last_line_is_dropped(
+    tmp_path, monkeypatch
+):
+    made = []
+    monkeypatch.setattr(faults, "_check", lambda case, **_: [made.append(case) or "refused"])
+    cases = [faults.Case("", "real", tmp_path / "log", number) for number in range(3)]
+    place = (faults.Config(), tmp_path, Console(), Workspace(tmp_path, tmp_path))
+    assert faults._check_cases(cases, *place) == dict.fromkeys(cases, "refused")
+    (path,) = tmp_path.glob("checked-*.jsonl")
+    path.write_text(path.read_text()[:-3])
+    for _ in range(2):
+        assert faults._check_cases(cases, *place) == dict.fromkeys(cases, "refused")
+    assert made == [*cases, cases[-1]]
+
+
+def test_without_a_long_flight_the_page_is_refused_and_a_changed_vehicle_file_flies_again(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(faults, "collect", lambda *args: {"flights": []})
+    config = faults.Config(vehicle=str(tmp_path / "mine.toml"))
+    for mass in (PLAIN.mass, 1.1 * PLAIN.mass):
+        save_vehicle(replace(PLAIN, mass=mass), config.vehicle, "")
+        with pytest.raises(ValueError, match="mine.toml: no flight .*4 s"):
+            faults.document(config, Workspace(tmp_path, tmp_path), Console())
+    assert len(list(tmp_path.glob("faults-*"))) == 2
 
 
 def test_outcomes_are_counted_by_name(judged):

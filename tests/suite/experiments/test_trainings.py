@@ -3,11 +3,13 @@
 import pytest
 
 from eval.judging.statistics import wilson
+from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.experiments.ablation import Config, _comparison_grid, pooled, settings
 from suite.experiments.pages.paper import ablation as printed
 from suite.experiments.schemes import Config as SchemesConfig
-from suite.experiments.schemes import first_times, schemes
+from suite.experiments.schemes import document, first_times, schemes
+from suite.experiments.study.cache import Workspace
 from suite.experiments.study.summary import Spread, summaries
 from suite.experiments.study.training import TrainingResult
 from suite.train import run as training_run
@@ -15,6 +17,7 @@ from suite.train.config import TrainConfig
 from suite.train.ppo.config import PpoConfig
 from tests.support.documents import page, reproduce
 from tests.support.training import boxes_worlds
+from tracks.common.grid import Grid
 
 TINY = "--set spec.hidden_size=8 spec.camera.width=20 spec.camera.height=20 episode.steps=6"
 TINY += " --iterations 2 --worlds 4 --trials 3 --seconds 0.5 --training-seeds 4 --only"
@@ -80,7 +83,7 @@ def test_the_ablation_from_one_command_and_again(tmp_path, monkeypatch, small_sc
     assert field["over"]["success_cross"]["most"] == field["pooled"]["success_cross"]["low"] == 0
     assert field["over"]["collision_free"]["least"] == 1 and field["over"]["v_max"]["mean"] > 0
     assert "| without, L_p^norm | 6.4 | diverged | - |" in text and "| 1 of 1 |" in text
-    monkeypatch.setattr(training_run, "make_update", None)
+    monkeypatch.setattr(training_run, "make_update", pytest.fail)
     assert reproduce(tmp_path, "ablation", *args) == 0, "nothing is trained again"
     assert (tmp_path / "docs" / "ablation.md").read_text() == text
 
@@ -142,6 +145,14 @@ def learnt(scheme, seed, pace, *gates, diverged=""):
         for k, g in enumerate(gates)
     )  # fmt: skip
     return trained(scheme, seed, *points, diverged=diverged)
+
+
+def test_a_page_of_schemes_that_all_diverged_has_no_chart(tmp_path, monkeypatch):
+    runs = [learnt("ours", seed, 1.0, diverged="it diverged") for seed in (0, 1, 2)]
+    monkeypatch.setattr("suite.experiments.study.training.train_all", lambda *_: runs)
+    contents = document(SchemesConfig(only=("ours",)), Workspace(tmp_path, tmp_path), Console())
+    chartless, *_ = contents.parts["Learning curves"]
+    assert isinstance(chartless, Grid) and contents.numbers["rows"][0]["diverged"] == 3
 
 
 def test_curves_and_first_times_by_hand():

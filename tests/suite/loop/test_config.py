@@ -13,7 +13,7 @@ from suite.common.errors import WorkFailed
 from suite.common.stages import is_done
 from suite.common.usage import renamed
 from suite.loop import delta_action, hidden_effect, work
-from suite.loop.config import DeltaLoopConfig, HiddenLoopConfig, loop_by_content, resolve
+from suite.loop.config import loop_by_content, resolve
 from suite.loop.variants import DeltaModel, Variant
 from suite.loop.work import LoopRun, Quiet, plan
 from tests.support.vehicles import with_effects
@@ -70,14 +70,13 @@ def test_a_copy_under_another_name_hides_nothing_and_a_load_on_a_line_may_be_hid
 def test_sizes_are_the_recipes_options_go_first_and_a_policy_has_its_own_recipe(root, monkeypatch):
     monkeypatch.chdir(root)
     loop = resolve(recipe="quick", seed=3, flights=4)
-    assert isinstance(loop, DeltaLoopConfig)
     assert (loop.trials, loop.flights, loop.fit.iterations) == (20, 4, 500)
     assert loop.tuning.optimizer.iterations == round(0.25 * loop.training.optimizer.iterations)
     assert loop.tuning.optimizer.rate < loop.training.optimizer.rate
-    assert loop.tuning.seed != loop.training.seed and loop.true_simulator == "mujoco"
+    assert loop.tuning.seed != loop.training.seed and loop.simulator == "mujoco"
     assert (loop.recorded_from, loop.cells, loop.true_vehicle) == (100_003, 6, "reference")
+    assert loop.hidden_vehicle is None
     hidden = resolve(recipe="race", hidden_vehicle=EXAMPLE)
-    assert isinstance(hidden, HiddenLoopConfig)
     assert (hidden.trials, hidden.flights, hidden.fit.iterations) == (25, 3, 200)
     assert hidden.tuning.optimizer.iterations == 60 and hidden.tuning.quadrotor is not None
     assert hidden.true_vehicle == EXAMPLE and hidden.policy == shipped.DEFAULT
@@ -128,7 +127,7 @@ def test_a_folder_called_like_something_shipped_makes_no_other_loop(tmp_path, mo
     shutil.copytree(shipped.folder("race-paper"), tmp_path / "mine")
     save_vehicle(load_vehicle("racer5"), tmp_path / "racer5")
     own = loop_by_content(hidden_loop(policy="mine"))
-    assert isinstance(own, HiddenLoopConfig) and own.digests == begun.digests
+    assert own.digests == begun.digests
     assert (own.policy, own.hidden_vehicle, own.vehicle) == ("a file", "a file", "reference")
 
 

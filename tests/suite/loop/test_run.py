@@ -28,7 +28,7 @@ from suite.delta.replay import nominal_model
 from suite.delta.run import flight_files
 from suite.loop import hidden_effect, work
 from suite.loop.compare import policy_results
-from suite.loop.config import HiddenLoopConfig, resolve
+from suite.loop.config import resolve
 from suite.loop.hidden_effect import LABELS, LOOP, describe_hidden, hidden_effects
 from suite.loop.measured import CONTACT_MARGIN_S, Noise
 from suite.loop.tables import CAVEAT
@@ -282,7 +282,6 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
         resolve(recipe="quick", simulator="rotorpy", hidden_vehicle=name)
         for name in ("examples/rotorpy.toml", None)
     )
-    assert isinstance(config, HiddenLoopConfig) and isinstance(same, HiddenLoopConfig)
     run = work.LoopRun(LOOP, config, tmp_path, Quiet())
     judged = [work._evaluation(run, variant) for variant in LOOP.variants]
     flown = [(one.simulator, one.vehicle) for one in judged]
@@ -292,9 +291,12 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
     effects, simulator = describe_hidden(config)
     assert "rotor_drag (coefficient 7.8e-05 kg/rad)" in effects and "no linear_drag" in effects
     assert "the rotors' drag acts at each hub" in simulator
-    effects, simulator = describe_hidden(same)
-    assert effects == "The hidden vehicle's file is that of the simulation."
-    assert "linear_drag: RotorPy's drag is proportional to the rotors' speed" in simulator
+    copied = replace(load_vehicle("reference"), name="copied")
+    save_vehicle(copied, tmp_path / "copied.toml", "")
+    for one in (same, replace(same, hidden_vehicle=str(tmp_path / "copied.toml"))):
+        effects, simulator = describe_hidden(one)
+        assert effects == "The hidden vehicle's file is that of the simulation."
+        assert "linear_drag: RotorPy's drag is proportional to the rotors' speed" in simulator
 
 
 @pytest.mark.parametrize(

@@ -67,8 +67,9 @@ def test_settings_that_would_do_nothing_or_that_the_command_sets_itself_are_refu
         both = [change, f"{need}={given}"]
         assert override(run, both) == override(run, both[::-1])
     check_owned(["loss.progress=1"], {"loss.prog": "", "spec": ""})
-    with pytest.raises(ValueError, match=r"'spec.rate_hz=30': this command sets spec.*; take"):
-        check_owned(["spec.rate_hz=30"], {"spec": "take another policy"})
+    for change in ("spec.rate_hz=30", "phases.2.spec.rate_hz=30"):
+        with pytest.raises(ValueError, match=rf"'{change}': this command sets spec.*; take"):
+            check_owned([change], {"spec": "take another policy"})
 
 
 @pytest.mark.parametrize(
@@ -149,6 +150,10 @@ def test_a_phase_keeps_what_came_before_and_a_change_holds_in_all_or_in_the_one_
     alone = phase_configs(with_changes(RUN, ["phases.3.loss.progress=0.4", "loss.jerk=0.5"]))
     assert [one.loss.progress for one in alone] == [1.2, 2.0, 0.4]
     assert [one.loss.jerk for one in alone] == [0.5] * 3
+    both = with_changes(RUN, ["phases.2. optimizer.rate = 2e-4", "optimizer.rate=5e-4"])
+    assert [one.optimizer.rate for one in phase_configs(both)] == [5e-4, 2e-4, 2e-4]
+    again = phase_configs(with_changes(both, ["optimizer.rate=3e-4"]))
+    assert [one.optimizer.rate for one in again] == [3e-4] * 3
     always = phase_configs(in_every_phase(RUN, "loss", progress=0.7))
     assert [one.loss.progress for one in always] == [0.7] * 3
     for number in ("0", "4", "x"):

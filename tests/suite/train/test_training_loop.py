@@ -46,7 +46,7 @@ def counting(iterations=10, stop=None, bad=None) -> RunPhase:
 def train(folder, *phases, config=CONFIG, start=None, seen=None):
     """Train in a folder; the list `seen` gets the parameters of each measurement."""
     origin = {"config": plain(config), "from": start, "delta": None}
-    run = Run(config, config.seed, origin, folder, Estimate(1.0, 1.0))
+    run = Run(config, origin, folder, Estimate(1.0, 1.0))
 
     def measure(params):
         seen.append(params)

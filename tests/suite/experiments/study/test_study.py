@@ -60,6 +60,9 @@ def test_the_cache_is_named_by_all_code_that_flies(tmp_path, monkeypatch):
     assert now() == first, "the statements are the same"
     judge.write_text("a = 2")
     second = now()
+    parts = code_digest.__wrapped__("eval/view")
+    video.write_text("a = 3")
+    assert code_digest.__wrapped__("eval/view") != parts, "a named folder counts"
     judge.rename(judge.with_name("jury.py"))
     assert len({first, second, now()}) == 3
     assert digest({"a": 1}) != digest({"a": 2}) and len(digest(load_vehicle("reference"))) == 16
