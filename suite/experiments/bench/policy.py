@@ -110,21 +110,23 @@ def _c_steps(name: str, checkpoint: Any, folder: Path) -> tuple[dict[str, Any], 
 
 def _grid(rows: dict[str, dict[str, Any]]) -> Grid:
     """Return a table of the measured times, and estimates for two processors, a row per engine."""
-    headers = (
-        "engine", "median [us]", "p99 [us]", "longest [us]", "multiply-adds", "weights [B]",
-        "working memory [B]", "Cortex-M7 480 MHz [ms], estimate", "A76 2.4 GHz [ms], estimate",
-    )  # fmt: skip
-    lines = []
-    for engine, row in rows.items():
-        texts = [f"{row[key]:.1f}" for key in ("median_us", "p99_us", "max_us")]
-        counts = (row[key] for key in ("multiply_adds", "weight_bytes", "working_bytes"))
-        texts += ["-" if count is None else str(count) for count in counts]
-        estimates = ("estimate_cortex_m7_480mhz_ms", "estimate_a76_2400mhz_ms")
-        texts += [f"{row[key]:.2f}" if key in row else "-" for key in estimates]
-        lines.append([engine, *texts])
     m7, a76 = M7_CYCLES, A76_CYCLES
     note = (
         f"Estimates are multiply-adds x cycles each, assumed and not measured: Cortex-M7 "
         f"{m7['C float32']:g} (float32) and {m7['C int8']:g} (int8), A76 {a76['C float32']:g}."
     )
-    return table(headers, lines, note=note)
+    columns = {
+        "median [us]": ("median_us", ".1f"),
+        "p99 [us]": ("p99_us", ".1f"),
+        "longest [us]": ("max_us", ".1f"),
+        "multiply-adds": ("multiply_adds", "d"),
+        "weights [B]": ("weight_bytes", "d"),
+        "working memory [B]": ("working_bytes", "d"),
+        "Cortex-M7 480 MHz [ms], estimate": ("estimate_cortex_m7_480mhz_ms", ".2f"),
+        "A76 2.4 GHz [ms], estimate": ("estimate_a76_2400mhz_ms", ".2f"),
+    }
+    lines = [
+        [name] + [format(row[k], f) if row.get(k) is not None else "-" for k, f in columns.values()]
+        for name, row in rows.items()
+    ]
+    return table(["engine", *columns], lines, note=note)

@@ -16,6 +16,7 @@ import os
 from typing import Any, NamedTuple
 
 import mujoco
+import mujoco.sysid as sysid
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -45,8 +46,6 @@ class Problem(NamedTuple):
 
 def is_installed() -> bool:
     """Return whether all packages of `mujoco.sysid` are installed."""
-    import mujoco.sysid as sysid
-
     return hasattr(sysid, "optimize")
 
 
@@ -58,8 +57,6 @@ def prepare(task: Task, sigma: np.ndarray) -> Problem:
         sigma: (19,) standard deviation of the noise of each channel (the first 12 are position,
             attitude, velocity and body rates).
     """
-    import mujoco.sysid as sysid
-
     dt = step_s(task.nominal)
     spec = mujoco.MjSpec()
     spec.option.timestep = dt
@@ -113,8 +110,6 @@ def refit(problem: Problem) -> tuple[np.ndarray, NormalEquations]:
     Returns:
         The fitted parameters (K,), and the normal equations at these values, one for each window.
     """
-    import mujoco.sysid as sysid
-
     # `verbose=False` silences `sysid.optimize`, not the optimiser that it calls.
     with contextlib.redirect_stdout(io.StringIO()):
         params, result = sysid.optimize(
@@ -151,8 +146,6 @@ def _with_parameters(base: Any, task: Task, values: np.ndarray) -> Any:
 
 def _start_state(model: Any, windows: Any, w: int) -> np.ndarray:
     """Return the measured state at the start of window `w`, in the form of `mujoco.sysid`."""
-    import mujoco.sysid as sysid
-
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, np.asarray(windows.rot_w[w]).ravel())
     pose = np.concatenate([windows.pos_w[w], quat])
@@ -163,8 +156,6 @@ def _start_state(model: Any, windows: Any, w: int) -> np.ndarray:
 
 def _thrusts(task: Task, w: int, dt: float) -> Any:
     """Return the thrusts of the rotors in window `w` [N], from the measured rotor speeds."""
-    import mujoco.sysid as sysid
-
     constants = make_plant(task.nominal, dt).constants
     thrust = constants.thrust_coefficient * np.asarray(task.windows.rotor_speed[w]) ** 2
     # The last control is not applied by `mujoco.sysid`: one more row gives all steps.
@@ -174,8 +165,6 @@ def _thrusts(task: Task, w: int, dt: float) -> Any:
 
 def _measurements(task: Task, w: int) -> Any:
     """Return the measured states of window `w`; missing values are NaN."""
-    import mujoco.sysid as sysid
-
     windows = task.windows
     quats = np.empty((len(windows.row_s[w]), 4))
     for quat, rot_w in zip(quats, windows.row_rot_w[w], strict=True):
