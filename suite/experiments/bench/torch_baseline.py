@@ -9,7 +9,6 @@ is the number of worlds.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any
 
 import torch
@@ -21,15 +20,11 @@ from suite.experiments.bench.torch_scene import Tensor, to_local, to_world
 from suite.train.config import TrainConfig
 from suite.train.dynamics.point_mass import HEADING_RATE, PointMassParams, PointMassState
 from suite.train.losses import BARRIER_HEIGHT, BARRIER_SLOPE, FIELD_DECAY, MAX_PULL, UNIT_FIELD
-from suite.train.recipes import paper
 from suite.train.step import BEYOND_M, PATH_SAMPLES
 from suite.train.update import WEIGHT_DECAY
 from suite.train.worlds import Worlds
 from tracks.geometry.camera import pixel_rays_b
 from tracks.geometry.scene import Gates
-
-SIZES = ("camera", "hidden_size", "channels")
-"""Settings that may differ from those of the recipe: sizes of the network and of the image."""
 
 
 def to_torch(tree: Any) -> Any:
@@ -99,26 +94,7 @@ class Baseline:
     """A policy in torch, its optimiser and the loss of a batch of worlds."""
 
     def __init__(self, config: TrainConfig, params: Mapping[str, Any]) -> None:
-        """Make the network, with the parameters `params` of `policies.networks.network`.
-
-        Raises:
-            ValueError: for quadrotors, and for a setting of the loss or the observation that
-                differs from the recipe `paper`.
-        """
-        if config.quadrotor is not None:
-            raise ValueError(
-                "the torch baseline has no quadrotor, only the point mass; leave quadrotor out"
-            )
-        for part in ("loss", "spec"):
-            settings, allowed_settings = getattr(config, part), getattr(paper(), part)
-            for field in fields(allowed_settings):
-                value = getattr(settings, field.name)
-                allowed = getattr(allowed_settings, field.name)
-                if value != allowed and field.name not in SIZES:
-                    raise ValueError(
-                        f"{part}.{field.name} is {value!r}, allowed for the torch baseline is "
-                        f"{allowed!r}, as in the recipe paper"
-                    )
+        """Make the network, with the parameters `params` of `policies.networks.network`."""
         self.config = config
         self.network = torch_twin(params, config.spec).requires_grad_(True)
         self.optimizer = torch.optim.AdamW(

@@ -46,15 +46,6 @@ def test_both_sides_compute_the_same_loss_and_gradient():
         assert float((value.grad - expected[name]).abs().max()) < 0.01 * size, name
 
 
-def test_the_baseline_refuses_what_its_recipe_does_not_have():
-    base = train.bench_config(2, 3)
-    params = {name: np.asarray(value) for name, value in fresh_params(base.spec).items()}
-    for part, change in (("loss", {"projection": 1.0}), ("spec", {"gate_axis": True})):
-        config = replace(base, **{part: replace(getattr(base, part), **change)})
-        with pytest.raises(ValueError, match=f"{part}.{next(iter(change))} is .* recipe paper"):
-            Baseline(config, params)
-
-
 def test_both_sides_have_the_same_residuals():
     task = make_task(20_000, 2.5)
     model = RolloutModel(
