@@ -48,9 +48,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         ValueError: for an unknown recipe or logs that cannot be used.
     """
     from suite.delta.fit import FitConfig
-    from suite.delta.run import errors, fit_delta, table
+    from suite.delta.run import errors_grid, fit_delta
     from suite.train.recipes import named_recipe, with_model
     from tracks.common.files import plain
+    from tracks.common.grid import markdown
 
     fitting = replace(
         FitConfig(),
@@ -61,6 +62,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     recipe = with_model(named_recipe(config.recipe), config.model, config.vehicle)
     dynamics = recipe.quadrotor or recipe.physics
     result = fit_delta(fitting, dynamics, config.flights, config.out, console)
-    console.say(table(result, fitting.horizon_s))
+    errors = plain(result.errors)
+    console.say(markdown(errors_grid({"horizon_s": fitting.horizon_s, **errors})))
     console.say(f"delta: {config.out / 'delta'}")
-    return {"delta": str(config.out / "delta"), **plain(errors(result))}
+    return {"delta": str(config.out / "delta"), **errors}

@@ -73,27 +73,19 @@ class ReplayErrors(NamedTuple):
 
 @dataclass(frozen=True)
 class DeltaFit:
-    """A fitted network and its errors on held-out flights."""
+    """A fitted network and the errors of the models on held-out flights."""
 
     params: dict[str, np.ndarray]
     """Parameters of the Delta Action network."""
-    without: ReplayErrors
-    """Errors of the dynamics without the network, on held-out flights."""
-    with_delta: ReplayErrors
-    """Errors of the dynamics with the network, on held-out flights."""
+    errors: dict[str, ReplayErrors]
+    """Errors on held-out flights by model, a key of `suite.delta.run.MODEL_NAMES`. The first are
+    those of the dynamics without the network, the last those with it."""
     curve: list[dict[str, float]]
     """Learning curve. Each row has the iteration and the position errors on fitted and on held-out
     windows [m]."""
-
-
-@dataclass(frozen=True)
-class PointMassFit(DeltaFit):
-    """A network fitted through the point mass, and a fitted point mass for comparison."""
-
-    identified: PointMassModel
-    """The point mass whose lag, drag and delay were fitted."""
-    identified_errors: ReplayErrors
-    """Held-out errors of that point mass, without a network."""
+    identified: PointMassModel | None = None
+    """The point mass whose lag, drag and delay were fitted for comparison, if the network was
+    fitted through the point mass."""
 
 
 Replay = Callable[[Any, Any], tuple[jax.Array, jax.Array, jax.Array]]
@@ -237,8 +229,10 @@ def fit_network(
     params = _descend(config, loss, start, fit_windows, config.iterations, add_to_curve)
     return DeltaFit(
         params={name: np.asarray(value) for name, value in params.items()},
-        without=_means(errors(held_out, None)),
-        with_delta=_means(errors(held_out, params)),
+        errors={
+            "without": _means(errors(held_out, None)),
+            "delta_action": _means(errors(held_out, params)),
+        },
         curve=curve,
     )
 
@@ -254,7 +248,7 @@ def fit_point_mass(
     fit_windows: PointMassWindows,
     held_out: PointMassWindows,
     show: Callable[[int, str], None] = lambda *_: None,
-) -> PointMassFit:
+) -> DeltaFit:
     """Fit the Delta Action Model of the point mass, and a point mass for comparison.
 
     Args:
@@ -268,8 +262,9 @@ def fit_point_mass(
     network = fit_network(config, nominal, fit_windows, held_out, show)
     identified = identify(config, physics, fit_windows)
     errors = jax.jit(partial(window_errors, partial(replay_point_mass, identified)))
-    return PointMassFit(
-        **vars(network),
-        identified=identified,
-        identified_errors=_means(errors(held_out, None)),
-    )
+    found = {
+        "point_mass": network.errors["without"],
+        "fitted_point_mass": _means(errors(held_out, None)),
+        "delta_action": network.errors["delta_action"],
+    }
+    return replace(network, errors=found, identified=identified)

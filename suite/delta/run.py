@@ -19,18 +19,12 @@ from policies.formats.policy_file import DELTA
 from suite.common.console import Console
 from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.stages import Estimate, announce
-from suite.delta.fit import (
-    DeltaFit,
-    FitConfig,
-    PointMassFit,
-    ReplayErrors,
-    fit_network,
-    fit_point_mass,
-)
+from suite.delta.fit import DeltaFit, FitConfig, fit_network, fit_point_mass
 from suite.delta.replay import QUAD, describe_dynamics
 from suite.delta.windows import cut_windows, decision_rate
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from tracks.common.files import plain, write_json, write_text
+from tracks.common.grid import Grid, markdown, table_of
 
 PLANT_STEPS_S, POINT_STEPS_S = 4e5, 1.5e5
 """Simulated steps a second of the quadrotor and of the point mass in a fit, from which the duration
@@ -39,10 +33,11 @@ MODEL_NAMES = {
     "point_mass": "point mass as trained in",
     "without": "quadrotor of the vehicle file",
     "fitted_point_mass": "point mass, lag, drag and delay fitted",
-    "delta_action": "with Delta Action Model",
+    "delta_action": "{} with Delta Action Model",
 }
 """Key in delta.json -> name of a model that replays the held-out flights. The uncorrected dynamics
-are first: `point_mass` or, for a quadrotor, `without`. The Delta Action Model is last."""
+are first: `point_mass` or, for a quadrotor, `without`. The Delta Action Model, with the name of the
+dynamics that it corrects, is last."""
 
 
 def fitting_estimate(config: FitConfig, steps: float, through_quadrotor: bool) -> Estimate:
@@ -163,50 +158,43 @@ def fit_delta(
     with console.progress("fitting", config.iterations) as show:
         result = run_fit(fit_windows, held_out, show)  # pyrefly: ignore[bad-argument-type]
     # Write the record, the checkpoint and the tables.
-    summary = {
+    record = {
         "model": description["model"],
         "horizon_s": config.horizon_s,
         "held_out": [log.name for log in groups[1]],
         **({"vehicle": dynamics.vehicle} if isinstance(dynamics, QuadrotorConfig) else {}),
         "windows": {"fit": len(fit_windows.pos_w), "held_out": len(held_out.pos_w)},
-        **errors(result),
-        **({"identified": result.identified} if isinstance(result, PointMassFit) else {}),
+        **result.errors,
+        **({} if result.identified is None else {"identified": result.identified}),
         "curve": result.curve,
     }
     write_run_record(out, config, config.seed)
     stored = {**plain(config), **description, "rate_hz": rate_hz}
     save_arrays(out / "delta", result.params, kind=DELTA, seed=config.seed, extra={"fit": stored})
-    write_json(out / "delta.json", plain(summary))
-    write_text(out / "table.md", table(result, config.horizon_s))
+    summary = plain(record)
+    write_json(out / "delta.json", summary)
+    write_text(out / "table.md", markdown(errors_grid(summary)))
     return result
-
-
-def errors(result: DeltaFit) -> dict[str, ReplayErrors]:
-    """Return the held-out errors by model, for delta.json."""
-    if isinstance(result, PointMassFit):
-        return {
-            "point_mass": result.without,
-            "fitted_point_mass": result.identified_errors,
-            "delta_action": result.with_delta,
-        }
-    return {"without": result.without, "delta_action": result.with_delta}
 
 
 def errors_by_name(fitted: Mapping[str, Any]) -> dict[str, Mapping[str, float]]:
     """Return the held-out errors in delta.json by the model's name, as in `MODEL_NAMES`."""
-    return {name: fitted[key] for key, name in MODEL_NAMES.items() if key in fitted}
+    dynamics = "quadrotor" if "without" in fitted else "point mass"
+    return {
+        name.format(dynamics): fitted[key] for key, name in MODEL_NAMES.items() if key in fitted
+    }
 
 
-def table(result: DeltaFit, horizon_s: float) -> str:
-    """Return the held-out errors as a Markdown table."""
-    dynamics = "point mass" if isinstance(result, PointMassFit) else "quadrotor"
-    names = {**MODEL_NAMES, "delta_action": f"{dynamics} {MODEL_NAMES['delta_action']}"}
-    lines = [
-        f"| held-out flights, after {horizon_s:g} s | position error [m] "
-        f"| velocity error [m/s] | of the {dynamics}'s |",
-        "|---|---|---|---|",
-    ]
-    for key, (position_m, velocity_m_s) in errors(result).items():
-        share = position_m / result.without.position_m
-        lines.append(f"| {names[key]} | {position_m:.3f} | {velocity_m_s:.3f} | {share:.2f} |")
-    return "\n".join([*lines, ""])
+def errors_grid(fitted: Mapping[str, Any], title: str = "") -> Grid:
+    """Return a table of the held-out errors; `fitted` are the contents of delta.json."""
+    errors = errors_by_name(fitted)
+    # The first model is the uncorrected dynamics, with which the others are compared.
+    base_m = next(iter(errors.values()))["position_m"]
+    return table_of(
+        errors.items(),
+        (f"held-out flights, after {fitted['horizon_s']:g} s", lambda row: row[0]),
+        ("position error [m]", lambda row: f"{row[1]['position_m']:.3f}"),
+        ("velocity error [m/s]", lambda row: f"{row[1]['velocity_m_s']:.3f}"),
+        ("of the first", lambda row: f"{row[1]['position_m'] / base_m:.2f}"),
+        title=title,
+    )

@@ -14,14 +14,12 @@ from pathlib import Path
 from suite.common import curve
 from suite.common.charts import curves_chart
 from suite.common.report import Picture, Section
-from suite.delta.run import errors_by_name
+from suite.delta.run import errors_grid
 from suite.loop.charts import COLOURS, delta_chart
 from suite.loop.compare import BEFORE, PolicyResult
 from suite.loop.config import LoopConfig
-from suite.loop.report import errors_row
 from suite.loop.tables import points, significance
 from suite.loop.variants import DeltaModel, Findings, Loop, ShownPolicy, Variant
-from tracks.common.grid import table
 
 WITHOUT, WITH = "without", "with"
 LABELS = {BEFORE: "before", WITHOUT: "tuned without delta", WITH: "tuned with delta"}
@@ -61,10 +59,6 @@ def verdict(policies: Sequence[PolicyResult], trials: int) -> str:
 
 def _delta_section(fitted: Mapping) -> Section:
     """Return the section with the errors on held-out flights; `fitted` is from delta.json."""
-    errors = errors_by_name(fitted)
-    # The first error is that of the uncorrected dynamics.
-    base_m = next(iter(errors.values()))["position_m"]
-    rows = [errors_row(name, error, base_m) for name, error in errors.items()]
     corrected = f"quadrotor of {fitted['vehicle']['name']}" if "vehicle" in fitted else "point mass"
     windows, held, horizon = fitted["windows"], len(fitted["held_out"]), fitted["horizon_s"]
     return Section(
@@ -73,7 +67,7 @@ def _delta_section(fitted: Mapping) -> Section:
             f"Recorded actions are flown again in the {corrected} for {horizon:g} s. "
             f"{held} flights ({windows['held_out']} windows) are held out: no fit used them. "
             f"The fit used {windows['fit']} windows of the other flights.",
-            table(["", "position error [m]", "velocity error [m/s]", "of the first"], rows),
+            errors_grid(fitted),
             Picture(delta_chart(fitted), f"Mean distance from the record after {horizon:g} s."),
         ],
     )

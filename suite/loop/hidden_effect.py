@@ -26,16 +26,16 @@ from eval.worlds import differences
 from suite.common import curve
 from suite.common.charts import curves_chart
 from suite.common.report import Links, Picture, Section
+from suite.delta.run import errors_grid
 from suite.diagnose.report.summary import components, grid
 from suite.loop.charts import COLOURS
 from suite.loop.compare import BEFORE, PolicyResult
 from suite.loop.config import EXACT_SIMULATORS, LoopConfig
-from suite.loop.report import errors_row
 from suite.loop.tables import points, significance
 from suite.loop.variants import DeltaModel, Findings, Loop, ShownPolicy, Variant
 from suite.loop.work import named_effects, read_diagnosis
 from tracks.common.files import to_json
-from tracks.common.grid import table
+from tracks.common.grid import Grid, markdown
 
 NOMINAL, CONTROL, DELTA, NAMED, BOTH = "nominal", "control", "delta", "named", "both"
 LABELS = {
@@ -52,6 +52,13 @@ REFERENCES = (BEFORE, CONTROL, NOMINAL)
 MODELS = {CONTROL: "simulation's", NAMED: "corrected"}
 """Delta Action Models: the model in delta-NAME/ is fitted to the dynamics in which the policy NAME
 is fine-tuned. The text names the quadrotor of these dynamics."""
+DELTA_TITLE = "Delta Action Models on held-out flights"
+DELTA_TEXT = (
+    "Recorded actions are flown again through the differentiable quadrotor. The flights have "
+    "measurement noise, so the noise of the start is in every row. The diagnosis, which "
+    "corrected the vehicle, used some of these flights; no fit of a Delta Action Model did."
+)
+"""Heading and explanation of the errors of the Delta Action Models."""
 JUDGED = "judging the one fine-tuned {}, on the same seeds"
 """Description of the judging of a fine-tuned policy."""
 
@@ -59,15 +66,11 @@ JUDGED = "judging the one fine-tuned {}, on the same seeds"
 def summarise(config: LoopConfig, out: Path, policies: Sequence[PolicyResult]) -> Findings:
     """Return the results of the finished loop in `out`."""
     diagnosis, trials = read_diagnosis(out), config.trials * config.cells
+    errors = _errors_grids(out) if config.delta else []
     keys = ("verdict", "effects", "gap", "unexplained")
     return Findings(
         verdict=verdict(policies, diagnosis, trials, vehicle_phrase(config)),
-        errors=[
-            f"Delta Action Model of the {quadrotor} quadrotor\n\n"
-            + (out / f"delta-{name}" / "table.md").read_text(encoding="utf-8")
-            for name, quadrotor in MODELS.items()
-            if config.delta
-        ],
+        errors=[*map(markdown, errors)],
         numbers={"diagnosis": {key: diagnosis[key] for key in keys}},
         facts={
             "simulation's vehicle": config.vehicle,
@@ -76,7 +79,7 @@ def summarise(config: LoopConfig, out: Path, policies: Sequence[PolicyResult]) -
         },
         sections=[
             _diagnosis_section(config, diagnosis),
-            *([_delta_section(out)] if config.delta else []),
+            *([Section(DELTA_TITLE, [DELTA_TEXT, *errors])] if errors else []),
             _training_section(out, config),
         ],
     )
@@ -173,21 +176,15 @@ def hidden_effects(simulated: Vehicle, true: Vehicle) -> str:
     return "; ".join(texts)
 
 
-def _delta_section(out: Path) -> Section:
-    """Return the section with the errors of the Delta Action Models."""
-    rows = []
-    for variant, vehicle in MODELS.items():
-        text = (out / f"delta-{variant}" / "delta.json").read_text(encoding="utf-8")
-        fitted = json.loads(text)
-        rows.append(errors_row(f"{vehicle} vehicle", fitted["without"]))
-        rows.append(errors_row(f"{vehicle} vehicle with delta", fitted["delta_action"]))
-    headers = ["held-out flights, after 1 s", "position error [m]", "velocity error [m/s]"]
-    text = (
-        "Recorded actions are flown again through the differentiable quadrotor. The flights have "
-        "measurement noise, so the noise of the start is in every row. The diagnosis, which "
-        "corrected the vehicle, used some of these flights; no fit of a Delta Action Model did."
-    )
-    return Section("Delta Action Models on held-out flights", [text, table(headers, rows)])
+def _errors_grids(out: Path) -> list[Grid]:
+    """Return a table of the errors of each Delta Action Model."""
+    return [
+        errors_grid(
+            json.loads((out / f"delta-{name}" / "delta.json").read_text(encoding="utf-8")),
+            f"Delta Action Model of the {quadrotor} quadrotor",
+        )
+        for name, quadrotor in MODELS.items()
+    ]
 
 
 def _training_section(out: Path, config: LoopConfig) -> Section:

@@ -87,18 +87,3 @@ def _files_section(
             Details("Configuration", to_json(config, indent=2)),
         ],
     )
-
-
-def errors_row(name: str, errors: Mapping[str, float], base_m: float | None = None) -> list[str]:
-    """Return a row of a table with the errors of a model on held-out flights.
-
-    Args:
-        name: name of the model.
-        errors: `position_m`, the position error [m], and `velocity_m_s`, the velocity error [m/s].
-        base_m: position error of another model [m]; the row then has the ratio to it. None: no
-            ratio.
-    """
-    texts = [name, f"{errors['position_m']:.3f}", f"{errors['velocity_m_s']:.3f}"]
-    if base_m is not None:
-        texts.append(f"{100 * errors['position_m'] / base_m:.0f} %")
-    return texts

@@ -56,17 +56,21 @@ def table(
 
 
 def table_of(
-    rows: Iterable[Row], *columns: tuple[str, Callable[[Row], str | Cell]], note: str = ""
+    rows: Iterable[Row],
+    *columns: tuple[str, Callable[[Row], str | Cell]],
+    title: str = "",
+    note: str = "",
 ) -> Grid:
     """Return a table with a line for each of `rows`.
 
     Args:
         rows: objects of any kind.
         columns: (header, function of a row that returns the cell) of each column.
+        title: text above the table.
         note: text below the table.
     """
     lines = [[cell_of(row) for _, cell_of in columns] for row in rows]
-    return table([header for header, _ in columns], lines, note=note)
+    return table([header for header, _ in columns], lines, title, note)
 
 
 def markdown(grid: Grid) -> str:

@@ -11,12 +11,14 @@ import pytest
 from eval.logs.flight_log import write_flight
 from policies.formats.policy_file import load_delta
 from suite.common.console import Console
-from suite.delta.fit import FitConfig, PointMassFit, _descend, _loss, identify, window_errors
+from suite.delta.fit import FitConfig, _descend, _loss, identify, window_errors
 from suite.delta.replay import PointMassModel, nominal_model
-from suite.delta.run import fit_delta, table
+from suite.delta.run import errors_grid, fit_delta
 from suite.delta.windows import cut_windows
 from suite.train.config import PointMassConfig
 from tests.support.point_mass_flights import fly
+from tracks.common.files import plain
+from tracks.common.grid import markdown
 
 
 class Record(NamedTuple):
@@ -66,19 +68,21 @@ def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(tmp_path, monke
     told = nullcontext(lambda *words: shown.append(words))
     monkeypatch.setattr(console, "progress", lambda *_: told)
     result = fit_delta(CONFIG, PHYSICS, [tmp_path], tmp_path / "out", console)
-    assert isinstance(result, PointMassFit)
-    assert result.without.position_m > 0.1
-    assert result.with_delta.position_m < 0.3 * result.without.position_m
-    assert result.with_delta.velocity_m_s < 0.4 * result.without.velocity_m_s
-    assert result.with_delta.position_m < result.identified_errors.position_m
+    without, identified, with_delta = result.errors.values()
+    assert result.identified is not None
+    assert without.position_m > 0.1
+    assert with_delta.position_m < 0.3 * without.position_m
+    assert with_delta.velocity_m_s < 0.4 * without.velocity_m_s
+    assert with_delta.position_m < identified.position_m
     assert [row["iteration"] for row in result.curve] == [*range(0, 100, 2), 99]
     held_out = [row["held_out_m"] for row in result.curve]
-    assert held_out[-1] == pytest.approx(result.with_delta.position_m, rel=1e-5)
+    assert held_out[-1] == pytest.approx(with_delta.position_m, rel=1e-5)
     assert held_out[-1] < 0.5 * held_out[0] and len(shown) == len(held_out)
     stored = load_delta(tmp_path / "out" / "delta").arrays
     jax.tree.map(np.testing.assert_array_equal, stored, result.params)
     said = (tmp_path / "out" / "table.md").read_text()
-    assert said == table(result, 0.6) and "| point mass with Delta Action Model |" in said
+    grid = errors_grid({"horizon_s": 0.6, **plain(result.errors)})
+    assert said == markdown(grid) and "| point mass with Delta Action Model |" in said
 
 
 def test_a_replay_is_held_against_the_record_of_its_own_time():

@@ -135,8 +135,8 @@ def test_a_fit_cuts_the_error_and_says_what_it_corrects(logs, tmp_path, monkeypa
     config = FitConfig(horizon_s=0.5, iterations=30, batch=32, rate=1e-2, held_out=0.5)
     quad = QuadrotorConfig(BARE, physics_hz=100.0)
     result = fit_delta(config, quad, [tmp_path / "logs"], tmp_path / "out", Console())
-    assert result.without.position_m > 0.05
-    assert result.with_delta.position_m < 0.6 * result.without.position_m
+    assert result.errors["without"].position_m > 0.05
+    assert result.errors["delta_action"].position_m < 0.6 * result.errors["without"].position_m
     stored = load_delta(tmp_path / "out" / "delta")
     assert stored.config["fit"]["model"] == "quad"
     for name, value in result.params.items():

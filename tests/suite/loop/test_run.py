@@ -23,7 +23,7 @@ from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks import delta_network
 from suite import cli
 from suite.common.console import Quiet
-from suite.delta.fit import PointMassFit, ReplayErrors
+from suite.delta.fit import DeltaFit, ReplayErrors
 from suite.delta.replay import nominal_model
 from suite.delta.run import flight_files
 from suite.loop import hidden_effect, work
@@ -50,8 +50,9 @@ def fitted(config, physics, fit_windows, held_out, show):
     assert len(fit_windows.pos_w) > 0 < len(held_out.pos_w)
     params = {k: np.asarray(v) + 0.01 for k, v in delta_network.init(jax.random.key(0)).items()}
     curve = [{"iteration": k, "fit_m": 0.2, "held_out_m": 0.2} for k in range(config.iterations)]
-    errors = [ReplayErrors(error, error) for error in (0.2, 0.1, 0.15)]
-    return PointMassFit(params, *errors[:2], curve, nominal_model(physics), errors[2])
+    models = {"point_mass": 0.2, "fitted_point_mass": 0.15, "delta_action": 0.1}
+    errors = {name: ReplayErrors(error, error) for name, error in models.items()}
+    return DeltaFit(params, errors, curve, nominal_model(physics))
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +191,7 @@ class Stub(Small):
         fit = {"model": "quad"}
         save_arrays(out / "delta", params, kind="delta", seed=0, extra={"fit": fit})
         errors = {"position_m": 0.1, "velocity_m_s": 0.2}
-        stored = {"without": errors, "delta_action": errors}
+        stored = {"horizon_s": 1.0, "without": errors, "delta_action": errors}
         (out / "delta.json").write_text(json.dumps(stored))
         (out / "table.md").write_text("| fitted |\n")
 
