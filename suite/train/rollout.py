@@ -77,8 +77,6 @@ class StepRecord(NamedTuple):
     """Smallest signed distance on the step's path [m]."""
     passed: jax.Array
     """Bool: a gate was crossed in this step."""
-    pos_w: jax.Array
-    """(B, 3) position at the step's end [m]."""
     hidden: jax.Array
     """(B, hidden) the policy's recurrent state after the step."""
     alive: jax.Array
@@ -348,7 +346,6 @@ def make_rollout(
                 speed=jnp.linalg.norm(after.vel_w, axis=-1),
                 clearance=motion.clearance,
                 passed=motion.passed,
-                pos_w=after.pos_w,
                 hidden=hidden,
                 alive=carry.alive,
                 noted=None if note is None else note(worlds, before, after, target),
