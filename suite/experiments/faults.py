@@ -176,7 +176,7 @@ def _simulated_cases(config: Config, flights: Sequence[Path]) -> Iterator[Case]:
     The formats alternate, among those that have the signals that the fault changes.
     """
     for number, (name, kind) in enumerate(KINDS.items()):
-        formats = [f for f in FORMATS if kind.fits(_signals_of(f))]
+        formats = [f for f in kind.formats or FORMATS if kind.fits(_signals_of(f))]
         for k in range(config.flights):
             index = (number * config.flights + k) % len(flights)
             yield Case(name, formats[k % len(formats)], flights[index], index)

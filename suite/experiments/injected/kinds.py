@@ -45,6 +45,8 @@ class Kind:
     """Whether it ended flights of teams in a vision race of 2026."""
     needs: tuple[str, ...] = ()
     """Signals that `change` reads, and signals without which the fault is not identifiable."""
+    formats: tuple[str, ...] = ()
+    """Log formats that can have the fault; all if empty."""
     accepts_pwm: bool = False
     """Whether motor commands (`pwm`) may stand in for rotor speeds (`motor`), if a log has only
     the commands."""
@@ -284,7 +286,12 @@ KINDS: dict[str, Kind] = {
     "loop at two thirds of its rate (40 of 60 Hz)": Kind(
         ("controller_rate",), change=_hold_commands, race=True, needs=("cmd_rate", "throttle")
     ),
-    "time in ms": Kind(("time_unit",), change=lambda p, _: {**p, "time": 1e3 * p["time"]}),
+    # The other formats define the unit of time.
+    "time in ms": Kind(
+        ("time_unit",),
+        change=lambda p, _: {**p, "time": 1e3 * p["time"]},
+        formats=("table", "flight log"),
+    ),
     "throttle is a share of the motors' speed": Kind(
         ("throttle_curve",), change=_unlinearised, needs=("throttle", "cmd_thrust")
     ),
