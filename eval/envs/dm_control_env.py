@@ -56,10 +56,10 @@ class RaceTask(control.Task):
 
     def observation_spec(self, physics: RacePhysics) -> dict[str, specs.Array]:
         """Return the shapes of the observation."""
-        camera = physics.race.spec.camera
+        spec = physics.race.spec
         return {
-            "state": specs.Array((physics.race.spec.state_size,), np.float32, "state"),
-            "image": specs.Array((camera.height, camera.width), np.float32, "image"),
+            "state": specs.Array((spec.state_size,), np.float32, "state"),
+            "image": specs.Array(spec.image_shape, np.float32, "image"),
         }
 
     def get_observation(self, physics: RacePhysics) -> dict[str, np.ndarray]:
@@ -98,9 +98,12 @@ def load(
             judge they depend on the name of its file.
         vehicle: the vehicle; None: `eval/vehicles/reference.toml`.
         spec: rate, camera and encoding of the observation; the period is rounded to whole physics
-            steps.
+            steps. Actions are accelerations in SI units, images have two axes of float32.
         rules: rules for the end of an episode; None: the judge's.
         environment: further arguments of `dm_control.rl.control.Environment`.
+
+    Raises:
+        ValueError: for an unknown track or a spec that this environment cannot fly.
     """
     track = track or make_track(family, level, seed)
     race = Race(track, vehicle or load_vehicle("reference"), spec or PolicySpec(), rules or Rules())

@@ -10,7 +10,6 @@ import math
 import mujoco
 import numpy as np
 
-from eval.judging.guard import ActionLimits, guard_action
 from eval.quadrotor.autopilot import AutopilotState, autopilot_step, make_autopilot, start_autopilot
 from eval.quadrotor.plant import uses_noise
 from eval.vehicles.vehicle import Vehicle
@@ -31,7 +30,7 @@ from eval.worlds.trial import (
     start_progress,
 )
 from policies.observation import observe, view_of
-from policies.spec import PolicySpec
+from policies.spec import PolicySpec, check_spec
 from tracks.geometry.rotation import to_world
 from tracks.geometry.scene import Gates
 from tracks.track import Track
@@ -50,9 +49,24 @@ class Race:
     """A trial by the judge's rules; the caller provides MuJoCo's `MjData`."""
 
     def __init__(self, track: Track, vehicle: Vehicle, spec: PolicySpec, rules: Rules) -> None:
-        """Compile the model of `vehicle` on `track`."""
+        """Compile the model of `vehicle` on `track`.
+
+        Raises:
+            ValueError: for a spec that this environment cannot fly.
+        """
         self.spec, self.rules = spec, rules
         self.autopilot = make_autopilot(vehicle)
+        check_flyable(spec, vehicle)
+        if spec.action.kind != "acceleration" or not spec.action.is_plain:
+            raise ValueError(
+                f"spec.action is {spec.action}, allowed is acceleration in SI units; use `RaceEnv` "
+                "for other actions"
+            )
+        if spec.depth.channel_axis or spec.depth.uint8:
+            raise ValueError(
+                f"spec.depth is {spec.depth}, allowed is channel_axis=False and uint8=False; use "
+                "`RaceEnv` for other images"
+            )
         layout = layout_of([track])
         self.model = compile_model(track, vehicle, self.autopilot.dt, layout.solids)
         period = 1 / (spec.rate_hz * self.autopilot.dt)
@@ -95,11 +109,17 @@ class Race:
             data: state of the simulation after `mj_step1`, as `place` and this function leave it.
             action_b: (3,) wanted acceleration in body axes [m/s^2].
             steps: number of physics steps.
+
+        Raises:
+            ValueError: for an action of another shape, not finite, or out of range.
         """
-        limits = ActionLimits(size=ACTION_LIMIT * 3**0.5)
-        action = np.asarray(action_b, float)[None]
-        guarded = guard_action(limits, action, self.action_b, 0.0, "of the environment's user")
-        self.action_b = guarded.action_b
+        action = np.asarray(action_b, float)
+        if action.shape != (3,) or not (abs(action) <= ACTION_LIMIT).all():
+            raise ValueError(
+                f"action is {action.tolist()}, allowed are 3 numbers from {-ACTION_LIMIT:g} to "
+                f"{ACTION_LIMIT:g} m/s^2; check the policy's output for NaN, or clip it"
+            )
+        self.action_b = action[None]
         gates_before, path_before = int(self.progress.gates[0]), self._remaining_path()
         for _ in range(steps):
             if self.progress.ended[0] != FLYING:
@@ -159,6 +179,21 @@ class Race:
             "state": np.clip(state, -STATE_LIMIT, STATE_LIMIT).astype(np.float32),
             "image": image.astype(np.float32),
         }
+
+
+def check_flyable(spec: PolicySpec, vehicle: Vehicle) -> None:
+    """Refuse an impossible spec, and one with more decisions than physics steps of `vehicle`.
+
+    Raises:
+        ValueError: naming the key, its value and what is allowed.
+    """
+    check_spec(spec)
+    frequency = vehicle.controller.frequency
+    if spec.rate_hz > frequency * (1 + 1e-9):
+        raise ValueError(
+            f"spec.rate_hz is {spec.rate_hz:g}, allowed is up to the {frequency:g} Hz of vehicle "
+            f"{vehicle.name!r}'s controller.frequency"
+        )
 
 
 def remaining_path(pos_w: np.ndarray, centres_w: np.ndarray, gates: int) -> float:
