@@ -7,13 +7,22 @@ environment and N environments give the same results.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.envs.race import ACTION_LIMIT, CRASH_REWARD, GATE_REWARD, STATE_LIMIT, remaining_path
+from eval.envs.race import (
+    ACTION_LIMIT,
+    CRASH_REWARD,
+    GATE_REWARD,
+    STATE_LIMIT,
+    check_flyable,
+    remaining_path,
+)
 from eval.judging.guard import ActionLimits, first_action, guard_action, limits_of
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
@@ -70,26 +79,27 @@ REWARDS: dict[str, tuple[float, Callable[[Moments], np.ndarray]]] = {
 class RaceConfig:
     """Arguments of the environments."""
 
-    track: str = "random"
+    track: str | os.PathLike[str] = "random"
     """A track family, or a track file (.toml). The judge evaluates policies on families other than
     `random`."""
     level: int | tuple[int, int] = 0
     """Difficulty 0 to 9, or (lowest, highest) for a random level in each episode."""
     track_seed: int | None = None
     """Seed of one track for all episodes; None: a random seed for each episode."""
-    vehicle: str | Vehicle | Callable[[np.random.Generator], Vehicle] = "racer5"
+    vehicle: str | os.PathLike[str] | Vehicle | Callable[[np.random.Generator], Vehicle] = "racer5"
     """A shipped name, a file, a vehicle, or a function that draws a vehicle for each episode. All
     drawn vehicles must have the same effects (`suite.train.recipes.race_settings` has those of the
     trainer). The judge flies the vehicle `reference`; training on it makes a comparison unfair."""
-    spec: PolicySpec | str | None = None
+    spec: PolicySpec | str | os.PathLike[str] | None = None
     """Rate, camera, encoding and optional inputs of the observation: a spec, or the name or folder
     of a policy with that spec; None: the default."""
-    action: str = "acceleration"
-    """Kind of action: acceleration, ctbr or motors. Its components are from -1 to 1."""
+    action: str | None = None
+    """Kind of action: acceleration, ctbr or motors, with components from -1 to 1. None: the kind of
+    the spec. A spec with an action of its own allows no other kind."""
     channel_axis: bool = False
-    """Whether images have the shape (1, height, width)."""
+    """Whether images have the shape (1, height, width), in addition to the spec's setting."""
     uint8: bool = False
-    """Whether pixels are uint8, 0 to 255."""
+    """Whether pixels are uint8, 0 to 255, in addition to the spec's setting."""
     rewards: Mapping[str, float] = field(default_factory=dict)
     """Weights of reward terms by name, instead of the defaults in `REWARDS`."""
     rules: Rules = field(default_factory=Rules)
@@ -97,9 +107,17 @@ class RaceConfig:
 
 
 def levels_of(config: RaceConfig) -> tuple[int, int]:
-    """Return the lowest and the highest level."""
-    level = config.level
-    return (level, level) if isinstance(level, int) else (int(level[0]), int(level[1]))
+    """Return the lowest and the highest level.
+
+    Raises:
+        ValueError: where `level` is neither a level nor two of them in order.
+    """
+    given = config.level
+    levels = list(given) if isinstance(given, Iterable) else [given, given]
+    whole = len(levels) == 2 and all(isinstance(level, Integral) for level in levels)
+    if not whole or not LEVELS[0] <= levels[0] <= levels[1] <= LEVELS[-1]:
+        raise ValueError(f"level is {given}, allowed is 0 to 9, or (lowest, highest)")
+    return int(levels[0]), int(levels[1])
 
 
 def resolved_vehicle(config: RaceConfig, rng: np.random.Generator) -> Vehicle:
@@ -111,18 +129,23 @@ def resolved_vehicle(config: RaceConfig, rng: np.random.Generator) -> Vehicle:
 
 
 def resolved_spec(config: RaceConfig, vehicle: Vehicle) -> PolicySpec:
-    """Return the environment's spec, whose actions from -1 to 1 cover the range of `vehicle`."""
+    """Return the environment's spec, whose actions from -1 to 1 cover the range of `vehicle`.
+
+    Raises:
+        ValueError: for an unknown policy or kind of action, or a kind other than the spec's own.
+    """
     spec = config.spec or PolicySpec()
     if isinstance(spec, str):
         if not locate(spec).exists():
             raise unknown_name("policy (or folder)", spec, names())
         spec = load_policy_checkpoint(locate(spec)).spec
-    if config.channel_axis or config.uint8:
-        depth = replace(spec.depth, channel_axis=config.channel_axis, uint8=config.uint8)
-        spec = replace(spec, depth=depth)
-    if not spec.action.is_plain:
-        return spec
-    kind = config.action if spec.action.kind == "acceleration" else spec.action.kind
+    depth = replace(
+        spec.depth,
+        channel_axis=spec.depth.channel_axis or config.channel_axis,
+        uint8=spec.depth.uint8 or config.uint8,
+    )
+    spec = replace(spec, depth=depth)
+    kind = config.action or spec.action.kind
     half_thrust = vehicle.full_thrust / 2
     scales = {
         "acceleration": ((ACTION_LIMIT,), (0.0,)),
@@ -131,6 +154,14 @@ def resolved_spec(config: RaceConfig, vehicle: Vehicle) -> PolicySpec:
     }
     if kind not in scales:
         raise unknown_name("kind of action", kind, scales)
+    own = spec.action.kind != "acceleration" or not spec.action.is_plain
+    if own and kind != spec.action.kind:
+        raise ValueError(
+            f"action is {kind!r}, allowed is the spec's {spec.action.kind!r}; leave action out, or "
+            "give a spec without an action"
+        )
+    if not spec.action.is_plain:
+        return spec
     scale, offset = scales[kind]
     return replace(spec, action=ActionSpec(kind, scale, offset, spec.action.motors, clip=1.0))
 
@@ -147,10 +178,11 @@ class Races:
         """
         if slots < 1:
             raise ValueError(f"num_envs is {slots}, allowed is 1 or more")
-        lowest, highest = levels_of(config)
-        if not LEVELS[0] <= lowest <= highest <= LEVELS[-1]:
-            raise ValueError(f"level is {config.level}, allowed is 0 to 9, or (lowest, highest)")
-        self.config, self.slots = config, slots
+        levels_of(config)
+        paths = {key: getattr(config, key) for key in ("track", "vehicle", "spec")}
+        paths = {key: os.fspath(p) for key, p in paths.items() if isinstance(p, os.PathLike)}
+        self.config = config = replace(config, **paths)
+        self.slots = slots
         for name in config.rewards:
             if name not in REWARDS:
                 raise unknown_name("reward term", name, REWARDS)
@@ -161,6 +193,7 @@ class Races:
             check_family(config.track)
         vehicle = self._vehicle = resolved_vehicle(config, np.random.default_rng(0))
         self.spec = resolved_spec(config, vehicle)
+        check_flyable(self.spec, vehicle)
         self.contract: Contract = contract_of(self.spec)
         layout = layout_of([self._file_track] if self._file_track else [])
         self._world = MujocoWorld(

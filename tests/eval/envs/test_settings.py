@@ -3,12 +3,15 @@
 import os
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 os.environ.setdefault("MUJOCO_GL", "disable")
 
 import numpy as np
 import pytest
 
+import tracks
+from eval.envs.gymnasium_env import RaceEnv
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies.spec import ActionSpec, DepthEncoding, PolicySpec
 
@@ -41,3 +44,42 @@ def test_dm_control_refuses_a_bad_action(action):
     env.reset()
     with pytest.raises(ValueError, match=r"action is \[.*allowed are 3 numbers from -20 to 20"):
         env.step(np.array(action))
+
+
+CTBR = PolicySpec(action=ActionSpec("ctbr"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"spec": PolicySpec(rate_hz=0.0)}, "spec.rate_hz.* is 0"),
+        ({"spec": PolicySpec(rate_hz=300.0), "vehicle": SLOW}, "rate_hz is 300, .* 200 Hz"),
+        ({"spec": PolicySpec(action=ActionSpec("ctbr", (1.0, 2.0)))}, "action.scale is .*1 or 4"),
+        ({"spec": PolicySpec(action=ActionSpec("ctbt"))}, "unknown kind of action 'ctbt'"),
+        ({"spec": CTBR, "action": "motors"}, "action is 'motors', allowed is the spec's 'ctbr'"),
+        ({"spec": CTBR, "action": "acceleration"}, "'acceleration', allowed is the spec's 'ctbr'"),
+        ({"level": (1, 2, 3)}, r"level is \(1, 2, 3\), allowed is 0 to 9"),
+        ({"level": (1,)}, r"level is \(1,\), allowed is 0 to 9"),
+        ({"level": (1.5, 2)}, r"level is \(1.5, 2\), allowed is 0 to 9"),
+        ({"level": 2.5}, "level is 2.5, allowed is 0 to 9"),
+    ],
+)
+def test_settings_that_were_ignored_or_crashed_later_are_refused(settings, said):
+    with pytest.raises(ValueError, match=said):
+        RaceEnv(**settings)
+
+
+def test_flags_of_the_spec_and_of_the_environment_are_joined():
+    spec = PolicySpec(depth=DepthEncoding(channel_axis=True), action=ActionSpec("ctbr"))
+    env = RaceEnv(spec=spec, uint8=True)
+    image = env.observation_space["image"]
+    assert (image.shape, image.dtype) == ((1, 24, 32), np.uint8)
+    assert env.action_space.shape == (4,) == RaceEnv(action="ctbr").action_space.shape
+
+
+def test_paths_and_numpy_numbers_are_taken():
+    file = Path(tracks.__path__[0]) / "examples" / "yard.toml"
+    env = RaceEnv(track=file, vehicle=Path("reference"), spec=Path("race"), level=np.int64(3))
+    _, info = env.reset(seed=0)
+    assert info["level"] == 3
+    assert RaceEnv(level=np.array([2, 2])).reset(seed=0)[1]["level"] == 2
