@@ -5,6 +5,8 @@ Importing this file registers them under `ID`, for `gymnasium.make` and `gymnasi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -18,6 +20,7 @@ from eval.envs.races import RaceConfig, Races
 from eval.worlds.trial import FLYING
 from policies.contract import Contract
 from policies.spec import PolicySpec
+from tracks.common.names import unknown_name
 
 if TYPE_CHECKING:
     from eval.view.chase import Scenery
@@ -49,6 +52,34 @@ def observation_space(spec: PolicySpec) -> gymnasium.spaces.Dict:
     return gymnasium.spaces.Dict({"state": state, "image": image})
 
 
+def check_render_mode(mode: str | None, allowed: Sequence[str]) -> None:
+    """Refuse a render mode that is neither None nor allowed."""
+    if mode not in (None, *allowed):
+        names = " or ".join(["None", *map(repr, allowed)])
+        raise ValueError(f"render_mode is {mode!r}, allowed is {names}; `RaceEnv` renders")
+
+
+def track_seed_of(options: dict[str, Any] | None) -> Any:
+    """Return the `track_seed` in the options of `reset`, and refuse others."""
+    for name in options or {}:
+        if name != "track_seed":
+            raise unknown_name("option of reset", name, ["track_seed"])
+    return (options or {}).get("track_seed")
+
+
+def seeds_of(seed: Any, count: int) -> list[int | None]:
+    """Return the seeds of `count` environments: `seed` + i, or entry i of a sequence."""
+    if isinstance(seed, Integral):
+        return [int(seed) + k for k in range(count)]
+    seeds = [None] * count if seed is None else np.ravel(np.asarray(seed, object)).tolist()
+    if len(seeds) != count or not all(each is None or isinstance(each, Integral) for each in seeds):
+        raise ValueError(
+            f"seed is {seed}, allowed is a whole number, or one for each of num_envs = {count} "
+            "environments"
+        )
+    return [None if each is None else int(each) for each in seeds]
+
+
 class RaceEnv(gymnasium.Env):
     """Fly through the gates of a track in order, by the rules of the judge.
 
@@ -76,6 +107,7 @@ class RaceEnv(gymnasium.Env):
             ValueError: for an invalid value.
             TypeError: for an unknown argument.
         """
+        check_render_mode(render_mode, self.metadata["render_modes"])
         self._races = Races(RaceConfig(**config), 1)
         self.action_space = action_space(self._races.spec)
         self.observation_space = observation_space(self._races.spec)
@@ -92,9 +124,13 @@ class RaceEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode."""
+        """Start an episode.
+
+        Raises:
+            ValueError: for an unknown option, or a `track_seed` that is not a whole number.
+        """
         super().reset(seed=seed)
-        self._races.start([0], [self.np_random], (options or {}).get("track_seed"))
+        self._races.start([0], [self.np_random], track_seed_of(options))
         self._started, self._scenery = True, None
         return self._observation(), self._races.info(0)
 
@@ -162,7 +198,12 @@ class RaceVectorEnv(VectorEnv):
             threads: threads for physics and images; they do not change the results.
             render_mode: not supported here; `RaceEnv` renders.
             config: as in `RaceEnv`.
+
+        Raises:
+            ValueError: for an invalid value.
+            TypeError: for an unknown argument.
         """
+        check_render_mode(render_mode, ())
         self._races = Races(RaceConfig(**config), num_envs, threads)
         self.num_envs, self.render_mode = num_envs, render_mode
         self._arguments = {"num_envs": num_envs, "threads": threads, "render_mode": render_mode}
@@ -181,20 +222,22 @@ class RaceVectorEnv(VectorEnv):
     def reset(
         self,
         *,
-        seed: int | list[int | None] | None = None,
+        seed: int | Sequence[int | None] | np.ndarray | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start all episodes; environment i has the seed `seed` + i, or entry i of a list."""
-        seeds = seed if isinstance(seed, list) else [
-            None if seed is None else seed + k for k in range(self.num_envs)
-        ]  # fmt: skip
+        """Start all episodes; environment i has the seed `seed` + i, or entry i of a sequence.
+
+        Raises:
+            ValueError: for other seeds or as in `RaceEnv.reset`.
+        """
+        track_seed, seeds = track_seed_of(options), seeds_of(seed, self.num_envs)
         existing = self._rngs or [None] * self.num_envs
         self._rngs = [
             rng if rng is not None and new_seed is None else seeding.np_random(new_seed)[0]
             for rng, new_seed in zip(existing, seeds, strict=True)
         ]
         slots = list(range(self.num_envs))
-        self._races.start(slots, self._rngs, (options or {}).get("track_seed"))
+        self._races.start(slots, self._rngs, track_seed)
         return self._races.observation(), self._infos(slots)
 
     def step(

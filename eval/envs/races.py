@@ -120,6 +120,12 @@ def levels_of(config: RaceConfig) -> tuple[int, int]:
     return int(levels[0]), int(levels[1])
 
 
+def check_track_seed(seed: Any) -> None:
+    """Refuse a seed of the track that is neither None nor a whole number from 0."""
+    if seed is not None and (not isinstance(seed, Integral) or seed < 0):
+        raise ValueError(f"track_seed is {seed!r}, allowed is a whole number from 0, or None")
+
+
 def resolved_vehicle(config: RaceConfig, rng: np.random.Generator) -> Vehicle:
     """Return the configured vehicle, drawn from `rng` if it is random."""
     vehicle = config.vehicle
@@ -179,6 +185,7 @@ class Races:
         if slots < 1:
             raise ValueError(f"num_envs is {slots}, allowed is 1 or more")
         levels_of(config)
+        check_track_seed(config.track_seed)
         paths = {key: getattr(config, key) for key in ("track", "vehicle", "spec")}
         paths = {key: os.fspath(p) for key, p in paths.items() if isinstance(p, os.PathLike)}
         self.config = config = replace(config, **paths)
@@ -217,7 +224,11 @@ class Races:
             slots: numbers of the slots.
             rngs: a random generator for each slot, for the level, the track and the vehicle.
             track_seed: seed of the track; None: that of the configuration, or a random one.
+
+        Raises:
+            ValueError: for a `track_seed` that is not a whole number.
         """
+        check_track_seed(track_seed)
         config = self.config
         entries: list[tuple[int, Track, TrialSpec]] = []
         for slot, rng in zip(slots, rngs, strict=True):

@@ -58,10 +58,17 @@ class RaceVecEnv(VecEnv):
         super().__init__(num_envs, self._space, self.races.single_action_space)
 
     def reset(self) -> Observation:
-        """Start all episodes, with the seeds of `seed()` if it was called."""
-        seed = None if None in self._seeds else list(self._seeds)
-        observation, infos = self.races.reset(seed=seed)
+        """Start all episodes, with the seeds of `seed()` and options of `set_options()`, if any.
+
+        Raises:
+            ValueError: for options that differ between environments.
+        """
+        seed, options = None if None in self._seeds else list(self._seeds), self._options[0]
+        if any(other != options for other in self._options):
+            raise ValueError(f"options are {self._options}, allowed is one dict for all")
+        observation, infos = self.races.reset(seed=seed, options=options)
         self._reset_seeds()
+        self._reset_options()
         self.reset_infos = [_info_of(infos, slot) for slot in range(self.num_envs)]
         return as_space(self._space, observation, self.num_envs)
 

@@ -355,3 +355,10 @@ def test_its_vector_environment_is_ours():
         assert all(np.array_equal(last[key], alone[k][key]) for key in last)
         assert infos[k]["TimeLimit.truncated"] and infos[k]["ended_by"] == "timeout"
     assert many.get_attr("contract")[0] == singles[0].unwrapped.contract
+    many.set_options({"track_seed": 12})
+    for fixed in (True, False):  # options hold for one reset
+        many.reset()
+        assert ([info["track_seed"] for info in many.reset_infos] == [12, 12]) is fixed
+    many.set_options([{"track_seed": 1}, {"track_seed": 2}])
+    with pytest.raises(ValueError, match="options are .* allowed is one dict for all"):
+        many.reset()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import tracks
-from eval.envs.gymnasium_env import RaceEnv
+from eval.envs.gymnasium_env import RaceEnv, RaceVectorEnv
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies.spec import ActionSpec, DepthEncoding, PolicySpec
 
@@ -83,3 +83,29 @@ def test_paths_and_numpy_numbers_are_taken():
     _, info = env.reset(seed=0)
     assert info["level"] == 3
     assert RaceEnv(level=np.array([2, 2])).reset(seed=0)[1]["level"] == 2
+
+
+@pytest.mark.parametrize("seed", [(1, 2), np.array([1, 2]), [1, 2]])
+def test_any_sequence_of_seeds_is_taken(seed):
+    env = RaceVectorEnv(2)
+    assert env.reset(seed=seed)[1]["track_seed"].tolist() == (
+        env.reset(seed=np.int64(1))[1]["track_seed"].tolist()
+    )
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda env: env.reset(seed=[1, 2, 3]), r"seed is \[1, 2, 3\], .* num_envs = 2"),
+        (lambda env: env.reset(seed=1.5), "seed is 1.5, allowed is a whole number"),
+        (lambda env: env.reset(options={"trackseed": 5}), "Did you mean 'track_seed'"),
+        (lambda env: env.reset(options={"track_seed": 5.7}), "track_seed is 5.7, allowed is a"),
+        (lambda env: type(env)(track_seed=5.7), "track_seed is 5.7, allowed is a whole number"),
+        (lambda env: type(env)(render_mode="rgb_array"), "render_mode is 'rgb_array', .* None"),
+        (lambda env: RaceEnv(render_mode="human"), "'human', allowed is None or 'rgb_array'"),
+        (lambda env: RaceEnv().reset(options={"track_sed": 5}), "Did you mean 'track_seed'"),
+    ],
+)
+def test_seeds_options_and_render_modes_are_checked(call, said):
+    with pytest.raises(ValueError, match=said):
+        call(RaceVectorEnv(2))
