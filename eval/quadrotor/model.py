@@ -60,7 +60,9 @@ def add_quadrotor(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
         mass=0.0,
         rgba=[0.15, 0.15, 0.18, 1.0],
     )
-    ratio = constants.torque_coefficient / constants.thrust_coefficient
+    thrust = constants.thrust_coefficient
+    # A dead motor has no torque either; 0 / 0 would make the whole model's state NaN.
+    ratio = constants.torque_coefficient / np.where(thrust > 0.0, thrust, np.inf)
     for index, hub in enumerate(constants.rotor_position_b):
         spin = vehicle.rotors.spin[index]
         name = rotor_name(index)

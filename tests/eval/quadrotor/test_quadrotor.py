@@ -2,17 +2,20 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading, level_heading
 from eval.quadrotor.mixer import mix, rate_torque
+from eval.quadrotor.model import compile_quadrotor
 from eval.quadrotor.plant import Motion, Wrench, accelerations, euler_step, make_plant
 from eval.quadrotor.rotors import follow, speed_command
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies.observation import View, encode_depth, observe
 from policies.spec import DepthEncoding, PolicySpec
+from tests.support.vehicles import PLAIN, with_effects
 from tracks.geometry.crossing import crossing, is_inside, is_near
 from tracks.geometry.field import attractive_field, magnetic_field
 from tracks.geometry.rotation import cross, exp_rot, quat_to_rot, rot_to_quat, to_local, to_world
@@ -84,3 +87,9 @@ def test_rows_of_any_batch_are_as_each_alone(function, takes):
         np.testing.assert_allclose(many[1, 2], one, rtol=1e-12, atol=1e-12)
     traced = jax.eval_shape(function, *(jnp.asarray(array, jnp.float32) for array in arrays))
     assert [part.shape for part in jax.tree.leaves(traced)] == [part.shape for part in whole]
+
+
+def test_a_dead_motor_has_no_torque_and_leaves_the_model_finite():
+    dead = with_effects(PLAIN, weak_motor=((0.0, 1.0, 1.0, 1.0),))
+    gear = compile_quadrotor(mujoco.MjSpec(), dead, 0.002).actuator_gear
+    assert np.isfinite(gear).all() and gear[0, 5] == 0.0 < abs(gear[1, 5])
