@@ -143,7 +143,7 @@ def follow(
         if step % period == 0:
             # Set points of this moment.
             now = Reference(*(part[step // period] for part in wanted))
-            check_flights(motion, now, np.full(count, step * dt))
+            check_flights(motion, now, np.full(count, step * dt), step < np.array(steps))
             summed_w = summed_w + period * dt * (now.pos_w - motion.pos_w)
             summed_w = np.clip(summed_w, -SUM_MOST, SUM_MOST)
             command = steer(nominal, gains, now, motion, summed_w)
@@ -171,13 +171,16 @@ def _flight_of(rows: Sequence[Any], index: int) -> Any:
     return row_type(*parts) if hasattr(row_type, "_fields") else tuple(parts)
 
 
-def check_flights(motion: Motion, wanted: Reference, time_s: np.ndarray) -> None:
+def check_flights(
+    motion: Motion, wanted: Reference, time_s: np.ndarray, flying: np.ndarray | bool = True
+) -> None:
     """Check that N flights are upright, above the ground and near their trajectories.
 
     Args:
         motion: (N, ...) states.
         wanted: (N, ...) set points.
         time_s: (N,) current times [s].
+        flying: (N,) whether a flight has not ended; the others are not checked.
 
     Raises:
         FlightFailed: where a flight has tipped over, hit the ground or left its trajectory.
@@ -185,9 +188,9 @@ def check_flights(motion: Motion, wanted: Reference, time_s: np.ndarray) -> None
     distance = np.sqrt(((motion.pos_w - wanted.pos_w) ** 2).sum(-1))
     # With these comparisons, a state of NaN fails too.
     upright, above_ground = motion.rot_w[:, 2, 2] > 0.0, motion.pos_w[:, 2] > LOWEST_M
-    valid = (distance < FURTHEST_M) & upright & above_ground
-    if not valid.all():
-        first = int(np.flatnonzero(~valid)[0])
+    failed = ~((distance < FURTHEST_M) & upright & above_ground) & flying
+    if failed.any():
+        first = int(np.flatnonzero(failed)[0])
         raise FlightFailed(
             f"flight {first + 1} failed at {time_s[first]:.2f} s, {distance[first]:.1f} m off its "
             "trajectory; make the trajectory gentler or the effect weaker"

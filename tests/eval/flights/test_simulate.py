@@ -117,7 +117,7 @@ class Points:
 
     def motion(self):
         count = len(self.start_w)
-        pos_w = self.start_w + np.array([self.off_m * self.steps * DT, 0.0, 0.0])
+        pos_w = self.start_w + self.off_m * self.steps * DT * np.array([1.0, 0.0, 0.0])
         quat = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
         still = np.zeros((count, 3))
         return Motion(pos_w, np.tile(np.eye(3), (count, 1, 1)), still, still), quat
@@ -157,6 +157,11 @@ def test_a_specific_force_stands_with_the_step_after_the_one_that_had_it():
 def test_a_flight_away_from_its_trajectory_fails_with_its_number():
     with pytest.raises(FlightFailed, match=r"flight [12] failed at 0\.\d\d s, 4\.\d m off"):
         flown(off_m=20.0)
+
+
+def test_a_flight_is_not_judged_after_its_end():
+    _, (_, hover) = flown(off_m=np.array([[0.0], [15.0]]))  # 3 m off at its end, then 6 m
+    assert len(hover.time_s) == 100
 
 
 def test_the_pilot_stays_on_the_trajectory():
