@@ -129,8 +129,8 @@ def check_track_seed(seed: Any) -> None:
 def resolved_vehicle(config: RaceConfig, rng: np.random.Generator) -> Vehicle:
     """Return the configured vehicle, drawn from `rng` if it is random."""
     vehicle = config.vehicle
-    if isinstance(vehicle, str):
-        return load_vehicle(vehicle)
+    if isinstance(vehicle, str | os.PathLike):
+        return load_vehicle(os.fspath(vehicle))
     return vehicle if isinstance(vehicle, Vehicle) else vehicle(rng)
 
 
@@ -141,10 +141,11 @@ def resolved_spec(config: RaceConfig, vehicle: Vehicle) -> PolicySpec:
         ValueError: for an unknown policy or kind of action, or a kind other than the spec's own.
     """
     spec = config.spec or PolicySpec()
-    if isinstance(spec, str):
-        if not locate(spec).exists():
-            raise unknown_name("policy (or folder)", spec, names())
-        spec = load_policy_checkpoint(locate(spec)).spec
+    if not isinstance(spec, PolicySpec):
+        policy = os.fspath(spec)
+        if not locate(policy).exists():
+            raise unknown_name("policy (or folder)", policy, names())
+        spec = load_policy_checkpoint(locate(policy)).spec
     depth = replace(
         spec.depth,
         channel_axis=spec.depth.channel_axis or config.channel_axis,
@@ -180,24 +181,21 @@ class Races:
 
         Raises:
             ValueError: for an unknown track, vehicle, kind of action or reward term, an invalid
-                level, or no slots.
+                level, spec or track_seed, or no slots.
         """
         if slots < 1:
             raise ValueError(f"num_envs is {slots}, allowed is 1 or more")
         levels_of(config)
         check_track_seed(config.track_seed)
-        paths = {key: getattr(config, key) for key in ("track", "vehicle", "spec")}
-        paths = {key: os.fspath(p) for key, p in paths.items() if isinstance(p, os.PathLike)}
-        self.config = config = replace(config, **paths)
-        self.slots = slots
+        self.config, self.slots, self._track = config, slots, os.fspath(config.track)
         for name in config.rewards:
             if name not in REWARDS:
                 raise unknown_name("reward term", name, REWARDS)
         self._file_track: Track | None = None
-        if config.track.endswith(".toml"):
-            self._file_track = load_track(config.track)
+        if self._track.endswith(".toml"):
+            self._file_track = load_track(self._track)
         else:
-            check_family(config.track)
+            check_family(self._track)
         vehicle = self._vehicle = resolved_vehicle(config, np.random.default_rng(0))
         self.spec = resolved_spec(config, vehicle)
         check_flyable(self.spec, vehicle)
@@ -236,13 +234,13 @@ class Races:
             level = lowest if lowest == highest else int(rng.integers(lowest, highest + 1))
             seed = config.track_seed if track_seed is None else track_seed
             seed = int(rng.integers(SEEDS)) if seed is None else int(seed)
-            track = self._file_track or make_track(config.track, level, seed)
+            track = self._file_track or make_track(self._track, level, seed)
             self._tracks = self._tracks or [track] * self.slots
             self._tracks[slot] = track
             self.track_seed[slot], self.level[slot] = seed, level
             self._decision[slot], self._action[slot] = 0, self._first_action
             self._output[slot], self._bad[slot] = 0.0, False
-            name = config.track if self._file_track else track.family
+            name = self._track if self._file_track else track.family
             entries.append((slot, track, TrialSpec(name, level, seed)))
         vehicles = [self._draw_vehicle(rng) for rng in rngs] if callable(config.vehicle) else None
         if entries:
