@@ -252,7 +252,9 @@ class _Slots:
         self._late = np.zeros(slots, bool)
         self._fresh = np.ones(slots, bool)
         self._hidden = policy.start(slots)
-        self._recorder = Recorder(slots, task.record.depth, self._first) if task.record else None
+        self._recorder = None
+        if task.record:
+            self._recorder = Recorder(slots, task.record.depth, self._first, action.kind)
         sensors, self._sensors, self._delays = task.options.sensors, None, None
         self._filtered = None
         if sensors.estimator:

@@ -191,7 +191,7 @@ def check_flight(flight, result):
     assert flight.time_s[-1] == pytest.approx(result.time_s)
     assert np.array_equal(flight.pos_w[-1], [result.pos_x, result.pos_y, result.pos_z])
     assert (flight.gate[-1], flight.about["ended_by"]) == (result.gates_passed, result.ended_by)
-    assert {len(part) for part in flight[:-2]} == {rows}
+    assert {len(part) for part in flight[:-3]} == {rows}
     # 30 decisions a second, the first at once; each has its image.
     assert flight.policy_step[0] and flight.policy_step.sum() == len(flight.depth_m)
     assert abs(flight.policy_step.sum() - 30 * result.time_s) <= 1.5
