@@ -129,6 +129,16 @@ def test_reference_world_flies_the_same(expected):
     assert [r._replace(world="mujoco") for r in found] == [expected[t] for t in trials]
 
 
+def test_a_trial_that_ends_at_its_start_makes_no_decision():
+    for world in ("mujoco", "reference"):
+        ends = fly_on(
+            Pursuit(), straight(wall_at=0.0, name="blocked"), straight(name="free"),
+            vehicle=VEHICLE, world=world, slots=1, workers=1, rules=RULES,
+        )[0]  # fmt: skip
+        found = [(end.ended_by, end.decisions) for end in ends]
+        assert found == [("collision", 0), ("timeout", 15)], world
+
+
 def rows(due, time_s):
     """Rows of two slots without a number twice: 100 a field, 10 a slot, 1 a component."""
     starts = [100.0 * k + np.array([[0.0], [10.0]]) for k in range(8)]
