@@ -195,7 +195,8 @@ def spec_of(contract: Contract, where: str) -> PolicySpec:
     try:
         check_spec(spec, "")
     except ValueError as error:
-        raise PolicyError(f"{where}: {error}") from None
+        text = str(error).replace("hidden_size", "memory[0]")  # its name in a contract
+        raise PolicyError(f"{where}: {text}") from None
     provided = contract_of(spec, contract.memory)
     for name, theirs, ours in _differences(contract, provided):
         raise PolicyError(
