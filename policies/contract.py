@@ -115,14 +115,12 @@ class Contract:
         return to_json(self.to_json())
 
 
-# Kind of action -> names, units, frame and limits.
+# Kind of action -> units, frame and limits.
 _ACTIONS = {
-    "acceleration": (("x", "y", "z"), ("m/s^2",) * 3, f"{BODY}; net, without gravity",
-                     "length up to 50 m/s^2"),
-    "ctbr": (("thrust", "roll_rate", "pitch_rate", "yaw_rate"), ("m/s^2", *("rad/s",) * 3),
-             f"{BODY}; thrust per nominal mass along z", "the vehicle file's"),
-    "motors": (("rotor_1", "rotor_2", "rotor_3", "rotor_4"), ("share of largest {}",) * 4,
-               "rotors in the vehicle file's order", "0 to 1"),
+    "acceleration": (("m/s^2",) * 3, f"{BODY}; net, without gravity", "length up to 50 m/s^2"),
+    "ctbr": (("m/s^2", *("rad/s",) * 3), f"{BODY}; thrust per nominal mass along z",
+             "the vehicle file's"),
+    "motors": (("share of largest {}",) * 4, "rotors in the vehicle file's order", "0 to 1"),
 }  # fmt: skip
 # Optional part of the state -> unit and frame.
 _EXTRAS = {
@@ -147,10 +145,11 @@ def contract_of(spec: PolicySpec, memory: tuple[int, ...] | None = None) -> Cont
         spec.image_shape, "inverse_depth", "uint8" if depth.uint8 else "float32", depth.scale,
         depth.near, camera.range_m, depth.offset, camera.pitch_deg, camera.fov_deg, camera.rays,
     )  # fmt: skip
-    names, units, frame, limit = _ACTIONS[action.kind]
+    units, frame, limit = _ACTIONS[action.kind]
     units = tuple(unit.format(action.motors) for unit in units)
     scale, offset = (_each(numbers, action.size) for numbers in (action.scale, action.offset))
-    output = Action(action.kind, names, units, frame, scale, offset, action.clip, limit)
+    names, clip = ACTIONS[action.kind], action.clip
+    output = Action(action.kind, names, units, frame, scale, offset, clip, limit)
     speed = spec.speed if spec.speed_input else 1.0
     contract = Contract(spec.rate_hz, tuple(state), image, output, memory, speed)
     # Reading it back converts numbers, so that 30 and 30.0 give the same digest.
@@ -196,7 +195,8 @@ def spec_of(contract: Contract, where: str) -> PolicySpec:
     try:
         check_spec(spec, "")
     except ValueError as error:
-        raise PolicyError(f"{where}: {error}") from None
+        text = str(error).replace("hidden_size", "memory[0]")  # its name in a contract
+        raise PolicyError(f"{where}: {text}") from None
     provided = contract_of(spec, contract.memory)
     for name, theirs, ours in _differences(contract, provided):
         raise PolicyError(

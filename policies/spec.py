@@ -24,8 +24,12 @@ EXTRAS = {"second_gate": 3, "gate_axis": 3, "second_axis": 3, "speed_input": 1}
 """Optional parts of the state: key of a spec -> size, in this order."""
 ACTION_SIZE = 3
 """Number of components of an action of kind `acceleration`."""
-ACTIONS = {"acceleration": ACTION_SIZE, "ctbr": 4, "motors": 4}
-"""Kind of action -> number of components; `ActionSpec.kind` explains the kinds."""
+ACTIONS = {
+    "acceleration": ("x", "y", "z"),
+    "ctbr": ("thrust", "roll_rate", "pitch_rate", "yaw_rate"),
+    "motors": ("rotor_1", "rotor_2", "rotor_3", "rotor_4"),
+}
+"""Kind of action -> names of its components; `ActionSpec.kind` explains the kinds."""
 
 CHANNEL_BLOCK = 32
 """The channels of the second and third convolution are multiples of this, so that the C export can
@@ -75,7 +79,7 @@ class ActionSpec:
     @property
     def size(self) -> int:
         """Number of components of an action."""
-        return ACTIONS[self.kind]
+        return len(ACTIONS[self.kind])
 
     @property
     def is_plain(self) -> bool:

@@ -67,7 +67,8 @@ class Filtered:
             corners: largest number of gate corners of a track.
 
         Raises:
-            ValueError: if the sensors file also delays the state.
+            ValueError: if the sensors file also delays the state, or has more frames than physics
+                steps.
         """
         if wanted.ages.state_s:
             raise ValueError(
@@ -75,6 +76,12 @@ class Filtered:
                 "estimator has a delay itself: leave delay.state out"
             )
         settings: FilterSettings = wanted.estimator
+        if settings.frame_hz * dt > 1 + 1e-9:
+            raise ValueError(
+                f"sensors {wanted.name!r}: gate_filter.rate is {settings.frame_hz:g} Hz; allowed "
+                f"is up to the {1 / dt:g} Hz of the physics (the vehicle's controller.frequency): "
+                "lower the rate"
+            )
         self._settings, self._dt, self._camera = settings, dt, camera
         self._imu = {
             name: as_arrays(values)

@@ -132,8 +132,8 @@ def guard_action(
             f"expected real numbers of shape {last_b.shape}: one {limits.action.kind} for each row "
             "of its input. Check the policy's output."
         )
-    largest = np.abs(action).max(1).astype(np.float64)
     finite = np.isfinite(action).all(1)
+    largest = np.where(finite, np.abs(action).max(1), np.nan).astype(np.float64)
     action = np.asarray(limits.action.to_si(action)).astype(np.float64)
     late = np.full(len(action), limits.deadline_s is not None and took_s > limits.deadline_s)
     bad = ~(finite & np.isfinite(action).all(1)) & ~late

@@ -252,7 +252,9 @@ class _Slots:
         self._late = np.zeros(slots, bool)
         self._fresh = np.ones(slots, bool)
         self._hidden = policy.start(slots)
-        self._recorder = Recorder(slots, task.record.depth, self._first) if task.record else None
+        self._recorder = None
+        if task.record:
+            self._recorder = Recorder(slots, task.record.depth, self._first, action.kind)
         sensors, self._sensors, self._delays = task.options.sensors, None, None
         self._filtered = None
         if sensors.estimator:
@@ -269,9 +271,10 @@ class _Slots:
         waiting = list(reversed(share))
         while waiting or (self._index >= 0).any():
             self._fill(waiting)
-            self._decide_and_fly()
-            ended = (self._world.progress.ended != FLYING) | self._late
-            for slot in np.flatnonzero((self._index >= 0) & ended):
+            # A trial that ended at its start, as in a contact, makes no decision.
+            if not self._ended().any():
+                self._decide_and_fly()
+            for slot in np.flatnonzero(self._ended()):
                 index = int(self._index[slot])
                 result = self._result(int(slot))
                 flight = None
@@ -280,6 +283,10 @@ class _Slots:
                     flight = self._recorder.finish(int(slot), about)
                 self._index[slot] = -1
                 yield index, result, flight
+
+    def _ended(self) -> np.ndarray:
+        """Return (N,) bool: slots whose trial has ended."""
+        return (self._index >= 0) & ((self._world.progress.ended != FLYING) | self._late)
 
     def _fill(self, waiting: list[Numbered]) -> None:
         """Start waiting trials in the empty slots."""
@@ -291,7 +298,7 @@ class _Slots:
             self._trial[slot] = trial
             self._decision[slot], self._action_b[slot], self._faults[slot] = 0, self._first, 0
             self._outputs.start(slot)
-            self._fresh[slot] = True
+            self._fresh[slot], self._late[slot] = True, False
             if self._recorder:
                 self._recorder.start(slot)
             track = track_of(self._task.tracks, trial)

@@ -23,17 +23,21 @@ _EMPTY = (
     np.zeros(3),  # rate_cmd_b
     np.zeros(4),  # rotor_speed
     0,  # gate
-    np.zeros(3),  # action
-    False,  # whether the action is new
 )
-"""A row of zeros that gives the columns of an empty flight their shapes; a flight is empty if its
-trial ended at the start."""
+"""A row of zeros that gives the columns of an empty flight their shapes, before the action; a
+flight is empty if its trial ended at the start."""
 
 
 class Recorder:
     """Collects the rows of the flights in N slots, and returns a slot's flight at its end."""
 
-    def __init__(self, slots: int, depth: bool, first: np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        slots: int,
+        depth: bool,
+        first: np.ndarray | None = None,
+        action_kind: str = "acceleration",
+    ) -> None:
         """Make a recorder.
 
         Args:
@@ -41,8 +45,9 @@ class Recorder:
             depth: whether depth images are recorded (3 kB each at 24 x 32 pixels).
             first: (size,) action that is recorded before the first decision; None: an acceleration
                 of zero (3,).
+            action_kind: the policy's kind of action.
         """
-        self._depth = depth
+        self._depth, self._action_kind = depth, action_kind
         self._rows: list[list[tuple[Any, ...]]] = [[] for _ in range(slots)]
         self._images: list[list[np.ndarray]] = [[] for _ in range(slots)]
         self._first = np.zeros(3) if first is None else first
@@ -76,7 +81,7 @@ class Recorder:
 
     def finish(self, slot: int, about: dict[str, Any]) -> Flight:
         """Return the flight in `slot`, with `about` as its metadata."""
-        rows = self._rows[slot] or [_EMPTY]
+        rows = self._rows[slot] or [(*_EMPTY, self._first, False)]
         columns = [np.array(column) for column in zip(*rows, strict=True)]
         if not self._rows[slot]:
             columns = [column[:0] for column in columns]
@@ -99,4 +104,5 @@ class Recorder:
             gate.astype(np.int32),
             images,
             about,
+            self._action_kind,
         )

@@ -32,7 +32,8 @@ class Flight(NamedTuple):
     rotor_speed: np.ndarray
     """(T, 4) rotor speeds in the vehicle file's order [rad/s]."""
     action_b: np.ndarray
-    """(T, 3) the policy's action in use, after the guard [m/s^2]."""
+    """(T, size) the policy's action in use, after the guard, in SI units; 3 accelerations, or the
+    components of `action_kind`."""
     policy_step: np.ndarray
     """(T,) bool: the first row that flies a new action."""
     gate: np.ndarray
@@ -43,3 +44,5 @@ class Flight(NamedTuple):
     """Where the flight comes from: a row of trials.parquet (track, difficulty, seed, policy,
     vehicle, world, ended_by, ...) and how the world steps (integrator, step_s), as plain Python
     values; JSON can hold it."""
+    action_kind: str = "acceleration"
+    """Kind of action of the policy; `policies.spec.ACTIONS` has the names of its components."""

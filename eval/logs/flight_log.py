@@ -18,6 +18,7 @@ from eval.logs.columns import GROUPS, KNOWN, NEEDED, FlightLogError, check_colum
 from eval.logs.files import read_columns, write_columns
 from eval.logs.flight import Flight
 from eval.logs.velocity import velocity_from_position
+from policies.spec import ACTIONS
 from tracks.common.files import to_json
 from tracks.common.provenance import stamp
 from tracks.geometry.rotation import quat_to_rot
@@ -26,6 +27,7 @@ from tracks.input.reading import InputError, parse_json
 SCHEMA = 1
 """Version of the flight log's layout, in the metadata of every file we write."""
 ACTION = ("action_x", "action_y", "action_z")
+"""Columns of an action of kind `acceleration`."""
 QUATERNION_ROUNDING = 1e-12
 """Quaternions closer to unit norm than this are not normalised, so that a log reads back equal."""
 
@@ -133,7 +135,7 @@ class FlightLog:
 
     @property
     def action_b(self) -> np.ndarray | None:
-        """(T, 3) the policy's action in use [m/s^2]; None where the log has none."""
+        """(T, 3) the policy's acceleration in use [m/s^2]; None where the log has none."""
         return self._numbers(ACTION)
 
     @property
@@ -175,7 +177,8 @@ _FIELDS = {
 
 def log_from_flight(flight: Flight, name: str = "flight") -> FlightLog:
     """Return a recorded `flight` as a log, its action, decisions and gates as extra columns."""
-    extra = dict(zip(ACTION, np.asarray(flight.action_b).T, strict=True))
+    names = [f"action_{name}" for name in ACTIONS[flight.action_kind]]
+    extra = dict(zip(names, np.asarray(flight.action_b).T, strict=True))
     extra |= {"policy_step": np.asarray(flight.policy_step), "gate": np.asarray(flight.gate)}
     return FlightLog(
         name,

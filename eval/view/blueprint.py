@@ -29,6 +29,8 @@ class Tab(NamedTuple):
     """(3,) lower corner of the visible region [m]."""
     high_w: np.ndarray
     """(3,) upper corner of the visible region [m]."""
+    action_kind: str
+    """Kind of the policy's action."""
 
 
 def trials_blueprint(tabs: Sequence[Tab], playback_s: tuple[float, float]) -> rrb.Blueprint:
@@ -92,10 +94,11 @@ def _trial_view(tab: Tab) -> rrb.Vertical:
     if tab.has_depth:
         camera = f"{world}/drone/camera"
         side_views.append(rrb.Spatial2DView(origin=camera, name="depth image"))
+    is_acceleration = tab.action_kind == "acceleration"
     plots = {
         "speed": "speed [m/s]",
         "rates": "body rates [rad/s]",
-        "action": "policy's action, body [m/s²]",
+        "action": "policy's action" + (", body [m/s²]" if is_acceleration else ""),
         "thrust": "thrust command [m/s²]",
         "rotors": "rotor speeds [rad/s]",
     }

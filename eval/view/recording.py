@@ -24,6 +24,7 @@ from eval.view import colours
 from eval.view.blueprint import TIMELINE, Tab, trials_blueprint
 from eval.view.solids import flat_normals, join_solids, track_solids
 from eval.worlds.trial import TrialResult
+from policies.spec import ACTIONS
 from tracks.common.files import replacing_file
 from tracks.common.provenance import stamp
 from tracks.geometry.camera import Camera, optical_axis_b
@@ -114,7 +115,7 @@ def _tab(number: int, track: Track, flight: Flight, result: TrialResult, with_po
     if with_policy:
         title = f"{result.policy}, {title}"
     low_w, high_w = points.min(axis=0), points.max(axis=0)
-    return Tab(f"/trial_{number}", title, _has_depth(flight), low_w, high_w)
+    return Tab(f"/trial_{number}", title, _has_depth(flight), low_w, high_w, flight.action_kind)
 
 
 def _playback_span(rollouts: Sequence[Rollout]) -> tuple[float, float]:
@@ -261,7 +262,7 @@ def _log_series(recording: rr.RecordingStream, root: str, flight: Flight) -> Non
     policy_steps = np.asarray(flight.policy_step, dtype=bool)
     axes = list(colours.AXES)
     pale_axes = [tuple(int(part * 0.5 + 127) for part in colour) for colour in axes]
-    grey = [colours.SOLID_EDGE]
+    grey, actions = [colours.SOLID_EDGE], list(ACTIONS[flight.action_kind])
     speed = np.linalg.norm(flight.vel_w, axis=1)
     all_rows = slice(None)
     series = [
@@ -269,7 +270,7 @@ def _log_series(recording: rr.RecordingStream, root: str, flight: Flight) -> Non
         ("thrust/command", flight.thrust_cmd[:, None], all_rows, ["c"], [colours.CRASH]),
         ("rates/measured", flight.rate_b, all_rows, ["x", "y", "z"], axes),
         ("rates/command", flight.rate_cmd_b, all_rows, ["x cmd", "y cmd", "z cmd"], pale_axes),
-        ("action", flight.action_b, policy_steps, ["x", "y", "z"], axes),
+        ("action", flight.action_b, policy_steps, actions, [*axes, *grey][: len(actions)]),
         ("rotors", flight.rotor_speed, all_rows, ["1", "2", "3", "4"], [*axes, *grey]),
     ]
     for name, values, rows, names, colour in series:

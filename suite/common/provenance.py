@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import importlib.metadata as metadata
 import os
 import platform
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import psutil
 
 from tracks.common.files import write_json
+from tracks.common.names import added_entries
 from tracks.common.provenance import stamp
 from tracks.common.work import usable_cores
 from tracks.input.reading import read_json
@@ -53,6 +57,44 @@ def _processor() -> str:
         return platform.processor() or platform.machine()
     names = [line.split(":", 1)[1].strip() for line in text.splitlines() if "model name" in line]
     return names[0] if names else platform.machine()
+
+
+@functools.cache
+def engines() -> dict[str, str | None]:
+    """Return what else affects a result: the processor, versions of packages, and the plugins.
+
+    A plugin is an installed Python package that adds effects, tracks or simulators.
+    """
+    versions = package_versions()
+    names = ("numpy", "scipy", "jax", "jaxlib", "optax", "mujoco", "mujoco-mjx", "torch")
+    return {
+        "processor": machine()["processor"],
+        **{name: versions[name] for name in (*names, "onnxruntime", "rotorpy")},
+        "added": added_digest(),
+    }
+
+
+def added_digest() -> str | None:
+    """Return a digest (16 hex digits) of the plugins' effects, tracks and simulators, if any."""
+    sha256 = hashlib.sha256()
+    entries = added_entries()
+    for entry in entries:
+        sha256.update(f"{entry.group}\0{entry.name}\0{entry.value}\0".encode())
+        for path in _sources(entry.module.partition(".")[0]):
+            sha256.update(path.name.encode() + b"\0" + path.read_bytes())
+    return sha256.hexdigest()[:16] if entries else None
+
+
+def _sources(module: str) -> list[Path]:
+    """Return the source files of a module or a package; none if it is missing."""
+    spec = find_spec(module)
+    if spec is None:
+        return []
+    folders = spec.submodule_search_locations or ()
+    files = [path for folder in folders for path in Path(folder).rglob("*.py")]
+    if not files and spec.origin is not None:
+        files = [Path(spec.origin)]
+    return sorted(path for path in files if path.is_file())
 
 
 def run_record(config: Any, seed: int | None) -> dict[str, Any]:

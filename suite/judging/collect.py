@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from eval.logs.columns import DURATION_MIN
 from suite.common.console import Console
-from suite.common.provenance import refuse_other_run, write_run_record
+from suite.common.provenance import engines, refuse_other_run, write_run_record
 from suite.common.stages import announce
 from suite.judging.flying import (
     Manner,
@@ -84,6 +84,7 @@ def collect(
         "vehicle": trial_set.vehicle,
         "tracks": trial_set.tracks,
         "git_commit": git_commit(),
+        "engines": engines(),
     }
     identity = without_paths(settings)
     # Rows of flights that exist, then of the missing ones.
@@ -235,8 +236,8 @@ def _existing_rows(out: Path, identity: dict[str, Any]) -> dict[TrialSpec, Row]:
         raise ValueError(f"{path}: not a list of flights ({error}); move it away") from error
     if not is_same:
         raise ValueError(
-            f"{path}: was written by another collection or another version of the code; give "
-            "another --out or move it away"
+            f"{path}: was written by another collection, another version of the code or of a "
+            "package, or on another processor; give another --out or move it away"
         )
     return {
         trial: row

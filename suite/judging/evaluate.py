@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from suite.common.console import Console
-from suite.common.provenance import refuse_other_run, write_run_record
+from suite.common.provenance import engines, refuse_other_run, write_run_record
 from suite.common.stages import announce
 from suite.judging.flying import (
     Manner,
@@ -237,6 +237,7 @@ def _open_journals(
     for path, entry in sorted(pairs, key=lambda pair: not pair[0].exists()):
         settings = {
             **stamp(1, None),
+            "engines": engines(),
             "policy": policy_record(entry.source, entry.policy),
             "speed": entry.manner.speed,
             "vehicle": trial_set.vehicle,

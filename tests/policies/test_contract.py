@@ -49,6 +49,7 @@ def test_the_digest_is_one_for_one_meaning():
         (("action", "unit"), ["g"] * 3, "action.unit"),
         (("image", "encoding"), "depth", "image.encoding is 'depth'"),
         (("image", "near_m"), 20.0, "depth.near is 20 m"),
+        (("memory",), [5000], r"here: memory\[0\] is 5000"),
         (("action", "kind"), "velocity", "unknown kind of action 'velocity'"),
     ],
 )

@@ -50,7 +50,7 @@ def convex_parts(path: Path) -> list[np.ndarray]:
     """Return the connected parts of a mesh file, each as triangles (M, 3, 3) in file units.
 
     Objects of an OBJ file or a scene are split one by one, so they may touch. Triangles
-    without an area are left out, since they have no normal.
+    without an area are left out, since they have no normal. Normals point outwards.
 
     Raises:
         ValueError: where the file cannot be read, or a part is open or not convex, naming the file
@@ -90,8 +90,10 @@ def convex_parts(path: Path) -> list[np.ndarray]:
 
 
 def _triangles_with_area(part: trimesh.Trimesh) -> np.ndarray:
+    """Return triangles (M, 3, 3), with counterclockwise corners as seen from outside."""
     least_area = _SLIVER * float(part.extents.max()) ** 2
-    return np.asarray(part.triangles, float)[part.area_faces > least_area]
+    triangles = np.asarray(part.triangles, float)[part.area_faces > least_area]
+    return triangles[:, ::-1] if part.volume < 0.0 else triangles
 
 
 def thickness(triangles: np.ndarray) -> float:

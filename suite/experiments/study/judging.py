@@ -25,8 +25,9 @@ from eval.worlds.trial import TrialResult, TrialSpec
 from policies.policy import Policy, load_policy
 from policies.spec import NeedsTrust, PolicyError
 from suite.common.console import Console
+from suite.common.provenance import engines
 from suite.common.stages import announce
-from suite.experiments.study.cache import FLIES, Workspace, code_digest, digest, engines
+from suite.experiments.study.cache import FLIES, Workspace, code_digest, digest
 from suite.judging.content import PolicyContent, policy_digest
 from suite.judging.flying import (
     TRIALS_A_PROCESS,

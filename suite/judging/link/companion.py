@@ -79,8 +79,10 @@ class Companion:
             PolicyError: for a policy that commands motors.
         """
         self._policy, self._vehicle, self._wire, self._clock = policy, vehicle, wire, clock
-        self._limits, self._kind = limits or Limits(), policy.spec.action.kind
-        if self._kind == "motors":
+        self._limits = limits or Limits()
+        self.action_kind = policy.spec.action.kind
+        """The policy's kind of action, `acceleration` or `ctbr`."""
+        if self.action_kind == "motors":
             raise PolicyError(
                 f"{policy.name}: commands motors, but a link carries body rates and thrust; fly a "
                 "policy with actions of kind acceleration or ctbr"
@@ -239,7 +241,7 @@ class Companion:
         to_gate_w = self._gates.center_w[None, self.gate] - state.pos_w
         self._heading_w = blend_heading(self._heading_w, to_gate_w, since_s)
         command = unpack_command(self._action_b)
-        if self._kind == "acceleration":
+        if self.action_kind == "acceleration":
             force_w = action_to_force(self._action_b, rot_w)
             command = attitude_command(self._vehicle.controller, force_w, rot_w, self._heading_w)
         thrust, rate_b = float(command.thrust[0]), command.rate_b[0]
@@ -324,7 +326,7 @@ class Row(NamedTuple):
     rate_b: np.ndarray
     """(3,) wanted body rates [rad/s]."""
     action_b: np.ndarray
-    """(3,) the policy's current action [m/s^2]."""
+    """(size,) the policy's current action, in SI units."""
     decided: bool
     """Whether the policy decided on this state."""
     gate: int

@@ -255,5 +255,6 @@ def log_of(companion: Companion, about: dict[str, Any]) -> FlightLog | None:
         gate=np.array([row.gate for row in rows], np.int32),
         depth_m=None,
         about={**about, "events": companion.events, "handed_over": companion.over},
+        action_kind=companion.action_kind,
     )
     return log_from_flight(flight)

@@ -8,7 +8,9 @@ import pytest
 
 from eval.effects.interface import GRAVITY
 from eval.judging.guard import ActionLimits, first_action, guard_action, limits_of
+from eval.judging.judge import Record
 from eval.judging.outputs import action_report, notes_of, probable_faults
+from eval.logs.flight_log import log_from_flight, read_flight, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules
 from policies.block_policy import BlockPolicy
@@ -51,6 +53,22 @@ def climbing(kind):
     action = ActionSpec(kind)
     more = [0.5, 0.3, 0.2, 0.0] if kind == "ctbr" else [0.05] * 4
     return Steady(tuple(first_action(action, VEHICLE) + more), PolicySpec(action=action))
+
+
+@pytest.mark.parametrize(
+    ("kind", "second"), [("ctbr", "action_roll_rate"), ("motors", "action_rotor_2")]
+)
+def test_flights_of_other_kinds_of_action_become_logs(kind, second, tmp_path):
+    how = {"vehicle": VEHICLE, "slots": 1, "workers": 1, "record": Record()}
+    for limit_s in (0.0, 1.2):
+        how["rules"] = Rules(time_limit_s=limit_s)
+        (flight,) = fly_on(climbing(kind), straight(height=30.0), **how)[1]
+        log = log_from_flight(flight)
+    log = read_flight(write_flight(tmp_path / "a.parquet", log))
+    assert (log.extra[second] == flight.action_b[:, 1]).all() and (log.extra[second] > 0).any()
+    assert (
+        log.action_b is None and log.whole.all() and (log.thrust_cmd is None) == (kind == "motors")
+    )
 
 
 @pytest.mark.parametrize("kind", ["ctbr", "motors"])

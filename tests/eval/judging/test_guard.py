@@ -31,6 +31,7 @@ def test_each_fault():
     )
     assert found.bad.tolist() == [False, True, False, True]
     assert found.limited.tolist() == [False, False, True, False]
+    np.testing.assert_array_equal(found.largest, [4.0, np.nan, 40.0, np.nan])
     assert not found.late.any()
 
 

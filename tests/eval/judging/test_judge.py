@@ -129,6 +129,16 @@ def test_reference_world_flies_the_same(expected):
     assert [r._replace(world="mujoco") for r in found] == [expected[t] for t in trials]
 
 
+def test_a_trial_that_ends_at_its_start_makes_no_decision():
+    for world in ("mujoco", "reference"):
+        ends = fly_on(
+            Pursuit(), straight(wall_at=0.0, name="blocked"), straight(name="free"),
+            vehicle=VEHICLE, world=world, slots=1, workers=1, rules=RULES,
+        )[0]  # fmt: skip
+        found = [(end.ended_by, end.decisions) for end in ends]
+        assert found == [("collision", 0), ("timeout", 15)], world
+
+
 def rows(due, time_s):
     """Rows of two slots without a number twice: 100 a field, 10 a slot, 1 a component."""
     starts = [100.0 * k + np.array([[0.0], [10.0]]) for k in range(8)]
@@ -191,7 +201,7 @@ def check_flight(flight, result):
     assert flight.time_s[-1] == pytest.approx(result.time_s)
     assert np.array_equal(flight.pos_w[-1], [result.pos_x, result.pos_y, result.pos_z])
     assert (flight.gate[-1], flight.about["ended_by"]) == (result.gates_passed, result.ended_by)
-    assert {len(part) for part in flight[:-2]} == {rows}
+    assert {len(part) for part in flight[:-3]} == {rows}
     # 30 decisions a second, the first at once; each has its image.
     assert flight.policy_step[0] and flight.policy_step.sum() == len(flight.depth_m)
     assert abs(flight.policy_step.sum() - 30 * result.time_s) <= 1.5

@@ -203,3 +203,8 @@ def test_what_has_no_estimator_refuses_it(monkeypatch):
     late = sensor_set({**models, "delay": {"state": 0.02}})
     with pytest.raises(ValueError, match=r"delay.state is 0.02 s, but the estimator"):
         filtered_flights(late, TWO_TRACKS[:1], monkeypatch)
+    Filtered(filtering(rate=500.0), 1, 1 / 500, SPEC.camera, 4)
+    with pytest.raises(
+        ValueError, match=r"gate_filter.rate is 500 Hz; allowed is up to the 200 Hz"
+    ):
+        Filtered(filtering(rate=500.0), 1, 1 / 200, SPEC.camera, 4)

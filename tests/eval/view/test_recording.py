@@ -14,9 +14,12 @@ from tracks.geometry.camera import Camera, pixel_rays_b
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A recording of a flight that finished and of one that collided, and its columns."""
+    """A recording of a flight that finished and of one that collided (ctbr), and its columns."""
     path = tmp_path_factory.mktemp("rrd") / "two.rrd"
-    assert write_recording(path, [rollout(), rollout("collision", 1.5, False)]) == path
+    track, flight, result = rollout("collision", 1.5, False)
+    action = np.column_stack([flight.thrust_cmd, flight.rate_cmd_b])
+    flight = flight._replace(action_b=action, action_kind="ctbr")
+    assert write_recording(path, [rollout(), (track, flight, result)]) == path
     assert [p.name for p in path.parent.iterdir()] == ["two.rrd"]
     return path, columns(path)
 
@@ -44,6 +47,8 @@ def test_a_recording_holds_every_row_of_the_flight(recorded):
     np.testing.assert_array_equal(scalars, flight.action_b[step])
     for entity in ("speed", "rates/measured", "rotors"):
         assert found[f"/trial_0/{entity}", "SeriesLines:names"][0] is None
+    names = [found[f"/trial_{k}/action", "SeriesLines:names"][1][0] for k in (0, 1)]
+    assert names == [["x", "y", "z"], ["thrust", "roll_rate", "pitch_rate", "yaw_rate"]]
 
 
 def test_a_recording_moves_the_drone_as_it_flew(recorded):
@@ -138,6 +143,8 @@ def test_a_recording_opens_laid_out(recorded):
         by_name[name].append(values[0][0])
     kinds = by_name["ViewBlueprint:class_identifier"]
     # Two trials: two 3D views each, five plots, the events; only the first one saw depth images.
+    titles = {"policy's action, body [m/s²]", "policy's action"}
+    assert titles <= set(by_name["ViewBlueprint:display_name"])
     counts = {kind: kinds.count(kind) for kind in set(kinds)}
     assert counts == {"3D": 4, "2D": 1, "TimeSeries": 10, "TextLog": 2}
     origins = set(by_name["ViewBlueprint:space_origin"])

@@ -54,6 +54,9 @@ def test_flights_of_another_course_or_code_are_not_taken_for_its_own(
     with monkeypatch.context() as patch:
         patch.setattr(suite.judging.collect, "git_commit", lambda: "another")
         assert "another version of the code" in refused(capfd, *args)
+    with monkeypatch.context() as patch:
+        patch.setattr(suite.judging.collect, "engines", lambda: {"numpy": "another"}, False)
+        assert "or of a package" in refused(capfd, *args)
     track.write_text(COURSE.replace("1.0", "1.1"))
     assert "another collection" in refused(capfd, *args)
 

@@ -7,6 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import eval.judging.judge
+import suite.judging.evaluate
 from eval.judging.results import read_trials
 from suite.common.console import Console
 from suite.judging.flying import Manner, load_in_manner, policy_for_workers
@@ -78,6 +79,9 @@ def test_an_interrupted_eval_goes_on_to_the_same_result(pilots, tmp_path, monkey
     flown = interrupt_after(monkeypatch, 1)
     assert evaluate(again, *asked) == 130
     assert not (again / "trials.parquet").exists()
+    with monkeypatch.context() as patch:
+        patch.setattr(suite.judging.evaluate, "engines", lambda: {"numpy": "another"}, False)
+        assert evaluate(again, *asked) == 2 and len(flown) == 1
     assert evaluate(again, *asked) == 0
     assert len(flown) == len(set(flown)) == 2, "no trial is flown twice"
     assert "1 trials were flown before" in printed(capfd)

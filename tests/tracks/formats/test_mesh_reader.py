@@ -32,6 +32,15 @@ def test_materials_are_left_alone(tmp_path, monkeypatch, side):
     assert [part.shape for part in parts] == [(12, 3, 3)]
 
 
+def test_a_part_wound_inwards_is_turned_outwards(tmp_path):
+    box = trimesh.creation.box((1, 1, 1))
+    for _ in range(2):
+        box.export(tmp_path / "it.stl")
+        ((part,),) = load_convex_parts([tmp_path / "it.stl"])
+        assert trimesh.triangles.mass_properties(part).volume == pytest.approx(1.0)
+        box.invert()
+
+
 def test_archives_and_other_kinds_are_refused_unread(tmp_path):
     for ending in ("zip", "tar.gz", "3mf", "bz2", "dae", "mtl", ""):
         path = tmp_path / f"it.{ending}"

@@ -11,8 +11,9 @@ from eval.effects.interface import bound_value
 from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
 from eval.sensors.sensors_file import PERFECT, sensor_set
 from suite.common import curve
+from suite.common.provenance import added_digest
 from suite.experiments.study import cache
-from suite.experiments.study.cache import added_digest, code_digest, digest
+from suite.experiments.study.cache import code_digest, digest
 from suite.experiments.study.conditions import effect_conditions, sweep_conditions, sweeps
 from suite.experiments.study.training import Setting, Study, UnseenWorlds, read_measurements
 from suite.train.recipes import named_recipe

@@ -5,9 +5,9 @@ import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialSpec
-from policies.spec import NoAnswer, PolicySpec
+from policies.spec import ActionSpec, NoAnswer, PolicySpec
 from suite.common.console import Console
-from suite.judging.link.flights import write_log
+from suite.judging.link.flights import log_of, write_log
 from suite.judging.link.messages import OperatorText, SetPoint, State, Wire, dialect
 from suite.judging.link.watchdog import Limits, jump_fault
 from tests.support.pilots import Steady
@@ -255,3 +255,10 @@ def test_a_state_may_lie_half_a_metre_off_where_its_speed_leads():
     for off_m, jumped in ((0.45, False), (0.55, True)):
         state = State(1.1, np.array([0.3 + off_m, 0.0, 0.0]), level, vel_w, still)
         assert (jump_fault(last, state, Limits()) is not None) == jumped
+
+
+def test_a_flight_of_thrust_and_rates_becomes_a_log(bench):
+    hover = Steady((9.81, 0.0, 0.0, 0.0), PolicySpec(action=ActionSpec("ctbr")))
+    log = log_of(bench(hover).fly().companion, {})
+    assert log is not None and log.action_b is None
+    np.testing.assert_allclose(log.extra["action_thrust"], 9.81, rtol=1e-6)
