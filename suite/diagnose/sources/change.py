@@ -48,6 +48,7 @@ class MeansSource(ViewSource):
     """The reference flights."""
     reason = NO_AGREEMENT
     block = 1  # means of flights are independent
+    window = "means of whole flights"
 
     def _within(self, residual: np.ndarray, flight: np.ndarray) -> np.ndarray:
         """Return the means, from which nothing is subtracted."""
@@ -148,7 +149,6 @@ def since_reference(
     shared |= {
         "measure": MEASURE.format(about=shared["about"], unit=shared["unit"]),
         "floor": _spread_of_means(reference, start.theta),
-        "window": "means of whole flights",
     }
     return MeansSource(
         candidates=view_candidates(allowed, weighed[1]),

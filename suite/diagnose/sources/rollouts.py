@@ -158,7 +158,6 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
         unit="times the noise",
         measure=MEASURE,
         horizon_s=LENGTH_S,
-        window=f"stretches of {LENGTH_S:g} s",
         weighed=rollout_evidence(model, fitted, take(linear, is_fitted), limits),
         start=start_estimate(model, fitted),
         candidates=[*single, *composites(single)],

@@ -99,8 +99,6 @@ class Source(ABC):
     """For people: definition of the gap."""
     horizon_s: float
     """Length of the windows over which the gap is measured [s]."""
-    window: str
-    """For people: the windows over which the gap is measured."""
     weighed: tuple[Evidence, Block]
     """The fitted flights with the weights of their residuals, and the linearisation of these
     residuals, both at the start of the search."""
@@ -122,6 +120,11 @@ class Source(ABC):
     def space(self) -> ParameterSpace:
         """The catalogue's parameters."""
         return self.weighed[0].space
+
+    @property
+    def window(self) -> str:
+        """For people: the windows over which the gap is measured."""
+        return f"windows of {self.horizon_s:g} s"
 
     @abstractmethod
     def gap(self, found: SearchResult, theta: np.ndarray) -> Gap:

@@ -124,6 +124,5 @@ def _descriptions(view: View) -> dict[str, Any]:
     measure = MEASURE.format(**about, width=view.width_s)
     return {
         **about, "name": view.name, "view": view, "horizon_s": view.width_s, "measure": measure,
-        "window": f"means of {view.width_s:g} s",
         "subject": f"error of the {view.name}",
     }  # fmt: skip
