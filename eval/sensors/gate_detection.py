@@ -67,18 +67,20 @@ def sense(
     map_w = xp.stack([seen.gate_w, seen.second_w], axis=-2)
     axes_w = xp.stack([seen.axis_w, seen.second_axis_w], axis=-2)
     true_w = xp.stack([truth.gate_w, truth.second_w], axis=-2)
-    # When a gate is passed, the second one becomes the next, with its stored estimate.
+    # When a gate is passed, the second one becomes the next, with its stored estimate and gap.
     passed = column(truth.gate_number > memory["number"])
     next_w = xp.concatenate([memory["gates_w"][..., 1:, :], map_w[..., 1:, :]], axis=-2)
-    next_held = xp.concatenate([memory["held"][..., 1:], memory["held"][..., 1:] & False], axis=-1)
+    held, missed = (
+        xp.where(passed, xp.concatenate([flag[..., 1:], flag[..., 1:] & False], axis=-1), flag)
+        for flag in (memory["held"], memory["missed"])
+    )
     stored_w = xp.where(column(passed), next_w, memory["gates_w"])
-    held = xp.where(passed, next_held, memory["held"])  # whether a gate has an estimate
-    stored_w = xp.where(column(held), stored_w, map_w)
+    stored_w = xp.where(column(held), stored_w, map_w)  # without an estimate, the map
 
     # Detect gates in view, and measure their positions with the errors of PnP.
     gates_b = to_local(truth.rot_w[..., None, :, :], true_w - truth.pos_w[..., None, :])
     share, gap_s = column(values.missed), column(values.length)
-    missed = markov_step(memory["missed"], draws.uniform, share, gap_s, moment.dt_s)
+    missed = markov_step(missed, xp.asarray(draws.uniform), share, gap_s, moment.dt_s)
     detected = in_view(gates_b, moment.camera) & ~missed
     range_m = xp.sqrt((gates_b**2).sum(-1) + 1e-6)
     across, along, tilt = spreads(values, range_m, moment.camera)

@@ -150,19 +150,22 @@ EXPOSURE = _fault(
 
 
 def frame_loss_start(values: Fault, moment: Moment) -> dict[str, Any]:
-    """Return the state at the start: no image is lost, and the last one is the true image."""
-    return {"lost": starts_absent(values, moment), "shown_m": moment.truth.depth_m}
+    """Return the state at the start: no image is lost, and there is no last one."""
+    absent = starts_absent(values, moment)
+    return {"lost": absent, "shown_m": moment.truth.depth_m, "has_image": absent}
 
 
 def frame_loss_sense(
     values: Fault, memory: dict[str, Any], seen: View, moment: Moment
 ) -> tuple[View, dict[str, Any]]:
-    """Return the view with the last image that was not lost."""
+    """Return the view with the last image that was not lost; the first one is never lost."""
     xp = seen.depth_m.__array_namespace__()
     chance = moment.draws.uniform[..., 0]
     lost = markov_step(memory["lost"], chance, values.share, values.length, moment.dt_s)
-    shown_m = xp.where(over_image(lost), memory["shown_m"], seen.depth_m)
-    return seen._replace(depth_m=shown_m), {"lost": lost, "shown_m": shown_m}
+    repeated = over_image(lost & memory["has_image"])
+    shown_m = xp.where(repeated, memory["shown_m"], seen.depth_m)
+    memory = {"lost": lost, "shown_m": shown_m, "has_image": memory["has_image"] | True}
+    return seen._replace(depth_m=shown_m), memory
 
 
 FRAME_LOSS = _fault(

@@ -199,6 +199,15 @@ def test_a_gate_that_is_not_found_stays_where_it_was_last_seen():
     assert np.array_equal(unseen.gate_w, behind.gate_w), "behind the camera there is the map alone"
 
 
+def test_a_gap_in_detections_stays_with_its_gate_when_the_one_before_is_passed():
+    values = as_arrays(SENSORS["gate_detection"].values(0.0, 0.5, 10.0, 0.5, 0.1, 0.0))
+    sensor = SENSORS["gate_detection"]
+    memory = sensor.start(values, Moment(view(), draws_of(sensor.trial), DT_S, CAMERA))
+    memory = memory | {"missed": np.array([[False, True]])}
+    same = Moment(view(number=1), draws_of(sensor.observation, uniform=0.5), DT_S, CAMERA)
+    assert sensor.sense(values, memory, same.truth, same)[1]["missed"].tolist() == [[True, False]]
+
+
 def test_the_wrong_gate_is_the_second():
     shown = seen_through("wrong_gate", {"share": 0.5}, [view()], uniform=0.0)[0]
     assert np.array_equal(shown.gate_w, view().second_w)
@@ -241,6 +250,12 @@ def test_blind_and_lost_images():
         assert (lost[0].depth_m == first).all() and (lost[1].depth_m == second).all(), name
         came = seen_through(name, {"share": 0.5}, views, uniform=1.0)
         assert (came[1].depth_m == 4.0).all(), name
+    # A first image that is lost has no image before it: it has the errors of the other models.
+    sensor, blind = SENSORS["frame_loss"], view(depth=10.0)
+    values = as_arrays(sensor.values(0.95, 0.0))
+    first = Moment(view(), draws_of(sensor.observation, uniform=0.5), DT_S, CAMERA)
+    memory = sensor.start(values, first)
+    assert (sensor.sense(values, memory, blind, first)[0].depth_m == 10.0).all()
 
 
 def test_turning_moves_an_image_row_by_row_and_blurs_it():
