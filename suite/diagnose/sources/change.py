@@ -71,13 +71,11 @@ class MeansSource(ViewSource):
         The axis is the one along which the named effects change the means most.
         """
         start, end = found.start.theta, found.estimate.theta
-        earlier = self.reference.residuals(start)
-        earlier_means = means_of(earlier.residual, earlier.flight)
-        earlier_means -= earlier_means.mean(axis=0)
+        earlier = _deviations(self.reference, start)
         change, left = (self.held.residuals(theta).residual for theta in (start, end))
         size = np.abs(change - left if found.named else change).mean(axis=0)
         axis = max(self.view.axes, key=lambda k: float(size[k]))
-        count, zeros = len(earlier_means), np.zeros(len(earlier_means) + len(change))
+        count, zeros = len(earlier), np.zeros(len(earlier) + len(change))
         lines = {"simulated as given": zeros}
         if found.named:
             named = zeros.copy()
@@ -86,7 +84,7 @@ class MeansSource(ViewSource):
         quantity = QUANTITIES.get(self.name, self.name)
         return Series(
             1.0 + np.arange(len(zeros)),
-            np.concatenate([earlier_means, change])[:, axis],
+            np.concatenate([earlier, change])[:, axis],
             lines,
             f"Change of the mean {quantity} along body {'xyz'[axis]} [{self.unit}]",
             f"Each point is the mean of a flight, less the mean of the {count} reference flights: "
@@ -163,9 +161,15 @@ def _spread_of_means(reference: ViewEvidence, theta: np.ndarray) -> np.ndarray:
 
     It is that of a flight of an unchanged vehicle, by axis. `theta` (P,) are the parameters.
     """
+    deviations = _deviations(reference, theta)
+    return deviations.std(axis=0, ddof=1) * np.sqrt(1.0 + 1.0 / len(deviations))
+
+
+def _deviations(reference: ViewEvidence, theta: np.ndarray) -> np.ndarray:
+    """Return the mean residual (F, 3) of each of F flights, less that of all flights."""
     data = reference.residuals(theta)
     means = means_of(data.residual, data.flight)
-    return means.std(axis=0, ddof=1) * np.sqrt(1.0 + 1.0 / len(means))
+    return means - means.mean(axis=0)
 
 
 def references_of(
