@@ -139,6 +139,20 @@ def smooth(time_s: np.ndarray, value: np.ndarray, width_s: float) -> np.ndarray:
     return np.where(enough, (sums[stop] - sums[first]) / np.maximum(inside, 1), np.nan)
 
 
+def forward_mean(value: np.ndarray, count: int) -> np.ndarray:
+    """Return the mean (T - count + 1, C) of `count` rows of `value` (T, C) from each row on.
+
+    It is NaN where one of these rows is missing.
+    """
+    known = np.isfinite(value)
+    sums, knowns = (
+        np.concatenate([np.zeros((1, value.shape[1])), np.cumsum(part, axis=0)])
+        for part in (np.where(known, value, 0.0), known)
+    )
+    complete = knowns[count:] - knowns[:-count] == count
+    return np.where(complete, (sums[count:] - sums[:-count]) / count, np.nan)
+
+
 def shift_rows(values: np.ndarray, count: int) -> np.ndarray:
     """Return `values` (T, C) moved to `count` rows later; NaN before the first."""
     moved = np.full_like(values, np.nan)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import rotate
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import Rows
 from eval.logs.faults.reading import option
+from eval.logs.faults.relation import forward_mean
 from eval.logs.velocity import velocity_from_position
 
 LEAST_V, MOST_V = 2.5, 70.0
@@ -67,7 +67,7 @@ def check_accelerometer_bias(rows: Rows) -> list[Finding]:
     count = max(1, round(SPAN_S / float(np.median(np.diff(time_s)))))
     if len(time_s) <= count:
         return []
-    acc_up, power = sliding_window_view(both, count, axis=0).mean(axis=-1)[1:].T
+    acc_up, power = forward_mean(both, count)[1:].T
     error_up = acc_up - (vel[count:, 2] - vel[:-count, 2]) / (time_s[count:] - time_s[:-count])
     good = np.isfinite(error_up) & np.isfinite(power)
     if good.sum() < 5 * count or min(np.std(power[good]), np.std(error_up[good])) < 1e-6:

@@ -10,14 +10,13 @@ from collections.abc import Mapping
 from itertools import permutations
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import conjugate, rotate
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import WIDTH_S, Rows
 from eval.logs.faults.reading import option
-from eval.logs.faults.relation import rms, smooth
+from eval.logs.faults.relation import forward_mean, rms, smooth
 from eval.logs.velocity import velocity_from_position
 from eval.vehicles.vehicle import Vehicle, motor_thrust
 
@@ -164,7 +163,7 @@ def _torques(
     if size < CALM_TURN:
         return f"turns change by {size:.2g} rad/s^2 only, too little to check their order by"
     # Mean thrust over the same time, with the delay that correlates best.
-    mean = sliding_window_view(thrust, count, axis=0).mean(axis=-1)[:-1]
+    mean = forward_mean(thrust, count)[:-1]
     step = float(np.median(np.diff(time_s)))
     delayed_means = [np.roll(mean, round(lag / step), axis=0) for lag in LAGS_S]
     mean = max(
