@@ -10,6 +10,7 @@ consists of rollouts, which start from measured states; lines break between them
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,7 +28,7 @@ SCHEMA = 1
 MEASURED = (29, 36, 48)
 """Colour of the measured flight, 0-255."""
 SIMULATED = ((224, 137, 43), (36, 99, 201), (122, 92, 184))
-"""Colours of the simulations, in order."""
+"""Colours of the simulations, in order; a fourth one has the first colour again."""
 ERRORS = {"position": "m", "velocity": "m/s", "attitude": "deg", "rates": "rad/s"}
 """Part of the state -> unit of its error."""
 SERIES = tuple(f"{group}_{axis}" for group in ("velocity", "rates") for axis in "xyz")
@@ -112,7 +113,7 @@ def _log_flight(
     recording.log(world, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     _log_drone(recording, f"{world}/measured", [flight.measured], MEASURED, half_size, "measured")
     _log_series(recording, root, "measured", flight.measured, MEASURED, 2.0)
-    for simulation, colour in zip(flight.simulations, SIMULATED, strict=False):
+    for simulation, colour in zip(flight.simulations, cycle(SIMULATED), strict=False):
         label = rr.escape_entity_path_part(simulation.label)
         entity = f"{world}/{label}"
         _log_drone(recording, entity, simulation.rollouts, colour, half_size, simulation.label)

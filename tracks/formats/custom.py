@@ -40,6 +40,8 @@ _RESERVED = (
 """Names that other geoms of the suite's MuJoCo models have."""
 _ROUNDING = 0.01
 """Share by which a mesh may be thinner than `LEAST_M`, because of rounding."""
+_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Rotation from the axes of a mesh file with y up to axes with z up; x stays."""
 _SINGULAR = {"boxes": "box", "meshes": "mesh"}
 """Singular of the keys that do not end in a plain s."""
 
@@ -309,6 +311,9 @@ def _meshes(top: Table, names: _Names) -> tuple[list[np.ndarray], list[str]]:
         file = top.path.parent / table.text("file")
         position, rot = _place(table, "position", (0.0, 0.0, 0.0)), rotation(table)
         scale = table.number("scale", 1.0, least=1e-6, most=1e6)
+        is_gltf = file.suffix.lower() in (".glb", ".gltf")  # y is up in the glTF standard
+        if table.choice("up", ("y", "z") if is_gltf else ("z", "y")) == "y":
+            rot = rot @ _Y_UP
         placed.append((table, file, position, rot, scale, names(table, "meshes", number)))
         table.close()
     meshes, labels = [], []

@@ -151,6 +151,21 @@ def test_meshes_come_from_any_common_file(tmp_path, suffix):
     )
 
 
+@pytest.mark.parametrize(
+    ("suffix", "key", "sides"),
+    [("glb", "", [1, 3, 2]), ("glb", 'up = "z"', [1, 2, 3]), ("obj", 'up = "y"', [1, 3, 2])],
+)
+def test_a_mesh_with_y_up_is_turned(tmp_path, suffix, key, sides):
+    box = trimesh.creation.box((1, 2, 3))
+    box.apply_translation([0, 0, -9])  # z of the file is -y of the world
+    box.export(tmp_path / f"box.{suffix}")
+    text = GATE + f'[[meshes]]\nfile = "box.{suffix}"\nposition = [0, 0, 20]\n{key}\n'
+    corners = load_track(write(tmp_path, text)).scene.triangles.reshape(-1, 3)
+    center = [0, 0, 11] if "z" in key else [0, 9, 20]
+    assert np.allclose(np.ptp(corners, axis=0), sides)
+    assert np.allclose((corners.min(0) + corners.max(0)) / 2, center)
+
+
 def test_parts_that_touch_are_objects_of_their_own(tmp_path):
     """As a decomposition into convex parts writes them."""
     left, right = trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, 2, 1))
