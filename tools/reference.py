@@ -175,9 +175,12 @@ def catalogue(page: str, entries: Iterable[Any]) -> str:
             about = cell(_meaning(entry, parameter.name))
             # The nine axes of `measured_state` differ in their names only.
             name = re.sub(r"_[xyz](?=_|$)", "_AXIS", parameter.name)
-            shown = f"`{name}` [{parameter.unit}]"
-            rows[name] = f"| {shown} | {about} | {usual} | {low:g} to {high:g} |"
-        parts.append("| parameter | meaning | usual size | allowed |\n|---|---|---|---|")
+            default = f"{bound_value(parameter.neutral, vehicle):g}"
+            default = "required" if getattr(parameter, "required", False) else default
+            cells = (f"`{name}` [{parameter.unit}]", about, usual, f"{low:g} to {high:g}", default)
+            rows[name] = f"| {' | '.join(cells)} |"
+        heads = "| parameter | meaning | usual size | allowed | if left out |"
+        parts.append(f"{heads}\n|---|---|---|---|---|")
         parts.append("\n".join(rows.values()) + f"\n\nSource: {entry.source}.\n")
     return "\n".join(parts)
 

@@ -67,5 +67,5 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         result["findings"] = [*answer["findings"], *result["findings"]]
         answer |= result
     if not any(finding["status"] in ("doubt", "corrected") for finding in answer["findings"]):
-        console.say("nothing to report")
+        console.say("no fault found")
     return answer

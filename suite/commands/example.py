@@ -32,6 +32,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     config.out.mkdir(parents=True, exist_ok=True)
     contents = real_files() if config.real else _simulated_files()
     for name, content in contents.items():
+        # The commands of the README read the files of this folder.
+        content = content.replace(b"FOLDER", str(config.out).encode()) if ".md" in name else content
         with replacing_file(config.out / name) as new:
             new.write_bytes(content)
     names = sorted(contents)

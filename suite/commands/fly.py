@@ -59,6 +59,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             f"--link {config.link}: set points would move a vehicle; read docs/fly.md, do its "
             "checks, then add --confirm"
         )
+    if config.link and config.flown.time_limit_s != Flights().time_limit_s:
+        raise ValueError(
+            "--time-limit-s ends simulated flights only; leave it out with --link: a real flight "
+            "ends at the last gate, at a limit of docs/fly.md, or with Ctrl-C"
+        )
     if config.signing_key and not config.link:
         raise ValueError("--signing-key needs --link: only a real link is signed")
     return fly_over_link(

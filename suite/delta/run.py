@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from eval.logs.faults.check import kept_lines
 from eval.logs.flight_log import FlightLog, read_flights
 from policies.formats.checkpoint import save_arrays
 from policies.formats.policy_file import DELTA
@@ -125,7 +126,7 @@ def fit_delta(
     # Read the flights, and hold some of them out.
     logs, warnings = read_flights(flight_files(paths))
     logs, short = long_enough(logs, config.horizon_s)
-    for warning in [*warnings, *short]:
+    for warning in [*warnings, *short, *kept_lines(logs)]:
         console.note(f"warning: {warning}")
     groups = split(logs, config.held_out, config.seed)
     description = describe_dynamics(dynamics)

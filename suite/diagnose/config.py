@@ -27,8 +27,8 @@ class Config(Command):
     out: Path = Path("runs/diagnosis")
     """Folder for diagnosis.json, vehicle.toml, report.html and recording.rrd."""
     drive: Advanced[Literal["auto", "commands", "motors"]] = "auto"
-    """Input of the model: logged commands or measured rotor speeds. auto takes measured speeds
-    where real logs have them."""
+    """Input of the model: logged commands or measured rotor speeds. auto takes the
+    commands, but measured speeds where the rate loop does not reproduce them or is a firmware's."""
     integrator: Advanced[Literal["auto", "continuous", "euler"]] = "auto"
     """How the flights were made: continuous (every real flight) or euler (MuJoCo's steps of the
     rate loop's period); auto reads it from the logs."""

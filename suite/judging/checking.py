@@ -108,13 +108,17 @@ def check_flight_files(
         ]
         for text in finding_lines(problems):
             console.say((f"{Path(name).name}: " if len(logs) > 1 and name else "") + text)
+    unseen = not_identifiable([finding for finding, _ in all_findings])
+    for manoeuvre in dict.fromkeys(one["manoeuvre"] for one in unseen):
+        faults = [one["fault"] for one in unseen if one["manoeuvre"] == manoeuvre]
+        console.say(f"to check {', '.join(faults)}: {manoeuvre}")
     if written:
         console.say(f"written: {', '.join(written)}")
     return {
         "flights": [log.name for log in logs],
         "vehicle": vehicle or None,
         "findings": [{**finding._asdict(), "flight": flight} for finding, flight in all_findings],
-        "not_identifiable": not_identifiable([finding for finding, _ in all_findings]),
+        "not_identifiable": unseen,
         "written": written,
     }
 

@@ -242,6 +242,14 @@ def lines_of(records: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
 
 
+def kept_lines(logs: Sequence[FlightLog]) -> list[str]:
+    """Return lines of text for the open findings that logs keep in their metadata.
+
+    A command that does not check the logs prints them as warnings.
+    """
+    return [f"{log.name}: {line(f)}" for log in logs for f in findings_of(log.about) if f.is_open]
+
+
 def check_files(against: CheckContext) -> list[Finding]:
     """Return the findings for the vehicle file and the policy's camera."""
     found = [] if against.vehicle is None else check_vehicle_numbers(against.vehicle)

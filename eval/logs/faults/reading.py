@@ -69,7 +69,7 @@ def parse_readings(texts: Sequence[str]) -> Readings:
             if not _allowed(signal, step):
                 raise ValueError(
                     f"--read {text!r}: {step!r} is no step of {signal}; allowed are a factor, "
-                    "x,-y,-z for vectors, 2,1,4,3 for motors, and what docs/import.md lists"
+                    "x,-y,-z for vectors, 2,1,4,3 for motors, and what docs/check.md lists"
                 )
             if step != steps and (signal == "time" or step == "drop"):
                 raise ValueError(f"--read {text!r}: {step!r} stands alone; leave the others out")

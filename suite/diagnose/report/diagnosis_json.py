@@ -1,4 +1,4 @@
-"""Converts a diagnosis into the content of diagnosis.json (schema: docs/diagnosis.md)."""
+"""Converts a diagnosis into the content of diagnosis.json (schema: docs/diagnose.md)."""
 
 from __future__ import annotations
 

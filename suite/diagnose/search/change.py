@@ -312,19 +312,16 @@ def search_motion_change(
 ) -> SearchResult | None:
     """Return the candidate that has changed since `reference`; None where none is significant.
 
-    The parameters of the result are total values, not changes. Both sets of flights need at least
-    two flights; otherwise the result is None.
+    The parameters of the result are total values, not changes.
 
     Args:
-        reference: evidence of the flights before a change.
-        task: evidence of the flights after it.
+        reference: evidence of the flights before a change, at least two.
+        task: evidence of the flights after it, at least two.
         among: the candidates.
         views: number of views that are searched, for Bonferroni's correction.
     """
     start, limits, space = fit_balance(reference), task.limits, task.space
     sets = [within_flights(one.residuals(start, None)) for one in (reference, task)]
-    if min(len(np.unique(one.flight)) for one in sets) < 2:
-        return None
     weights = weights_of(sets[1], limits)
     evidence = replace(task, weights=weights)
     acting = view_candidates(among, evidence.linearise(Estimate(start)))

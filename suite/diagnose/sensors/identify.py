@@ -14,6 +14,7 @@ import numpy as np
 
 from eval.judging.statistics import Interval
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.check import kept_lines
 from eval.logs.flight_log import FlightLog, read_flights
 from eval.sensors import SENSORS
 from eval.sensors.measured_state import AXES, GROUPS
@@ -201,7 +202,7 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
             refused.append(str(error))
     if not used:
         raise ValueError("no flight can be used:\n" + "\n".join(refused))
-    warnings += [f"not used: {text}" for text in refused]
+    warnings += [*kept_lines(used), *(f"not used: {text}" for text in refused)]
     console.say(f"{len(used)} flights with an estimate and a reference, {seconds:.0f} s in all")
     # Fit, and check on held-out flights.
     used, clocks_s = _on_gyro_clock(used)

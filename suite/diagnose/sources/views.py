@@ -33,6 +33,8 @@ MEASURE = (
     "RMS over the axes of the residual of {about} on held-out flights [{unit}], both "
     "sides smoothed over {width:g} s, without each flight's constant offset"
 )
+UNTESTED = "a change that depends on the motion, such as a drag, was not tested: {}"
+"""Warning if only constant changes since reference flights are tested."""
 
 
 def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | None:
@@ -81,6 +83,12 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
     is_fitted, _ = choose_held_out(logs, block.flight, start_s, information, limits)
     held_numbers = sorted({*block.flight.tolist()} - {*block.flight[is_fitted].tolist()})
     parts = parted(flights, held_numbers, limits)
+    # Of partial logs or a single flight to fit, only the means of flights are compared.
+    untested = list[str]()
+    if references and any(log.partial for log in [*logs, *references]):
+        untested = [UNTESTED.format("some logs are partial")]
+    elif references and len(next(iter(parts.fitted.values()))) < 2:
+        untested = [UNTESTED.format("this needs 3 new flights or more, as one is held out")]
     # Make one source for each view.
     sources = []
     for name in parts.fitted:
@@ -92,10 +100,10 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
             "floor": flights.floor[name],
         }
         if spread is not None:
-            # Of logs that lack a required signal only the means of flights are compared.
-            partial = any(log.partial for log in [*logs, *references])
             sources.append(
-                since_reference(earlier[name], to_fit, held_out, spread, allowed, partial, shared)
+                since_reference(
+                    earlier[name], to_fit, held_out, spread, allowed, bool(untested), shared
+                )
             )
             continue
         weighed = to_fit.estimate_noise(to_fit.start)
@@ -112,7 +120,7 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
         tuple(sources),
         parts.names,
         flights.source,
-        (*flights.notes, *parts.notes, *not_shown, *left_out),
+        (*flights.notes, *parts.notes, *not_shown, *left_out, *untested),
         (lag,) if lag else (),
         spread_words(spread, len(references)),
     )

@@ -36,9 +36,10 @@ class Limits:
     floor_m: Annotated[float, Range(-1000.0, 1000.0)] = -0.5
     """World z of the bottom of that box [m]."""
     deadline_s: Annotated[float, Range(1e-4, 1.0)] = 0.02
-    """Latest set point after its state's arrival [s]; a later one is not sent."""
+    """Latest decision of the policy after its state's arrival [s]; a later one is replaced by the
+    action before it."""
     late_most: Annotated[int, Range(1, 1000)] = 5
-    """Hand over after this many late answers in a row."""
+    """Hand over after this many late decisions in a row."""
     clock_jump_s: Annotated[float, Range(0.01, 100.0)] = 0.2
     """Hand over if the vehicle's clock jumps by more than this relative to that of the companion,
     or if its states arrive later than this [s]."""

@@ -1,6 +1,7 @@
 """The scorer on answers and diagnoses written by hand."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -98,6 +99,14 @@ def test_the_table_counts_what_is_named_and_a_diagnosis_that_failed_as_no_null(t
     assert lines["95 % intervals that contain the true value"] == (1, 1)
     assert lines["gap after within 1.1 of the noise floor, where named"] == (0, 1)
     assert lines["diagnosis failed"] == (1, 5)
+    page = Path("docs/results/blind.md").read_text(encoding="utf-8").splitlines()
+    goals = {
+        cells[1].strip(): cells[-2].strip()
+        for cells in (row.split("|") for row in page[:40])
+        if len(cells) == 8
+    }
+    compared = [(s.wanted, goals[s.what]) for s in shares(verdicts) if s.what in goals]
+    assert len(compared) == 5 and all(wanted == goal for wanted, goal in compared)
     half = next(s for s in shares(verdicts) if s.what == "nulls: something named")
     assert (half.low, half.high) == pytest.approx((0.0945, 0.9055), abs=1e-3)  # Wilson, 1 of 2
     write_json(tmp_path / "manifest.json", {"cases": {}, "answers": {}, "failed": {}})

@@ -12,7 +12,7 @@ from eval.logs.flight_log import columns_from_log, read_flight, write_flight
 from eval.quadrotor.vehicle_file import save_vehicle
 from suite.experiments.injected.flights import as_log
 from tests.eval.logs.faults.test_kinds import good
-from tests.support.commands import answer, refused
+from tests.support.commands import answer, refused, run
 from tests.support.vehicles import PLAIN
 
 
@@ -94,6 +94,11 @@ def test_what_an_import_left_open_is_repeated_and_findings_of_earlier_versions_a
     path = flight(1.0, about={"findings": [doubt._asdict()]})
     assert findings_of(read_flight(path).about) == (doubt,)
     answered = checked(tmp_path, capsys, path)
+    # Without --json the manoeuvre of every fault that this flight does not show is printed.
+    assert run("check", path) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    shown = [one["manoeuvre"] for one in answered["not_identifiable"]]
+    assert shown and all(f": {manoeuvre}" in said for manoeuvre in shown)
     assert "motor_count" in {f["fault"] for f in answered["findings"]}
     line = ("diagnose --vehicle", tmp_path / "plain.toml", "--out", tmp_path / "out", path)
     assert "6 motors turn" in refused(capsys, *line, lines=3)

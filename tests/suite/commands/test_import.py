@@ -69,6 +69,7 @@ def test_the_command_copies_all_a_diagnosis_needs(tmp_path, capsys):
 
 def test_the_real_flights_come_as_published_and_tell_a_vehicle_at_the_first_try(tmp_path, capsys):
     names = answer(capsys, "example --real --out", tmp_path)["files"]
+    assert f"import {tmp_path}/B3_figure8_fast_rep1.csv" in (tmp_path / "README.md").read_text()
     logs = [name for name in names if name.endswith(".csv")]
     assert len(logs) == 2
     for name in logs:

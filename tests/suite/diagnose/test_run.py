@@ -127,6 +127,7 @@ def test_a_change_is_written_as_every_diagnosis_is(tmp_path, capsys):
     names = {name for e in told["effects"] for name in (e["name"], *e["alternatives"])}
     assert "mass_offset" in names and told["views"] and len(told["reference"]) == 2
     assert any("--drive" in line for line in told["warnings"])
+    assert any("depends on the motion" in line for line in told["warnings"]), "two new flights"
     assert "warning: --drive needs rollouts" in said.err and "flights" in told["plan"]
     for axis in told["gap"]["channels"]["force"].values():
         assert {"before", "after", "noise_floor", "repeatability"} <= set(axis)

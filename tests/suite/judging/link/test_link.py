@@ -245,6 +245,7 @@ def test_a_real_vehicle_needs_the_operators_word(capsys, tmp_path, monkeypatch):
     assert "silence-s" in refused(capsys, REAL, tmp_path, "--silence-s", "-1")
     confirmed = (REAL, tmp_path, "--confirm")
     assert "--link flies one flight" in refused(capsys, *confirmed, "--trials", "3")
+    assert "--time-limit-s ends simulated" in refused(capsys, *confirmed, "--time-limit-s", "5")
 
     def outside(companion, link):
         companion.over = "outside the box at 0.0, 0.0, -3.0 m"
