@@ -115,12 +115,16 @@ def expected_shapes(spec: PolicySpec, where: str) -> dict[str, tuple[int, ...]]:
 def load_delta(folder: Path) -> Stored:
     """Read a Delta Action network; key "fit" of its config has the fit's configuration and results.
 
+    Args:
+        folder: the checkpoint's folder, or the folder of a `suite delta`, which has it as delta/.
+
     Raises:
         PolicyError: where the checkpoint is damaged, of another kind, not finite, or its arrays
             do not have the names and shapes of the network's parameters.
     """
     from policies.networks import delta_network
 
+    folder = folder / DELTA if (folder / DELTA).is_dir() else folder
     stored = load_arrays(folder, kind=DELTA)
     check_shapes(folder / WEIGHTS, stored.arrays, _shapes(delta_network.init))
     return stored

@@ -61,12 +61,12 @@ class Config(Command):
     """The device that computes. Without it a GPU if JAX finds one, else the CPU."""
     init_from: str | None = None
     """Start from this policy instead of random weights: a checkpoint's folder or a shipped
-    policy's name."""
+    policy's name (race-small needs --recipe race-small)."""
     finetune: bool = False
     """Fine-tune the policy of --init-from: the recipe's last phase alone, a quarter of its gradient
     steps, 0.3 times its learning rate."""
     delta: Advanced[Path | None] = None
-    """Correct the actions by this Delta Action Model (a checkpoint of `suite delta`), which is not
+    """Correct the actions by this Delta Action Model (the --out of `suite delta`), which is not
     trained."""
     set: tuple[str, ...] = ()
     """Change settings by name, in every phase, such as loss.progress=0.4; from the second phase

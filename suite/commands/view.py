@@ -14,6 +14,7 @@ import tyro
 from suite.common.console import Console
 from suite.common.options import Advanced, Command
 from tracks.common.files import check_place
+from tracks.common.names import unknown_name
 from tracks.input.ranges import Range, Seed
 
 if TYPE_CHECKING:
@@ -31,10 +32,14 @@ class Config(Command):
     file."""
     pick: Literal["first", "failed", "passed"] = "first"
     """Which trials of the run: the first ones, or the first that failed or that succeeded."""
+    policy: str | None = None
+    """If RUN is a suite eval: its policy, named as in its table, whose trials are shown. Without it
+    the first policy with such trials."""
     count: Annotated[int, Range(1, 1000)] = 3
     """Largest number of trials."""
     track: str = "all"
-    """If RUN is a policy: zigzag, circular, ellipse, all of these, a track file, or several."""
+    """If RUN is a policy: zigzag, circular, ellipse, all of these, random, a track file, or
+    several."""
     difficulty: str = "3"
     """If RUN is a policy: level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     vehicle: str = "reference"
@@ -67,14 +72,14 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         raise ValueError(f"--rerun {recording}: a recording's name must end in .rrd")
     check_place(recording)
     check_place(config.out / "picture.png")
-    evaluation, trials, digests = _choose_trials(config)
+    evaluation, trials, digests, label = _choose_trials(config, console)
     from eval.view.picture import write_picture
     from eval.view.recording import write_recording
     from suite.judging.replay import fly_again
     from suite.judging.trials import refuse_equal_names
 
     refuse_equal_names({trial.track for trial in trials})
-    console.note(f"flying {len(trials)} trial{'s' * (len(trials) != 1)} again")
+    console.note(f"flying {len(trials)} trial{'s' * (len(trials) != 1)} of {label} again")
     rollouts, drone = fly_again(evaluation, trials, judged=digests)
     write_recording(recording, rollouts, drone)
     written = [recording]
@@ -112,12 +117,15 @@ def _name(rollout: Rollout) -> str:
     return f"{Path(result.track).stem}-{result.difficulty}-{result.seed}"
 
 
-def _choose_trials(config: Config) -> tuple[Evaluation, list[TrialSpec], dict[str, str] | None]:
-    """Return the evaluation (policies and conditions), the chosen trials, and the inputs' SHA-256.
+def _choose_trials(
+    config: Config, console: Console
+) -> tuple[Evaluation, list[TrialSpec], dict[str, str] | None, str]:
+    """Return the evaluation of one policy, the chosen trials, the inputs' SHA-256 and the label.
 
-    The last is None if RUN is a policy: there is no earlier evaluation to compare the inputs with.
+    The SHA-256 is None if RUN is a policy: there is no evaluation to compare the inputs with.
     """
-    from suite.judging.replay import first_trials, read_digests, read_evaluation
+    from suite.judging.flying import default_policy, manners
+    from suite.judging.replay import first_trials, read_evaluation
     from suite.judging.requests import Evaluation
 
     folder = Path(config.run)
@@ -127,11 +135,13 @@ def _choose_trials(config: Config) -> tuple[Evaluation, list[TrialSpec], dict[st
             "trials, then view it"
         )
     if not (folder / "trials.parquet").is_file():
-        if config.pick != "first":
-            raise ValueError(
-                f"--pick is {config.pick}, but {folder} is not a finished run of suite eval; leave "
-                "it out"
-            )
+        for name in ("pick", "policy"):
+            value = getattr(config, name)
+            if value != getattr(Config, name):
+                raise ValueError(
+                    f"--{name} is {value}, but {folder} is not a finished run of suite eval; leave "
+                    "it out"
+                )
         evaluation = Evaluation(
             policies=(config.run,),
             track=config.track,
@@ -141,7 +151,7 @@ def _choose_trials(config: Config) -> tuple[Evaluation, list[TrialSpec], dict[st
             trust=config.trust,
             speed=() if config.speed is None else (config.speed,),
         )
-        return evaluation, first_trials(evaluation)[: config.count], None
+        return evaluation, first_trials(evaluation)[: config.count], None, config.run
     from eval.judging.results import read_trials
 
     for name in ("track", "difficulty", "vehicle", "seed", "speed"):
@@ -154,10 +164,45 @@ def _choose_trials(config: Config) -> tuple[Evaluation, list[TrialSpec], dict[st
     # A folder's record must not decide that the files that it names may run code.
     evaluation = replace(read_evaluation(folder), trust=config.trust)
     results = read_trials(folder / "trials.parquet")
-    results = [result for result in results if result.policy == results[0].policy]
+    # The rows are in the order of the evaluation's entries, and monitored ones are the last.
+    sources = evaluation.policies or (default_policy(),)
+    entries = [(each, k) for each in manners(evaluation.speed, False) for k in range(len(sources))]
+    labels = list(dict.fromkeys(result.policy for result in results))[: len(entries)]
+    if config.policy not in (None, *labels):
+        raise unknown_name("--policy", str(config.policy), labels)
     if config.pick != "first":
         results = [result for result in results if result.success == (config.pick == "passed")]
-    if not results:
-        raise ValueError(f"--pick {config.pick}: {folder} holds no such trial")
-    trials = [result.trial for result in results[: config.count]]
-    return evaluation, trials, read_digests(folder)
+    found = [label for label in labels if any(result.policy == label for result in results)]
+    label = config.policy or next(iter(found), None)
+    if label not in found:
+        of = f" of {config.policy}" if config.policy else ""
+        raise ValueError(f"--pick {config.pick}: {folder} holds no such trial{of}")
+    if others := ", ".join(each for each in found if each != label):
+        console.note(f"shown are trials of {label}; --policy selects another of: {others}")
+    manner, number = entries[labels.index(label)]
+    evaluation = replace(
+        evaluation,
+        policies=(sources[number],),
+        speed=() if manner.speed is None else (manner.speed,),
+    )
+    trials = [result.trial for result in results if result.policy == label]
+    return evaluation, trials[: config.count], _digests(folder, number), label
+
+
+def _digests(folder: Path, number: int) -> dict[str, str]:
+    """Return the SHA-256 of the inputs of policy `number` in an evaluation, by name of the input.
+
+    Raises:
+        ValueError: if summary.json does not have that of the policy.
+    """
+    from suite.judging.replay import read_digests
+    from tracks.input.reading import read_json
+
+    digests, path = read_digests(folder), folder / "summary.json"
+    try:
+        return {**digests, "policy": str(read_json(path)["policies"][number]["sha256"])}
+    except (KeyError, IndexError, TypeError) as error:
+        raise ValueError(
+            f"{path}: does not have the SHA-256 of policy {number + 1}; run suite eval again with "
+            "another --out, then view that folder"
+        ) from error

@@ -74,8 +74,8 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "suite train --recipe quick --iterations 100 --out runs/quick",
     ),
     "delta": (
-        "suite delta runs/collect --out runs/delta",
-        "suite delta runs/collect --vehicle racer5 --out runs/delta",
+        "suite delta runs/flights --out runs/delta",
+        "suite delta runs/flights --model quad --vehicle racer5 --out runs/delta-quad",
     ),
     "loop": (
         "suite loop --policy race --out runs/loop",

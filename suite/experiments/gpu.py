@@ -97,7 +97,8 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     if jax.default_backend() == "cpu" and max(config.worlds) > CPU_MOST:
         raise ValueError(
             f"--worlds is {' '.join(map(str, config.worlds))}, but JAX finds no GPU here (see "
-            "suite info): install '.[cuda]', or measure the CPU with --worlds 64 --train-worlds 64"
+            "suite info): pip install 'diffracing-suite[cuda]', or measure the CPU with "
+            "--worlds 64 --train-worlds 64"
         )
     # 1. The best speed of the device, for comparison with the speed of the training.
     device, vehicle = jax.devices()[0], load_vehicle("reference")

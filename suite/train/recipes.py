@@ -149,9 +149,9 @@ def quick() -> TrainConfig:
 
 
 def gpu() -> TrainConfig:
-    """Return the recipe of `race` with thousands of worlds at once, for one accelerator.
+    """Return the recipe of `race` with 2,048 environments at once, for one GPU.
 
-    It has one shard, because a small batch takes an accelerator as long as a large one.
+    It has one shard, because a small batch takes a GPU as long as a large one.
     """
     base = race()
     return replace(base, episode=replace(base.episode, batch=2048, shards=1))

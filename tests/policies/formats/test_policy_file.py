@@ -76,11 +76,15 @@ def test_a_policy_without_a_spec_and_weights_of_another_network_are_refused(tmp_
 
 def test_a_delta_comes_back_and_a_policy_is_none(tmp_path, params):
     delta = delta_network.init(jax.random.key(0))
-    saved = partial(save_arrays, tmp_path / "d", kind="delta", seed=1, extra={"fit": {"epochs": 2}})
+    saved = partial(
+        save_arrays, tmp_path / "run/delta", kind="delta", seed=1, extra={"fit": {"epochs": 2}}
+    )
     back = load_delta(saved(delta))
     assert back.config["fit"] == {"epochs": 2}
+    of_run = load_delta(tmp_path / "run")  # the --out of `suite delta`
     for name, value in delta.items():
         np.testing.assert_array_equal(back.arrays[name], value)
+        np.testing.assert_array_equal(of_run.arrays[name], value)
     with pytest.raises(PolicyError, match="kind is 'policy', expected 'delta'"):
         load_delta(save_policy(tmp_path / "p", params, SPEC, seed=None))
     with pytest.raises(PolicyError, match=r"'output.bias' is float32 \(4,\)"):

@@ -2,12 +2,15 @@
 
 A fenced sh block below the comment ``<!-- run -->`` is run, in an empty folder. Every other
 `suite` line must be one that the command line accepts, and every `make` line a target; what stands
-`suite so` within a sentence must be a command, with options that it has. The site is made of the
-same pages. Commands in docs/archive are those of an earlier commit; only links are checked there.
+`suite so` within a sentence must be a command, with options that it has. The same holds for the
+examples in help texts. The options of a training and of a fit must go together, and a folder is of
+one run. The site is made of the same pages. Commands in docs/archive are those of an earlier
+commit; only links are checked there.
 """
 
 import ast
 import contextlib
+import dataclasses
 import functools
 import importlib
 import io
@@ -20,7 +23,12 @@ from pathlib import Path
 
 import pytest
 
+from policies import shipped
 from suite import cli
+from suite.commands.train import resolve
+from suite.common.usage import EXAMPLES
+from suite.train.recipes import named_recipe, with_model
+from suite.train.run import load_start_params
 from tests.support.judged_cells import cut_short
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -37,11 +45,14 @@ MADE_UP = {"hello", "COMMAND"}
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
 BLOCKS = {
-    f"{page.name}-{number}": (bool(marked), body)
+    f"{page.relative_to(ROOT)}-{number}": (bool(marked), body)
     for page, text in TEXTS.items()
     for number, (marked, body) in enumerate(BLOCK.findall(text))
 }
 """Page and number -> whether the block is run, and its lines."""
+BLOCKS["EXAMPLES"] = (False, "\n".join(line for lines in EXAMPLES.values() for line in lines))
+RUNS = ("delta", "eval", "loop", "train")
+"""Commands that refuse a folder --out with a run of another kind."""
 
 
 def _commands(body):
@@ -58,10 +69,22 @@ def _check(words):
         case ["suite", name, *args]:
             assert name in cli.COMMANDS, f"no command {name!r}"
             if "--help" not in args:
-                cli.parse(name, args)
+                # A vehicle of the user may be any.
+                args = [re.sub(r"^[\w/]+\.toml$", "racer5", word) for word in args]
+                _check_together(name, cli.parse(name, args)[1])
         case ["make", *targets]:
             for target in targets:
                 assert "=" in target or re.search(rf"^{target}:", MAKEFILE, re.MULTILINE), target
+
+
+def _check_together(name, config):
+    """Refuse options of a training or a fit that do not go together."""
+    if name == "delta":
+        with_model(named_recipe(config.recipe), config.model, config.vehicle)
+    elif name == "train":
+        training = resolve(config)
+        if config.init_from in shipped.names():
+            load_start_params(config.init_from, training.spec)
 
 
 @contextlib.contextmanager
@@ -69,7 +92,7 @@ def _named(where):
     """Say where a wrong command stands."""
     try:
         yield
-    except (AssertionError, SystemExit) as error:
+    except (AssertionError, SystemExit, ValueError) as error:
         raise AssertionError(f"{where}: {error}") from error
 
 
@@ -78,6 +101,22 @@ def test_every_command_is_one_that_exists():
         for words in _commands(body):
             with _named(f"{where}: {shlex.join(words)}"):
                 _check(words)
+
+
+def test_no_page_gives_the_folder_of_another_run():
+    """Who follows the pages one after the other would be refused."""
+    runs = {}
+    for where, (_, body) in BLOCKS.items():
+        for _, name, *args in _commands(body):
+            if where.startswith(("EXAMPLES", "docs/reference")) or "--out" not in args:
+                continue
+            if name in RUNS:
+                config = cli.parse(name, args)[1]
+                # Processes share a training, and an evaluation replaces another one.
+                shared = {"train": {"process_options": None}, "eval": {"flown": None}}
+                run = (name, dataclasses.replace(config, **shared.get(name, {})))
+                first, place = runs.setdefault(config.out, (run, where))
+                assert first == run, f"{place} and {where}: --out {config.out}"
 
 
 @functools.cache
@@ -136,6 +175,19 @@ def test_python_on_a_page_imports_what_there_is():
         if isinstance(node, ast.ImportFrom) and node.module:
             module = importlib.import_module(node.module)
             assert all(hasattr(module, alias.name) for alias in node.names), node.module
+
+
+def test_the_card_of_the_default_policy_has_rows_of_the_page_of_its_results():
+    card = (ROOT / "policies/shipped/race/card.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| race \|(.*)$", card, re.MULTILINE)
+    page = (ROOT / "docs/results/table2.md").read_text(encoding="utf-8")
+    assert len(rows) == 12 and all(f"| ours |{row}" in page for row in rows)
+
+
+def test_every_page_installs_optional_packages_in_one_way():
+    """`pip install '.[cuda]'` would replace the editable install of `make env`."""
+    for page, text in TEXTS.items():
+        assert not re.search(r"pip install ['\"]?\.(?!/)", text), page.name
 
 
 def test_links_within_the_repository_lead_somewhere():

@@ -30,6 +30,33 @@ def test_view_flies_the_chosen_trials_again(pilots, tmp_path, capfd):
     assert "--pick passed" in refused(capfd, *again, "--pick", "passed")
 
 
+def test_view_finds_the_trials_of_every_policy_of_a_run(pilots, tmp_path, capfd):
+    """The first one is often `race`, and the one that fails the user's own."""
+    out, again = tmp_path / "out", ("view --out", tmp_path / "seen", tmp_path / "out")
+    policies = ("--policy", pilots["pursuit"], pilots["diver"], pilots["diver2"])
+    assert evaluate(out, "--trials 1 --track zigzag", *policies) == 0
+    assert run(*again, "--pick", "failed") == 0
+    said = capfd.readouterr().err
+    assert f"flying 1 trial of {pilots['diver']} again" in said
+    assert f"--policy selects another of: {pilots['diver2']}" in said
+    shown = answer(capfd, *again, "--policy", pilots["diver2"])["trials"]
+    assert shown[0]["pos_x"] == read_trials(out / "trials.parquet")[2].pos_x
+    said = refused(capfd, *again, *"--pick failed --policy pursuit".split())
+    assert "--pick failed" in said and "no such trial of pursuit" in said
+    assert "unknown --policy 'rac'" in refused(capfd, *again, "--policy", "rac")
+
+
+def test_view_flies_at_the_speed_of_the_shown_trials(pilots, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    assert evaluate(out, "--trials 1 --track zigzag --speed 0.4 0.7 --policy", pilots["other"]) == 0
+    flown, fly = [], eval.judging.judge.fly
+    monkeypatch.setattr(
+        eval.judging.judge, "fly", lambda policy, *rest: flown.append(policy) or fly(policy, *rest)
+    )
+    assert run("view --policy other@0.7 --out", tmp_path / "seen", out) == 0
+    assert [policy.spec.speed for policy in flown] == [0.7]
+
+
 def test_a_run_whose_files_have_changed_is_not_flown_again(
     pilots, tmp_path, root, monkeypatch, capsys
 ):
@@ -115,6 +142,7 @@ def test_options_that_do_not_fit_and_what_is_no_finished_run_are_refused(tmp_pat
         (f"{tmp_path} --speed 0.5", "--speed is 0.5, but"),
         (f"{tmp_path} --track zigzag", "flown again unchanged"),
         ("race --pick failed", "--pick is failed, but race is not a finished run"),
+        ("race --policy race", "--policy is race, but race is not a finished run"),
         ("race-paper --difficulty 0 --speed 0.4", "--speed 0.4: race-paper takes no speed"),
         ("race --difficulty 0 --speed 1.4", "--speed is 1.4"),
     ):
@@ -133,5 +161,5 @@ def test_a_recording_shows_who_flew_and_asks_for_a_speed(pilots, tmp_path):
     assert found[eye, "Pinhole:resolution"][1] == [[[36.0, 20.0]]]
     layout = found[f"{eye}/depth", "DepthImage:format"][1][0][0]
     assert (layout["width"], layout["height"]) == (36, 20)
-    evaluation, *_ = view._choose_trials(view.Config(run="race", speed=0.4))
+    evaluation, *_ = view._choose_trials(view.Config(run="race", speed=0.4), Quiet())
     assert manners(evaluation.speed, monitor=False) == [Manner(speed=0.4)]

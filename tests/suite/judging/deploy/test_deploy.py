@@ -120,7 +120,7 @@ def test_a_card_has_the_success_of_a_shipped_policys_card(folder):
         return exporting.card_text(name, name, stored, "float32", found)
 
     text = card("race-paper")
-    assert "95 % intervals" in text and "95 % intervals" not in card("race")
+    assert "95 % intervals" in text and "95 % intervals" not in card("tiny")
     assert "| race-paper | zigzag | 0 | 100 | 98 % [93, 99]" in text
     assert "no C compiler" in text and "not measured" in text
     config = {key: value for key, value in stored.config.items() if key != "seed"}
