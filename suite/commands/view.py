@@ -121,12 +121,12 @@ def _choose_trials(config: Config) -> tuple[Evaluation, list[TrialSpec], dict[st
     from suite.judging.requests import Evaluation
 
     folder = Path(config.run)
-    if any(folder.glob("journal-*.jsonl")):
-        raise ValueError(
-            f"{folder}: this suite eval is not finished; repeat its command to fly the remaining "
-            "trials, then view it"
-        )
     if not (folder / "trials.parquet").is_file():
+        if any(folder.glob("journal-*.jsonl")):
+            raise ValueError(
+                f"{folder}: this suite eval is not finished; repeat its command to fly the "
+                "remaining trials, then view it"
+            )
         if config.pick != "first":
             raise ValueError(
                 f"--pick is {config.pick}, but {folder} is not a finished run of suite eval; leave "
