@@ -82,14 +82,16 @@ def evaluate_policy(
         vehicle: a vehicle, a shipped name or a vehicle file.
         simulator: a name of `suite list simulators`.
         sensors: what the policy sees and knows: a shipped name or a sensors file.
-        workers: number of processes; None takes as many cores as give a gain.
+        workers: number of processes; None takes one. Several processes import the program again,
+            so it must call this function below `if __name__ == "__main__":`, and register effects,
+            tracks and simulators above it.
 
     Raises:
         ValueError: for an argument that cannot be used, before the first flight.
     """
     from eval.judging.judge import JudgeOptions, fly
     from policies.policy import load_policy
-    from suite.judging.flying import policy_for_workers, workers_for
+    from suite.judging.flying import policy_for_workers
     from suite.judging.requests import Evaluation
     from suite.judging.trials import read_trial_set
 
@@ -105,9 +107,8 @@ def evaluate_policy(
     request: dict[str, Any] = {"difficulty": str(difficulty), "sensors": str(sensors), **sources}
     evaluation = Evaluation(trials=trials, seed=seed, simulator=simulator, **request)
     trial_set = read_trial_set(evaluation, **objects)
-    flown, processes = loaded, workers
+    flown, processes = loaded, workers or 1
     if isinstance(policy, str | Path):
-        processes = workers_for(len(trial_set.trials), workers, simulator)
         flown = policy_for_workers(loaded, str(policy), False, processes)
     options = JudgeOptions(workers=processes, sensors=trial_set.sensors)
     return fly(

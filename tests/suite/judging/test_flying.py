@@ -111,13 +111,13 @@ def test_from_python_a_track_file_is_flown_and_a_named_policy_in_several_process
         flown.append((options.workers, trials, list(tracks)))
 
     monkeypatch.setattr(eval.judging.judge, "fly", fly)
-    monkeypatch.setattr(flying, "usable_cores", lambda: 4)
     suite.evaluate_policy("race-paper", track=YARD, trials=10)
     suite.evaluate_policy("race-paper", track=load_track(YARD), trials=10)
     suite.evaluate_policy(Path("race-paper"), track="zigzag", trials=2, workers=2)
+    # Without a number, a program without a main guard must still run.
     suite.evaluate_policy("race-paper", track="zigzag", difficulty=3, trials=300)
     numbers = [(workers, len(trials)) for workers, trials, _ in flown]
-    assert numbers == [(1, 1), (1, 1), (2, 4), (2, 300)]
+    assert numbers == [(1, 1), (1, 1), (2, 4), (1, 300)]
     assert flown[0][1:] == ([TrialSpec(YARD, 0, 0)], [YARD])
 
 
