@@ -73,24 +73,27 @@ def evaluate_policy(
 
     Args:
         policy: a policy (`load_policy`, or any object with its methods), a shipped name or a file.
-        track: a track of your own, "all" (the judged families), a family, or several with commas.
+        track: a track or track file of your own, "all" (the judged families), a family, or several
+            with commas.
         difficulty: a level 0 to 9, "0,3", "0-9" or "all"; ignored for a track of your own.
-        trials: number of trials on every track at every level.
+        trials: number of trials on every track at every level. A track of your own is flown once if
+            nothing in its flights is random.
         seed: seed of the first trial; each further trial adds one.
         vehicle: a vehicle, a shipped name or a vehicle file.
         simulator: a name of `suite list simulators`.
         sensors: what the policy sees and knows: a shipped name or a sensors file.
-        workers: number of processes; None takes as many cores as give a gain.
+        workers: number of processes; None takes one. Several processes import the program again,
+            so it must call this function below `if __name__ == "__main__":`, and register effects,
+            tracks and simulators above it.
 
     Raises:
         ValueError: for an argument that cannot be used, before the first flight.
     """
     from eval.judging.judge import JudgeOptions, fly
-    from eval.quadrotor.vehicle_file import load_vehicle
-    from eval.sensors.sensors_file import load_sensors
-    from eval.worlds.trial import TrialSpec
     from policies.policy import load_policy
-    from suite.judging.trials import parse_levels, parse_tracks
+    from suite.judging.flying import policy_for_workers
+    from suite.judging.requests import Evaluation
+    from suite.judging.trials import read_trial_set
 
     loaded = load_policy(policy) if isinstance(policy, str | Path) else policy
     if missing := [name for name in ("name", "spec", "start", "act") if not hasattr(loaded, name)]:
@@ -98,16 +101,19 @@ def evaluate_policy(
             f"policy {loaded!r} has no {', '.join(missing)}; a policy object has name, spec, "
             "start(n) and act(hidden, state, image, fresh): docs/policies.md"
         )
-    loaded_vehicle = load_vehicle(vehicle) if isinstance(vehicle, str | Path) else vehicle
-    seeds, custom_tracks = range(seed, seed + trials), {}
-    if isinstance(track, str):
-        levels = parse_levels(str(difficulty))
-        specs = [TrialSpec(t, d, s) for t in parse_tracks(track) for d in levels for s in seeds]
-    else:
-        custom_tracks = {track.family: track}
-        specs = [TrialSpec(track.family, 0, s) for s in seeds]
-    options = JudgeOptions(workers=workers, sensors=load_sensors(sensors))
-    return fly(loaded, specs, loaded_vehicle, simulator, options, tracks=custom_tracks)
+    given: dict[str, Any] = {"track": track, "vehicle": vehicle}
+    sources = {name: str(each) for name, each in given.items() if isinstance(each, str | Path)}
+    objects = {name: each for name, each in given.items() if name not in sources}
+    request: dict[str, Any] = {"difficulty": str(difficulty), "sensors": str(sensors), **sources}
+    evaluation = Evaluation(trials=trials, seed=seed, simulator=simulator, **request)
+    trial_set = read_trial_set(evaluation, **objects)
+    flown, processes = loaded, workers or 1
+    if isinstance(policy, str | Path):
+        flown = policy_for_workers(loaded, str(policy), False, processes)
+    options = JudgeOptions(workers=processes, sensors=trial_set.sensors)
+    return fly(
+        flown, trial_set.trials, trial_set.vehicle, simulator, options, tracks=trial_set.tracks
+    )
 
 
 def train_policy(

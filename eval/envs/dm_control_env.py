@@ -13,6 +13,7 @@ from dm_env import specs
 from eval.envs.race import ACTION_LIMIT, Race
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
+from eval.worlds.engine import refuse_start_contact
 from eval.worlds.trial import Rules
 from policies.spec import ACTION_SIZE, PolicySpec
 from tracks.families import make_track
@@ -103,10 +104,14 @@ def load(
         environment: further arguments of `dm_control.rl.control.Environment`.
 
     Raises:
-        ValueError: for an unknown track or a spec that this environment cannot fly.
+        ValueError: for an unknown track, a contact at the start of `track`, or a spec that this
+            environment cannot fly.
     """
+    vehicle = vehicle or load_vehicle("reference")
+    if track is not None:
+        refuse_start_contact(track.family, track, vehicle)
     track = track or make_track(family, level, seed)
-    race = Race(track, vehicle or load_vehicle("reference"), spec or PolicySpec(), rules or Rules())
+    race = Race(track, vehicle, spec or PolicySpec(), rules or Rules())
     physics = RacePhysics.from_model(wrapper.MjModel(race.model))
     physics.race = race
     return control.Environment(

@@ -10,6 +10,7 @@ import math
 import mujoco
 import numpy as np
 
+from eval.judging.guard import check_rate
 from eval.quadrotor.autopilot import AutopilotState, autopilot_step, make_autopilot, start_autopilot
 from eval.quadrotor.plant import uses_noise
 from eval.vehicles.vehicle import Vehicle
@@ -56,7 +57,8 @@ class Race:
         """
         self.spec, self.rules = spec, rules
         self.autopilot = make_autopilot(vehicle)
-        check_flyable(spec, vehicle)
+        check_spec(spec)
+        check_rate("the spec", spec.rate_hz, vehicle.controller.frequency)
         if spec.action.kind != "acceleration" or not spec.action.is_plain:
             raise ValueError(
                 f"spec.action is {spec.action}, allowed is acceleration in SI units; use `RaceEnv` "
@@ -179,21 +181,6 @@ class Race:
             "state": np.clip(state, -STATE_LIMIT, STATE_LIMIT).astype(np.float32),
             "image": image.astype(np.float32),
         }
-
-
-def check_flyable(spec: PolicySpec, vehicle: Vehicle) -> None:
-    """Refuse an impossible spec, and one with more decisions than physics steps of `vehicle`.
-
-    Raises:
-        ValueError: naming the key, its value and what is allowed.
-    """
-    check_spec(spec)
-    frequency = vehicle.controller.frequency
-    if spec.rate_hz > frequency * (1 + 1e-9):
-        raise ValueError(
-            f"spec.rate_hz is {spec.rate_hz:g}, allowed is up to the {frequency:g} Hz of vehicle "
-            f"{vehicle.name!r}'s controller.frequency"
-        )
 
 
 def remaining_path(pos_w: np.ndarray, centres_w: np.ndarray, gates: int) -> float:

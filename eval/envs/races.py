@@ -20,12 +20,12 @@ from eval.envs.race import (
     CRASH_REWARD,
     GATE_REWARD,
     STATE_LIMIT,
-    check_flyable,
     remaining_path,
 )
-from eval.judging.guard import ActionLimits, first_action, guard_action, limits_of
+from eval.judging.guard import ActionLimits, check_rate, first_action, guard_action, limits_of
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
+from eval.worlds.engine import refuse_start_contact
 from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.slots import layout_of
 from eval.worlds.trial import ENDINGS, FLYING, Rules, TrialSpec, steps_to_next
@@ -33,7 +33,7 @@ from policies.contract import Contract, contract_of
 from policies.formats.policy_file import load_policy_checkpoint
 from policies.observation import View, observe
 from policies.shipped import locate, names
-from policies.spec import ActionSpec, PolicySpec
+from policies.spec import ActionSpec, PolicySpec, check_spec
 from tracks.common.names import unknown_name
 from tracks.families import LEVELS, check_family, make_track
 from tracks.formats.custom import load_track
@@ -181,7 +181,7 @@ class Races:
 
         Raises:
             ValueError: for an unknown track, vehicle, kind of action or reward term, an invalid
-                level, spec or track_seed, or no slots.
+                level, spec or track_seed, no slots, or a contact at the start of a track file.
         """
         if slots < 1:
             raise ValueError(f"num_envs is {slots}, allowed is 1 or more")
@@ -198,7 +198,10 @@ class Races:
             check_family(self._track)
         vehicle = self._vehicle = resolved_vehicle(config, np.random.default_rng(0))
         self.spec = resolved_spec(config, vehicle)
-        check_flyable(self.spec, vehicle)
+        check_spec(self.spec)
+        check_rate("the spec", self.spec.rate_hz, vehicle.controller.frequency)
+        if self._file_track:
+            refuse_start_contact(self._track, self._file_track, vehicle)
         self.contract: Contract = contract_of(self.spec)
         layout = layout_of([self._file_track] if self._file_track else [])
         self._world = MujocoWorld(

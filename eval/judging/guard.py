@@ -46,6 +46,15 @@ def limits_of(limits: ActionLimits, action: ActionSpec, vehicle: Vehicle) -> Act
     return replace(limits, action=action, low=low, high=high)
 
 
+def check_rate(name: str, rate_hz: float, physics_hz: float) -> None:
+    """Raise a ValueError if `name` decides more often than the physics makes steps."""
+    if not 0 < rate_hz <= physics_hz * (1 + 1e-9):
+        raise ValueError(
+            f"{name} decides at {rate_hz:g} Hz; allowed is more than 0 and up to the "
+            f"{physics_hz:g} Hz of the physics (the vehicle's controller.frequency)"
+        )
+
+
 def first_action(action: ActionSpec, vehicle: Vehicle) -> np.ndarray:
     """Return the action of a hover (size,) in SI units.
 

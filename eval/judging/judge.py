@@ -18,7 +18,7 @@ import numpy as np
 
 from eval.judging.ages import Delays
 from eval.judging.filtered import Filtered, single_steps
-from eval.judging.guard import ActionLimits, call_policy, first_action, limits_of
+from eval.judging.guard import ActionLimits, call_policy, check_rate, first_action, limits_of
 from eval.judging.outputs import Outputs
 from eval.judging.recorder import Recorder
 from eval.judging.sensors import Sensors
@@ -197,7 +197,8 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
     policy = task.policy if _is_policy(task.policy) else task.policy()
     options = task.options
     if task.world == REFERENCE:
-        _check_rate(policy, task.vehicle, 1.0 / task.vehicle.controller.frequency)
+        frequency = task.vehicle.controller.frequency
+        check_rate(f"policy {policy.name!r}", policy.spec.rate_hz, frequency)
         for index, trial in share:
             result = world_class(REFERENCE)(
                 policy, trial, track_of(task.tracks, trial), task.vehicle, options.rules,
@@ -215,16 +216,6 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
     yield from _Slots(task, policy, world).run(share)
 
 
-def _check_rate(policy: Policy, vehicle: Vehicle, dt: float) -> None:
-    """Refuse a policy that decides more often than every physics step of `dt` [s]."""
-    rate = policy.spec.rate_hz
-    if not 0 < rate <= 1 / dt * (1 + 1e-9):
-        raise ValueError(
-            f"policy {policy.name!r} decides at {rate:g} Hz; allowed is more than 0 and up to the "
-            f"{1 / dt:g} Hz of vehicle {vehicle.name!r}'s controller.frequency"
-        )
-
-
 def _stepping(world: World) -> dict[str, Any]:
     """Return the flight's metadata on the integrator of `world`; {} if it does not name one."""
     integrator = getattr(world, "integrator", None)
@@ -236,7 +227,7 @@ class _Slots:
 
     def __init__(self, task: Task, policy: Policy, world: World) -> None:
         rate = policy.spec.rate_hz
-        _check_rate(policy, task.vehicle, world.dt)
+        check_rate(f"policy {policy.name!r}", rate, 1.0 / world.dt)
         self._task, self._policy, self._world = task, policy, world
         action = policy.spec.action
         self._limits = limits_of(task.options.limits, action, task.vehicle)

@@ -71,6 +71,13 @@ class SensorSet:
                 return settings_of(values)
         return None
 
+    @property
+    def random(self) -> bool:
+        """Whether what a policy observes depends on the trial's seed."""
+        sensors = [SENSORS[name] for name in self.models]
+        draws = any(any(s.trial + s.observation) for s in sensors if s.sense)
+        return draws or self.estimator is not None or (self.has_delay and self.ages.jitter > 0)
+
 
 PERFECT = SensorSet()
 """The set without errors: the policy observes the truth."""

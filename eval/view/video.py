@@ -150,8 +150,9 @@ def _finite_part(flight: Flight) -> Flight:
     not_finite = np.flatnonzero(~np.isfinite(state).all(axis=1))
     if not len(not_finite):
         return flight
-    rows = {name: getattr(flight, name)[: not_finite[0]] for name in Flight._fields[:-2]}
-    return flight._replace(**rows)
+    rows = {name: getattr(flight, name) for name in Flight._fields[:-2]}
+    finite = {name: each[: not_finite[0]] for name, each in rows.items() if each is not None}
+    return flight._replace(**finite)
 
 
 def _interpolate(flight: Flight, values: np.ndarray, time: float) -> np.ndarray:

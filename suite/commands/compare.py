@@ -36,7 +36,12 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for too few runs, or runs under different conditions.
     """
-    from suite.judging.comparing import compare_runs, compare_seeds, read_runs
+    from suite.judging.comparing import (
+        compare_runs,
+        compare_seeds,
+        read_runs,
+        version_notes,
+    )
 
     runs = [run for folder in config.runs for run in read_runs(folder)]
     others = [run for folder in config.against for run in read_runs(folder)]
@@ -46,6 +51,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         comparisons = [compare_seeds(runs, others)]
     else:
         comparisons = [compare_runs(runs[0], other) for other in (others or runs[1:])]
+    for note in version_notes([*runs, *others]):
+        console.note(note)
     for comparison in comparisons:
         console.say(comparison["sentence"])
     return {"comparisons": comparisons}

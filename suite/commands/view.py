@@ -129,12 +129,12 @@ def _choose_trials(
     from suite.judging.requests import Evaluation
 
     folder = Path(config.run)
-    if any(folder.glob("journal-*.jsonl")):
-        raise ValueError(
-            f"{folder}: this suite eval is not finished; repeat its command to fly the remaining "
-            "trials, then view it"
-        )
     if not (folder / "trials.parquet").is_file():
+        if any(folder.glob("journal-*.jsonl")):
+            raise ValueError(
+                f"{folder}: this suite eval is not finished; repeat its command to fly the "
+                "remaining trials, then view it"
+            )
         for name in ("pick", "policy"):
             value = getattr(config, name)
             if value != getattr(Config, name):

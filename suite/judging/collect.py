@@ -82,6 +82,7 @@ def collect(
         "collection": collection,
         "policy": policy_record(source, policy),
         "vehicle": trial_set.vehicle,
+        "sensors": trial_set.sensors,
         "tracks": trial_set.tracks,
         "git_commit": git_commit(),
         "engines": engines(),
@@ -227,7 +228,7 @@ def _existing_rows(out: Path, identity: dict[str, Any]) -> dict[TrialSpec, Row]:
         return {}
     try:
         listing = read_json(path)
-        is_same = without_paths({key: listing[key] for key in identity}) == identity
+        is_same = without_paths({key: listing.get(key) for key in identity}) == identity
         rows = {
             TrialSpec(row["track"], row["difficulty"], row["seed"]): row
             for row in listing["flights"]

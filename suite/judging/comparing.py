@@ -7,6 +7,7 @@ of one method that differ only in the seed of their training are compared as a g
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,8 +19,10 @@ from eval.judging.statistics import Interval, over_seeds, paired_success, wilson
 from eval.worlds.trial import TrialResult, TrialSpec
 from tracks.input.reading import read_json
 
-CONDITIONS = ("world", "time_limit_s", "deadline_s")
+CONDITIONS = ("simulator", "time_limit_s", "deadline_s")
 """Settings that change the result of a trial, besides the trial itself and the input files."""
+MANNER = re.compile(r"(@[\d.e-]+)?(\+monitor)?$")
+"""End of a policy's label: its commanded speed and the safety monitor; see `flying.Manner`."""
 
 
 class Run(NamedTuple):
@@ -30,7 +33,11 @@ class Run(NamedTuple):
     rows: dict[TrialSpec, TrialResult]
     """The result of each trial."""
     conditions: dict[str, Any]
-    """Settings and input files that must be the same for a comparison."""
+    """Settings, and SHA-256 of input files, that must be the same for a comparison."""
+    versions: dict[str, Any]
+    """Versions of the suite and of MuJoCo, which may change results."""
+    manner: str
+    """End of the policy's label: "@0.5" at a commanded speed, "+monitor" inside the monitor."""
 
 
 def read_runs(folder: Path) -> list[Run]:
@@ -45,14 +52,21 @@ def read_runs(folder: Path) -> list[Run]:
     results, summary = read_trials(path), read_json(folder / "summary.json", judged=dict)
     if len({(row.trial, row.policy) for row in results}) < len(results):
         raise ValueError(f"{path}: holds a trial twice; run suite eval again")
-    conditions = {key: summary["judged"].get(key) for key in CONDITIONS}
-    conditions["files"] = summary.get("sha256")
+    # Runs of older versions call the simulator world, and have no digests of files.
+    judged = {"simulator": summary["judged"].get("world"), **summary["judged"]}
+    conditions, files = {key: judged.get(key) for key in CONDITIONS}, summary.get("sha256")
+    conditions |= files if isinstance(files, dict) else {"files": files}
+    versions = {key: summary.get(key) for key in ("suite_version", "git_commit")}
+    if (record := folder / "run.json").is_file():
+        versions["mujoco"] = read_json(record, packages=dict)["packages"].get("mujoco")
     names = list(dict.fromkeys(row.policy for row in results))
     return [
         Run(
             f"{folder}" if len(names) == 1 else f"{folder}: {name}",
             {row.trial: row for row in results if row.policy == name},
             conditions,
+            versions,
+            name.removeprefix(MANNER.sub("", name)),
         )
         for name in names
     ]
@@ -64,16 +78,18 @@ def refuse_other_conditions(first: Run, other: Run) -> None:
     Raises:
         ValueError: naming what differs and what to do.
     """
-    for key, value in first.conditions.items():
-        other_value = other.conditions.get(key)
-        if other_value != value:
-            condition = f"{key} ({value} and {other_value})"
-            if key == "files":
-                condition = "vehicle or tracks"
-            raise ValueError(
-                f"{first.name} and {other.name}: judged under another {condition}; run suite eval "
-                "again with the same options"
-            )
+    keys = dict.fromkeys([*first.conditions, *other.conditions])
+    pairs = {key: (first.conditions.get(key), other.conditions.get(key)) for key in keys}
+    if different := {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}:
+        # The value of a setting is printed, but not the digest of a file.
+        names = [
+            f"{key} ({values[0]} and {values[1]})" if key in CONDITIONS else key
+            for key, values in different.items()
+        ]
+        raise ValueError(
+            f"{first.name} and {other.name}: judged under different conditions: "
+            f"{', '.join(names)}; run suite eval again with the same options"
+        )
     unshared = first.rows.keys() ^ other.rows.keys()
     if unshared:
         trial = min(unshared)
@@ -82,6 +98,17 @@ def refuse_other_conditions(first: Run, other: Run) -> None:
             f"as {trial.track}, level {trial.difficulty}, seed {trial.seed}; run suite eval for "
             "both with the same --track, --difficulty, --trials and --seed"
         )
+
+
+def version_notes(runs: Sequence[Run]) -> list[str]:
+    """Return a note for each of the runs' versions that is not the same in all of them."""
+    keys = dict.fromkeys(key for run in runs for key in run.versions)
+    found = {key: dict.fromkeys(str(run.versions.get(key)) for run in runs) for key in keys}
+    return [
+        f"the runs have different versions ({key}: {', '.join(values)}), which may change results"
+        for key, values in found.items()
+        if len(values) > 1
+    ]
 
 
 def compare_runs(first: Run, other: Run) -> dict[str, Any]:
@@ -130,10 +157,18 @@ def compare_seeds(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, 
         others: the same for a second method, whose rate is subtracted; may be empty.
 
     Raises:
-        ValueError: if conditions or trials differ, or a method has only one seed.
+        ValueError: if conditions or trials differ, or a method has only one seed, or several
+            commanded speeds or the monitor in some of its runs.
     """
     for run in (*runs[1:], *others):
         refuse_other_conditions(runs[0], run)
+    for group in (runs, others):
+        for run in group[1:]:
+            if run.manner != group[0].manner:
+                raise ValueError(
+                    f"{group[0].name} and {run.name}: are no training seeds of one method, because "
+                    "their --speed or --monitor differ; run suite eval for each of them alone"
+                )
     trials = list(runs[0].rows)
     # Successes of each method, (seeds, trials).
     groups = [
@@ -150,6 +185,8 @@ def compare_seeds(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, 
         if others_successes:
             interval = Interval(*paired_success(successes, others_successes[0])[:3])
             method = "over trials only: Newcombe"
+    lowest = -1.0 if others else 0.0
+    interval = interval._replace(low=max(lowest, interval.low), high=min(1.0, interval.high))
     rates = [[float(rate) for rate in group.mean(1)] for group in groups]
     return {
         "trials": len(trials),

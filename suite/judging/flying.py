@@ -222,7 +222,7 @@ def without_paths(settings: dict[str, Any]) -> dict[str, Any]:
     They have the content or the SHA-256 of the files instead, so that files may be moved.
     """
     settings = plain(settings)
-    paths = {"policy": ("source",), "collection": ("policy", "vehicle")}
+    paths = {"policy": ("source",), "collection": ("policy", "vehicle", "sensors")}
     for part, keys in paths.items():
         if isinstance(settings.get(part), dict):
             entries = settings[part].items()

@@ -17,7 +17,7 @@ from suite.judging.content import policy_digest
 from suite.judging.evaluate import file_digests
 from suite.judging.flying import default_policy, load_in_manner, manners
 from suite.judging.requests import Evaluation
-from suite.judging.trials import custom_tracks, parse_levels, parse_tracks, trial_list
+from suite.judging.trials import parse_levels, parse_tracks, read_trial_set, trial_list
 from tracks.common.toml_table import Table
 from tracks.input.ranges import check_ranges
 from tracks.input.reading import read_json
@@ -105,13 +105,11 @@ def fly_again(
     """
     from eval.judging.guard import ActionLimits
     from eval.judging.judge import JudgeOptions, Record, fly
-    from eval.quadrotor.vehicle_file import load_vehicle
-    from eval.sensors.sensors_file import load_sensors
     from eval.view.recording import Drone
     from eval.worlds.trial import Rules, track_of
 
     # Read the inputs as the evaluation did.
-    sensors = load_sensors(evaluation.sensors)
+    _, tracks, vehicle, sensors, *_ = read_trial_set(evaluation)
     options = JudgeOptions(
         workers=1,
         rules=Rules(time_limit_s=evaluation.time_limit_s),
@@ -121,8 +119,6 @@ def fly_again(
     name = policy or (evaluation.policies or (default_policy(),))[0]
     manner = manners(evaluation.speed, monitor=False)[0]
     loaded = load_in_manner(name, evaluation.trust, manner)
-    vehicle = load_vehicle(evaluation.vehicle)
-    tracks = custom_tracks(parse_tracks(evaluation.track))
     if judged is not None:
         digests = {"policy": policy_digest(name), **file_digests(vehicle, tracks, sensors)}
         sources = {"policy": name, "vehicle": evaluation.vehicle, "sensors": evaluation.sensors}

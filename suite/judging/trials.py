@@ -8,7 +8,7 @@ a family, which draws it from the seed, or a file. `read_trial_set` reads all th
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from eval.vehicles.vehicle import Vehicle
     from eval.worlds.trial import TrialSpec
     from suite.common.console import Console
-    from suite.judging.requests import Collection, Evaluation
+    from suite.judging.requests import SimulatedFlights
     from tracks.track import Track
 
 LEVELS = tuple(range(10))
@@ -91,11 +91,15 @@ def custom_tracks(names: Sequence[str]) -> dict[str, Track]:
 
 
 def trial_list(
-    tracks: Sequence[str], levels: Sequence[int], trials: int, seed: int, once: bool = False
+    tracks: Sequence[str],
+    levels: Sequence[int],
+    trials: int,
+    seed: int,
+    once: Collection[str] = (),
 ) -> list[TrialSpec]:
     """Return the trials of every track at every level, with the seeds seed, seed + 1, ...
 
-    A track from a file has no levels: it is flown with every seed or, if `once`, with the first.
+    A track from a file has no levels. The tracks in `once` are flown with the first seed only.
     """
     from eval.worlds.trial import TrialSpec
 
@@ -104,7 +108,7 @@ def trial_list(
         TrialSpec(track, level, number)
         for track in tracks
         for level in ([0] if is_track_file(track) else levels)
-        for number in (seeds[:1] if once and is_track_file(track) else seeds)
+        for number in (seeds[:1] if track in once else seeds)
     ]
 
 
@@ -125,7 +129,12 @@ class TrialSet(NamedTuple):
     """Other notes for the user, as sentences."""
 
 
-def read_trial_set(options: Evaluation | Collection, real_time: bool = False) -> TrialSet:
+def read_trial_set(
+    options: SimulatedFlights,
+    real_time: bool = False,
+    track: Track | None = None,
+    vehicle: Vehicle | None = None,
+) -> TrialSet:
     """Return the trials that a command's options describe.
 
     A track from a file is flown only once if all its flights would be equal.
@@ -133,34 +142,46 @@ def read_trial_set(options: Evaluation | Collection, real_time: bool = False) ->
     Args:
         options: the options of the command.
         real_time: whether flights are in real time. Then no two flights are equal.
+        track: a track that is flown instead of those that `options` name.
+        vehicle: a vehicle that flies instead of the one that `options` name.
 
     Raises:
         ValueError: for an unknown simulator or track, too few trials, or an invalid file.
     """
     from eval.effects import EFFECTS
     from eval.quadrotor.vehicle_file import load_vehicle
+    from eval.sensors import SENSORS
     from eval.sensors.sensors_file import load_sensors
     from eval.worlds import differences, world_class
     from eval.worlds.engine import refuse_start_contact
 
     world_class(options.simulator)
     check_ranges(options, options=True)
-    names = parse_tracks(options.track)
-    vehicle = load_vehicle(options.vehicle)
+    vehicle = vehicle or load_vehicle(options.vehicle)
     sensors = load_sensors(options.sensors)
-    levels, tracks, notes = parse_levels(options.difficulty), custom_tracks(names), list[str]()
+    if track is None:
+        names, levels = parse_tracks(options.track), parse_levels(options.difficulty)
+        tracks = custom_tracks(names)
+    else:
+        names, levels, tracks = [track.family], [0], {track.family: track}
+    notes = list[str]()
     # Without random effects every seed would give the same flight on a track from a file.
-    is_random = sensors.models or any(EFFECTS[name].random for name in vehicle.effects)
-    once = not (real_time or is_random)
-    if once and options.trials > 1:
-        notes = [
+    is_random = sensors.random or any(EFFECTS[name].random for name in vehicle.effects)
+    once = () if real_time or is_random else tracks.keys()
+    if options.trials > 1:
+        notes += [
             f"{name}: flown once, not {options.trials} times: without random effects (gusts, "
             "noise) all flights on a track from a file are equal"
-            for name in tracks
+            for name in once
         ]
-    for name, track in tracks.items():
-        refuse_start_contact(name, track, vehicle)
-        notes += _in_millimetres(name, track)
+    if sensors.estimator is None and any(SENSORS[name].measure for name in sensors.models):
+        notes.append(
+            f"sensors {sensors.name!r}: the IMU has no effect, because only an estimator "
+            "(gate_filter) uses it"
+        )
+    for name, custom in tracks.items():
+        refuse_start_contact(name, custom, vehicle)
+        notes += _in_millimetres(name, custom)
     trials = trial_list(names, levels, options.trials, options.seed, once)
     simulator_differences = differences(options.simulator, vehicle)
     return TrialSet(trials, tracks, vehicle, sensors, simulator_differences, notes)

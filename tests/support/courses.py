@@ -7,6 +7,16 @@ from eval.worlds.trial import TrialSpec
 from tracks.geometry.scene import Boxes, Gates, Scene, Spheres, no_rods
 from tracks.track import Track
 
+IN_CONTACT = """
+[start]
+position = [0.0, 0.0, 0.02]
+[[gates]]
+center = [5.0, 0.0, 1.3]
+width = 1.0
+height = 1.0
+"""
+"""A track file whose start is too close to the ground."""
+
 
 def straight(distances=(2.0, 4.0), wall_at=None, height=1.5, name="straight"):
     """Return gates without frames on the x axis, and a wall across it."""

@@ -51,10 +51,8 @@ class Flight(NamedTuple):
 def warm_up(policy: Policy) -> None:
     """Run a policy a few times before a flight, so that nothing is compiled in flight."""
     spec = policy.spec
-    size = (1, spec.camera.height, spec.camera.width)
-    observation = Observation(
-        np.zeros((1, spec.state_size), np.float32), np.zeros(size, np.float32)
-    )
+    shapes = (1, spec.state_size), (1, *spec.image_shape)
+    observation = Observation(*(np.zeros(shape, np.float32) for shape in shapes))
     hidden = policy.start(1)
     for _ in range(3):
         _, hidden = policy.act(hidden, *observation, np.ones(1, bool))

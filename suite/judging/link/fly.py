@@ -99,6 +99,8 @@ def fly_over_link(
         loaded, flying = Monitored(loaded), Monitored(flying)
     settings = LinkFlights(evaluation, policy_record(name, loaded), limits, link or "simulated")
     refuse_other_run(out, settings)
+    if (out / FLY).is_file() or any(out.glob("*.parquet")):
+        raise ValueError(f"--out {out} holds earlier flights; give another --out")
     rules = Rules(time_limit_s=evaluation.time_limit_s)
     # The judge's trials come before the flights, since the judge may refuse the policy.
     judged = [] if link else _judged_successes(loaded, trial_set, rules)
@@ -154,8 +156,6 @@ def _fly_real_vehicle(
             f"--link flies one flight, and these options give {len(trial_set.trials)}; give one "
             "track, one level and --trials 1"
         )
-    if (out / FLY).is_file() or any(out.glob("*.parquet")):
-        raise ValueError(f"--out {out} holds an earlier flight; give another --out")
     (trial,) = trial_set.trials
     warm_up(policy)
     wire = Wire(COMPANION, VEHICLE, key)

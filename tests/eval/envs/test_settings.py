@@ -14,6 +14,8 @@ import tracks
 from eval.envs.gymnasium_env import RaceEnv, RaceVectorEnv
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies.spec import ActionSpec, DepthEncoding, PolicySpec
+from tests.support.courses import IN_CONTACT
+from tracks.formats.custom import load_track
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # of the renderers that dm_control looks for
@@ -30,7 +32,7 @@ SLOW = replace(VEHICLE, controller=replace(VEHICLE.controller, frequency=200.0))
         (PolicySpec(action=ActionSpec(scale=(20.0,))), "spec.action is .*20.* SI units"),
         (PolicySpec(depth=DepthEncoding(channel_axis=True)), "spec.depth is .* channel_axis=False"),
         (PolicySpec(depth=DepthEncoding(uint8=True)), "spec.depth is .* uint8=False"),
-        (PolicySpec(rate_hz=300.0), "spec.rate_hz is 300, allowed is up to the 200 Hz"),
+        (PolicySpec(rate_hz=300.0), "the spec decides at 300 Hz; .* up to the 200 Hz"),
     ],
 )
 def test_dm_control_refuses_a_spec_that_it_would_ignore(spec, said):
@@ -53,7 +55,10 @@ CTBR = PolicySpec(action=ActionSpec("ctbr"))
     ("settings", "said"),
     [
         ({"spec": PolicySpec(rate_hz=0.0)}, "spec.rate_hz.* is 0"),
-        ({"spec": PolicySpec(rate_hz=300.0), "vehicle": SLOW}, "rate_hz is 300, .* 200 Hz"),
+        (
+            {"spec": PolicySpec(rate_hz=300.0), "vehicle": SLOW},
+            "the spec decides at 300 Hz; .* 200 Hz",
+        ),
         ({"spec": PolicySpec(action=ActionSpec("ctbr", (1.0, 2.0)))}, "action.scale is .*1 or 4"),
         ({"spec": PolicySpec(action=ActionSpec("ctbt"))}, "unknown kind of action 'ctbt'"),
         ({"spec": CTBR, "action": "motors"}, "action is 'motors', allowed is the spec's 'ctbr'"),
@@ -83,6 +88,16 @@ def test_paths_and_numpy_numbers_are_taken():
     _, info = env.reset(seed=0)
     assert info["level"] == 3
     assert RaceEnv(level=np.array([2, 2])).reset(seed=0)[1]["level"] == 2
+
+
+def test_a_track_on_which_the_vehicle_starts_in_contact_is_refused(tmp_path):
+    (tmp_path / "low.toml").write_text(IN_CONTACT)
+    for make in (
+        lambda: RaceEnv(track=tmp_path / "low.toml"),
+        lambda: load(track=load_track(tmp_path / "low.toml")),
+    ):
+        with pytest.raises(ValueError, match=r"at start.position .* touches ground; move the"):
+            make()
 
 
 @pytest.mark.parametrize("seed", [(1, 2), np.array([1, 2]), [1, 2]])

@@ -36,7 +36,8 @@ def test_a_diverged_flight_can_still_be_seen(tmp_path):
     result = result._replace(ended_by="diverged")
     write_recording(tmp_path / "a.rrd", [(track, lost, result)], Drone(camera=Camera(pitch_deg=0)))
     write_picture(tmp_path / "a.png", track, lost, result)
-    write_video(tmp_path / "a.gif", track, lost, result, SMALL)
+    for images in (lost.depth_m, None):
+        write_video(tmp_path / "a.gif", track, lost._replace(depth_m=images), result, SMALL)
     strips = columns(tmp_path / "a.rrd")["/trial_0/world/path", "LineStrips3D:strips"][1][0]
     assert len(strips) == len(pos) - 4
 

@@ -17,6 +17,7 @@ from tests.support.vehicles import with_effects
 
 GATE = "[[gates]]\ncenter = [{x}, 0.0, 1.3]\nwidth = 1.0\nheight = 1.0\n"
 COURSE = GATE.format(x=0.0) + GATE.format(x=5.0)
+SENSORS = 'name = "mine"\n[[state]]\nkind = "state_noise"\nvelocity = 1.0\n'
 TWO = "collect --track zigzag --difficulty 0 --trials 2 --seed 7 --time-limit-s 1.5"
 
 
@@ -46,8 +47,10 @@ def test_collect_writes_logs_that_read_back_and_goes_on(pilots, tmp_path, monkey
 def test_flights_of_another_course_or_code_are_not_taken_for_its_own(
     pilots, tmp_path, monkeypatch, capfd
 ):
-    track = tmp_path / "course.toml"
+    track, sensors = tmp_path / "course.toml", tmp_path / "sensors.toml"
+    sensors.write_text(SENSORS)
     args = ("collect --policy", pilots["diver"], "--track", track, "--out", tmp_path / "flights")
+    args = (*args, "--sensors", sensors)
     for text in (COURSE, f"# in other words\n{COURSE}"):
         track.write_text(text)
         assert run(*args) == 0
@@ -57,8 +60,10 @@ def test_flights_of_another_course_or_code_are_not_taken_for_its_own(
     with monkeypatch.context() as patch:
         patch.setattr(suite.judging.collect, "engines", lambda: {"numpy": "another"}, False)
         assert "or of a package" in refused(capfd, *args)
-    track.write_text(COURSE.replace("1.0", "1.1"))
-    assert "another collection" in refused(capfd, *args)
+    for file, text in ((track, COURSE), (sensors, SENSORS)):
+        file.write_text(text.replace("1.0", "1.1"))
+        assert "another collection" in refused(capfd, *args)
+        file.write_text(text)
 
 
 def test_flights_are_the_same_where_policy_and_vehicle_were_moved(

@@ -1,5 +1,6 @@
 """Comparisons of evaluations: published examples, coverage, and what is refused."""
 
+import json
 from math import erf, sqrt
 
 import numpy as np
@@ -11,6 +12,7 @@ from eval.judging.statistics import over_seeds, paired_success, wilson
 from suite.commands import compare
 from suite.common.console import Quiet
 from suite.judging.comparing import compare_runs, compare_seeds, read_runs
+from suite.judging.requests import Evaluation
 from tests.support.judged_cells import result
 
 
@@ -57,10 +59,9 @@ def test_the_interval_of_a_small_layout_is_that_of_its_mean_squares_and_one_seed
             over_seeds(*values)
 
 
-def run_of(folder, successes, **judged):
-    rows = [result(seed, bool(success)) for seed, success in enumerate(successes)]
-    conditions = {"world": "mujoco", "time_limit_s": 20.0, "deadline_s": None, **judged}
-    summary = {"judged": conditions, "sha256": {"vehicle": "a"}}
+def run_of(folder, successes, judged=None, policy="ours", **digests):
+    rows = [result(seed, bool(success), policy) for seed, success in enumerate(successes)]
+    summary = {"judged": judged or Evaluation(), "sha256": {"vehicle": "a", **digests}}
     write_results(folder, rows, table_markdown="", summary=summary, seed=0)
     return folder
 
@@ -74,9 +75,17 @@ def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path):
     assert " minus " in found["sentence"] and "McNemar" in found["sentence"]
     answer = compare.run(compare.Config((a, b), seeds=True), Quiet())
     assert "2 training seeds" in answer["comparisons"][0]["sentence"]
-    apart = run_of(tmp_path / "c", rng.random(40) < 0.5, time_limit_s=10.0)
-    with pytest.raises(ValueError, match=r"another time_limit_s \(20.0 and 10.0\)"):
-        compare_runs(*read_runs(a), *read_runs(apart))
+    for judged, digests, said in (
+        (Evaluation(simulator="mjx"), {}, r"simulator \(mujoco and mjx\);"),
+        ({"world": "mjx", "time_limit_s": 20.0}, {}, r"simulator \(mujoco and mjx\);"),
+        (Evaluation(time_limit_s=10.0), {}, r"time_limit_s \(20.0 and 10.0\);"),
+        (None, {"sensors": "b", "track my.toml": "c"}, "sensors, track my.toml;"),
+    ):
+        apart = run_of(tmp_path / "c", [True] * 40, judged, **digests)
+        with pytest.raises(ValueError, match=f"judged under different conditions: {said}"):
+            compare_runs(*read_runs(a), *read_runs(apart))
+    old = run_of(tmp_path / "old", [True] * 40, {"world": "mujoco", "time_limit_s": 20.0})
+    assert compare_runs(*read_runs(a), *read_runs(old))["trials"] == 40
     with pytest.raises(ValueError, match="10 trials are in only one of them"):
         compare_runs(*read_runs(a), *read_runs(run_of(tmp_path / "d", [True] * 30)))
     for folder, said in ((tmp_path, "no trials.parquet"), (None, "less than twice")):
@@ -112,8 +121,32 @@ def test_two_methods_are_compared_over_their_seeds(tmp_path):
         np.mean(found["success_by_seed"][0]) - np.mean(found["success_by_seed"][1])
     )
     assert "a difference of +" in found["sentence"] and len(found["spread"]) == 2
+    # With two seeds, Student's t would give an interval beyond all possible rates.
+    rates = [0.05, 0.95]
+    few = [read_runs(run_of(tmp_path / f"{r}", rng.random(60) < r))[0] for r in rates]
+    assert compare_seeds(few)["mean"][1:] == (0.0, 1.0)
+    assert compare_seeds(few, few[::-1])["mean"][1:] == (-1.0, 1.0)
     same = read_runs(run_of(tmp_path / "same", [True] * 60))[0]
     paired = paired_success(*[np.ones(60)] * 2)
     for others, low in (((), wilson(60, 60).low), ([same, same], paired.low)):
         found = compare_seeds([same, same], others)["mean"]
         assert found.low == pytest.approx(low) and found.low < found.value - 0.05
+
+
+def test_rows_of_other_speeds_or_the_monitor_are_no_training_seeds(tmp_path):
+    plain, other, *unlike = (
+        read_runs(run_of(tmp_path / policy, [True, False], policy=policy))[0]
+        for policy in ("a@0.5", "b@0.5", "a", "a@1", "a@0.5+monitor")
+    )
+    assert compare_seeds([plain, other], unlike[:1] * 2)["trials"] == 2
+    for run in unlike:
+        with pytest.raises(ValueError, match="are no training seeds of one method"):
+            compare_seeds([plain, run])
+
+
+def test_other_versions_are_noted(tmp_path, capsys):
+    folders = [run_of(tmp_path / name, [True, False]) for name in "ab"]
+    for folder, version in zip(folders, ("3.3.0", "3.4.0"), strict=True):
+        (folder / "run.json").write_text(json.dumps({"packages": {"mujoco": version}}))
+    compare.run(compare.Config(tuple(folders)), Quiet())
+    assert "(mujoco: 3.3.0, 3.4.0)" in " ".join(capsys.readouterr().err.split())

@@ -9,9 +9,11 @@ from typing import Any
 
 import pytest
 
+import eval.judging.judge
 import suite
 from eval.judging.results import read_trials
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
+from eval.worlds.trial import TrialSpec
 from policies import shipped
 from policies.policy import load_policy
 from policies.spec import PolicyError
@@ -21,9 +23,11 @@ from suite.judging.flying import Manner, manners, policy_labels, workers_for
 from suite.judging.requests import Collection, Evaluation
 from suite.judging.trials import read_trial_set, trial_list
 from tests.support.commands import evaluate, refused
+from tests.support.courses import IN_CONTACT
 from tests.support.engines import STAND_IN
 from tests.support.vehicles import with_effects
 from tracks.common.work.pickling import pack
+from tracks.formats.custom import load_track
 
 YARD = str(Path(__file__).resolve().parents[3] / "tracks" / "examples" / "yard.toml")
 
@@ -66,6 +70,55 @@ def test_a_track_file_is_flown_once_a_seed_and_once_where_nothing_acts_by_chance
         read_trial_set(replace(asked, track=YARD), real_time=True),
     ):
         assert [trial.seed for trial in course.trials] == [0, 1, 2] and not course.notes
+
+
+@pytest.mark.parametrize(
+    ("stage", "text", "flights", "noted"),
+    [
+        ("state", 'kind = "delay"\nstate = 0.03', 1, "flown once"),
+        ("state", 'kind = "delay"\nstate = 0.03\njitter = 0.2', 3, None),
+        ("state", 'kind = "drag_tilt"\ndrag = 0.3', 1, "flown once"),
+        ("depth", 'kind = "image_motion"\nexposure = 0.01', 1, "flown once"),
+        ("gates", 'kind = "gate_map"\nshift = 0.05', 3, None),
+        ("imu", 'kind = "imu"\ngyro_noise = 0.1', 1, "the IMU has no effect"),
+    ],
+)
+def test_sensors_without_random_numbers_give_equal_flights(tmp_path, stage, text, flights, noted):
+    (tmp_path / "mine.toml").write_text(f'name = "mine"\n[[{stage}]]\n{text}\n')
+    options = Evaluation(track=YARD, trials=3, sensors=str(tmp_path / "mine.toml"))
+    trial_set = read_trial_set(options)
+    assert len(trial_set.trials) == flights
+    assert noted in trial_set.notes[-1] if noted else not trial_set.notes
+    assert len(read_trial_set(replace(options, sensors="imu+gates")).trials) == 3
+
+
+def test_a_start_in_contact_is_refused_wherever_a_track_file_is_flown(tmp_path, capsys):
+    track = tmp_path / "low.toml"
+    track.write_text(IN_CONTACT)
+    for command in ("eval --policy race", "view race", "collect --policy race"):
+        said = refused(capsys, command, "--track", track, "--out", tmp_path / "out")
+        assert "low.toml: at start.position" in said and "touches ground" in said
+    for given in (str(track), load_track(track)):
+        with pytest.raises(ValueError, match="touches ground"):
+            suite.evaluate_policy("race", track=given)
+
+
+def test_from_python_a_track_file_is_flown_and_a_named_policy_in_several_processes(monkeypatch):
+    flown = []
+
+    def fly(policy, trials, vehicle, world, options, tracks):
+        assert options.workers == 1 or pack(policy)
+        flown.append((options.workers, trials, list(tracks)))
+
+    monkeypatch.setattr(eval.judging.judge, "fly", fly)
+    suite.evaluate_policy("race-paper", track=YARD, trials=10)
+    suite.evaluate_policy("race-paper", track=load_track(YARD), trials=10)
+    suite.evaluate_policy(Path("race-paper"), track="zigzag", trials=2, workers=2)
+    # Without a number, a program without a main guard must still run.
+    suite.evaluate_policy("race-paper", track="zigzag", difficulty=3, trials=300)
+    numbers = [(workers, len(trials)) for workers, trials, _ in flown]
+    assert numbers == [(1, 1), (1, 1), (2, 4), (1, 300)]
+    assert flown[0][1:] == ([TrialSpec(YARD, 0, 0)], [YARD])
 
 
 def test_trials_and_slow_worlds_take_more_processes_and_seconds(monkeypatch):

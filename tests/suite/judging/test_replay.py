@@ -28,6 +28,9 @@ def test_view_flies_the_chosen_trials_again(pilots, tmp_path, capfd):
     rows = read_trials(out / "trials.parquet")
     assert said["trials"][0]["time_s"] == rows[0].time_s
     assert "--pick passed" in refused(capfd, *again, "--pick", "passed")
+    # A finished evaluation keeps trials of an earlier command in a journal.
+    (out / "journal-0.jsonl").write_text("{}\n")
+    assert run(*again, *"--count 1".split()) == 0
 
 
 def test_view_finds_the_trials_of_every_policy_of_a_run(pilots, tmp_path, capfd):

@@ -13,6 +13,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec, track_of
 from policies.block_policy import BlockPolicy
 from policies.policy import load_policy
+from policies.spec import DepthEncoding, PolicySpec
 from suite.common.console import Console
 from suite.judging.link import fly, server
 from suite.judging.link.companion import Companion, Row
@@ -273,7 +274,8 @@ def test_an_operator_who_ends_a_flight_is_told_to_the_vehicle_and_its_log_stays(
     assert run(REAL, tmp_path, "--confirm") == 1
     assert "the operator" in printed(capsys) and len(sent) == 1 and b"the operator" in sent[0]
     (tmp_path / "zigzag-0-0.parquet").write_text("the log of a flight that ended by an error")
-    assert "holds an earlier flight" in refused(capsys, REAL, tmp_path, "--confirm")
+    for command in (f"{REAL} {tmp_path} --confirm", f"fly --out {tmp_path}"):
+        assert "holds earlier flights" in refused(capsys, command)
 
 
 def printed(capsys):
@@ -307,6 +309,14 @@ def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first
     assert not (tmp_path / "b").exists()
 
 
+def test_the_warm_up_has_the_image_of_the_policys_spec():
+    policy = Pursuit(spec=PolicySpec(depth=DepthEncoding(channel_axis=True)))
+    shapes = []
+    policy.act = lambda hidden, state, image, fresh: shapes.append(image.shape) or (state, hidden)
+    warm_up(policy)
+    assert shapes == [(1, 1, 24, 32)] * 3
+
+
 def test_two_tracks_of_one_name_are_refused(root, tmp_path, capsys):
     """Their logs would have one name."""
     yard = root / "tracks" / "examples" / "yard.toml"
@@ -325,14 +335,14 @@ def test_a_flight_in_real_time_over_the_loopback(tmp_path, capsys):
 
 
 def test_a_speed_and_the_judges_monitor_fly_in_real_time_too(capsys, tmp_path, monkeypatch):
-    asked, flown = ("fly --out", tmp_path, "--policy"), []
-    said = refused(capsys, *asked, "race-paper", "--speed", "0.3")
+    flown = []
+    said = refused(capsys, "fly --policy race-paper --speed 0.3 --out", tmp_path)
     assert "--speed 0.3: race-paper takes no speed" in said
     monkeypatch.setattr(fly, "_fly_real_vehicle", lambda policy, *_: flown.append(policy) or {})
-    asked = (*asked, "race", "--link", "udpin:127.0.0.1:0", "--confirm")
-    assert run(*asked, "--speed", "0.3") == run(*asked) == 0
+    asked = (REAL.replace("fly", "fly --policy race --confirm"),)
+    assert run(*asked, tmp_path / "a", "--speed", "0.3") == run(*asked, tmp_path / "b") == 0
     assert [policy.spec.speed for policy in flown] == [0.3, load_policy("race").spec.speed]
-    found = answer(capsys, *asked, "--monitor")
+    found = answer(capsys, *asked, tmp_path / "c", "--monitor")
     policy = flown[-1]
     assert isinstance(policy, Monitored) and isinstance(policy.policy, BlockPolicy)
     assert policy.policy.block == 1
