@@ -142,7 +142,7 @@ def evaluate(
             f"{tracks}; a plan knows the whole track)"
         )
     console.say(f"written: {out / 'trials.parquet'}, table.md, summary.json")
-    if not all(row.success for row in results if row.policy == results[0].policy):
+    if not all(row.success for row in results if not row.policy.endswith("+monitor")):
         console.say(f"next: suite view {out} --pick failed shows what went wrong")
     return {**stamp(1, evaluation.seed), **summary, "out": str(out)}
 

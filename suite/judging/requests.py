@@ -23,7 +23,8 @@ class Flights:
     """Trials on tracks with a vehicle: options of all commands that fly a policy."""
 
     track: str = "all"
-    """zigzag, circular, ellipse, all of these, a track file (.toml), or a list with commas."""
+    """zigzag, circular, ellipse, all of these, random, a track file (.toml), or a list with
+    commas."""
     difficulty: str = "0,3"
     """Level from 0 (easy) to 9 (hard); several levels as 0,3,9 or 0-3 or all."""
     trials: Trials = 10
