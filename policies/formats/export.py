@@ -140,7 +140,7 @@ def export_module(
 
 
 def file_names(name: str, format: str) -> tuple[str, ...]:
-    """Return the names of the files of the policy `name` in one of `FORMATS`, the main one first."""
+    """Return the names of the policy's files in one of `FORMATS`, the main file first."""
     from policies.formats.c.project import FILES
 
     return FILES if format == "c" else (f"{name}{_WRITERS[format][0]}",)
