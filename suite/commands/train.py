@@ -70,7 +70,8 @@ class Config(Command):
     trained."""
     set: tuple[str, ...] = ()
     """Change settings by name, in every phase, such as loss.progress=0.4; from the second phase
-    on: phases.2.loss.progress=0.4."""
+    on: phases.2.loss.progress=0.4. A new spec.rate_hz also changes episode.steps, so that rollouts
+    last as long as before."""
     tensorboard: Advanced[bool] = False
     """Also write the curve for TensorBoard, into tensorboard/ of the run (extra `tensorboard`)."""
     list_settings: bool = False
