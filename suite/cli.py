@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as error:
         # Kept until the process ends: XLA's threads may still use data of the error's frames.
         sys.last_value = error
-        _print_message("interrupted; finished work is kept, and the same command continues")
+        _print_message("interrupted; the same command continues from saved work, if there is some")
         return INTERRUPTED
     except BrokenPipeError:
         # Nobody reads the output any more, so no message is printed.

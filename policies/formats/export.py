@@ -65,7 +65,7 @@ def export_policy(
             files = {file: text.encode() for file, text in project.items()}
         else:
             _, write = _WRITERS[format_name]
-            files = {main_file(name, format_name): write(checkpoint, texts)}
+            files = {file_names(name, format_name)[0]: write(checkpoint, texts)}
         for file, data in files.items():
             with replacing_file(out / file) as temporary:
                 temporary.write_bytes(data)
@@ -139,9 +139,11 @@ def export_module(
     return Path(path)
 
 
-def main_file(name: str, format: str) -> str:
-    """Return the file name of the policy `name` in one of `FORMATS`."""
-    return "policy.c" if format == "c" else f"{name}{_WRITERS[format][0]}"
+def file_names(name: str, format: str) -> tuple[str, ...]:
+    """Return the names of the policy's files in one of `FORMATS`, the main file first."""
+    from policies.formats.c.project import FILES
+
+    return FILES if format == "c" else (f"{name}{_WRITERS[format][0]}",)
 
 
 def check_formats(formats: Sequence[str], dtype: str = "float32") -> None:

@@ -88,7 +88,7 @@ class ModelProcess:
         self.labels: dict[str, str | bytes] = description.get("labels", {})
         """Texts of the file by name."""
         self.sizes: list[int] = description.get("sizes", [])
-        """For a C library: size of its state [bytes], then the sizes of its observation."""
+        """For a C library: size of its state [bytes], sizes of its observation and action."""
         self.inputs, self.outputs = (
             [Port(name, kind, tuple(shape)) for name, kind, shape in description[side]]
             for side in ("inputs", "outputs")

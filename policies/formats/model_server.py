@@ -141,7 +141,7 @@ def load_library(ctypes: Any, path: bytes, labels: list[str]) -> Loaded:
 
     library = ctypes.CDLL(path.decode())
     library.suite_json.restype = ctypes.c_char_p
-    state_bytes, *sizes = (library.suite_size(number) for number in range(4))
+    state_bytes, *sizes = (library.suite_size(number) for number in range(5))
     text = library.suite_json().decode(errors="replace")
     description = {
         "inputs": [],

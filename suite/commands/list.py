@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import tyro
 
@@ -14,6 +14,9 @@ from suite.common.console import Console
 from suite.common.options import Command
 from suite.common.usage import first_paragraph
 from tracks.common.names import unknown_name
+
+if TYPE_CHECKING:
+    from suite.train.config import TrainConfig
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         ValueError: for an unknown kind or recipe.
     """
     if config.kind == "settings":
-        return {"settings": list_settings(config.recipe, console)}
+        recipe = _module("suite.train.recipes").named_recipe(config.recipe)
+        return {"settings": list_settings(recipe, console)}
     if not config.kind:
         all_names = {name: sorted(kind.names()) for name, kind in KINDS.items()}
         width = max(map(len, all_names))
@@ -55,12 +59,14 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     return {config.kind: descriptions}
 
 
-def list_settings(recipe: str, console: Console) -> list[dict[str, Any]]:
-    """Print every setting of a recipe with its value, range and meaning, and return them."""
-    from suite.common.options import settings
-    from suite.train.recipes import named_recipe
+def list_settings(config: TrainConfig, console: Console) -> list[dict[str, Any]]:
+    """Print every setting of a training with its value, range and meaning, and return them.
 
-    all_settings = list(settings(named_recipe(recipe)))
+    The values are those before the phases.
+    """
+    from suite.common.options import settings
+
+    all_settings = [setting for setting in settings(config) if setting.path != "phases"]
     for setting in all_settings:
         allowed = f", allowed {setting.allowed}" if setting.allowed else ""
         console.say(f"{setting.path} = {setting.default!r}{allowed}\n    {setting.about}")

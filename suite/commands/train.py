@@ -70,7 +70,8 @@ class Config(Command):
     trained."""
     set: tuple[str, ...] = ()
     """Change settings by name, in every phase, such as loss.progress=0.4; from the second phase
-    on: phases.2.loss.progress=0.4."""
+    on: phases.2.loss.progress=0.4. A new spec.rate_hz also changes episode.steps, so that rollouts
+    last as long as before."""
     tensorboard: Advanced[bool] = False
     """Also write the curve for TensorBoard, into tensorboard/ of the run (extra `tensorboard`)."""
     list_settings: bool = False
@@ -120,7 +121,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         ValueError: for options that cannot be used or do not go together.
     """
     if config.list_settings:
-        return {"settings": list_settings(config.recipe, console)}
+        return {"settings": list_settings(resolve(config), console)}
     member = read_member(config.process_options)
     use_device(config.device)
     connect(member)
@@ -141,7 +142,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         # The trained policy goes to out/policy, which must not be the one to start from.
         start, trained = locate(config.init_from) / CONFIG, config.out / "policy" / CONFIG
         check_no_input(trained, [start], "--out")
-        params = load_start_params(config.init_from, resolved.spec)
+        params = load_start_params(config.init_from, phase_configs(resolved)[0].spec)
     if config.delta is not None:
         stored = load_delta(config.delta)
         fit = stored.config.get("fit", {})

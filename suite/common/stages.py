@@ -17,6 +17,7 @@ import psutil
 from suite.common.console import Console, duration, size
 from suite.common.provenance import write_run_record
 from tracks.common.files import plain, write_json
+from tracks.input.ranges import shown
 from tracks.input.reading import read_json
 
 MARK = "stage.json"
@@ -59,7 +60,7 @@ def differences(stored: Any, new: Any, name: str = "") -> list[str]:
             path = f"{name}.{key}" if name else str(key)
             changes += differences(stored.get(key), new.get(key), path)
         return changes
-    return [] if stored == new else [f"{name} is {stored!r} there, {new!r} here"]
+    return [] if stored == new else [f"{name} is {shown(stored)} there, {shown(new)} here"]
 
 
 def first_changes(changes: Sequence[str]) -> str:

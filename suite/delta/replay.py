@@ -155,7 +155,8 @@ def check_corrects(
         raise ValueError(
             f"--delta {checkpoint} was fitted to flights with {rate:.3g} decisions a second, and "
             f"this run has {rate_hz:g}: its memory is updated at each decision; fit again to "
-            f"flights of a policy of {rate_hz:g} Hz, or give --set spec.rate_hz={round(rate)}"
+            f"flights of a policy of {rate_hz:g} Hz, or give --finetune if the recipe's last phase "
+            f"has {round(rate)} Hz, or --set spec.rate_hz={round(rate)}"
         )
     plant = fit.get("plant", training["plant"])
     if plant == training["plant"]:

@@ -76,19 +76,7 @@ def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -
     """
     windows = [window for log in logs for window in _flight_windows(log, duration_s, stride_s)]
     refuse_no_windows(windows, logs, duration_s)
-    steps = min(len(window.action_b) for window in windows)
-
-    def truncated(window: PointMassWindows) -> PointMassWindows:
-        """Truncate a window to the number of decisions that all windows have."""
-        return window._replace(
-            pos_w=window.pos_w[: steps + 1],
-            vel_w=window.vel_w[: steps + 1],
-            heading_w=window.heading_w[: steps + 1],
-            action_b=window.action_b[:steps],
-            time_step=window.time_step[:steps],
-        )
-
-    return stack_windows([truncated(window) for window in windows])
+    return stack_windows(windows)
 
 
 def refuse_no_windows(windows: Sequence[Any], logs: Sequence[FlightLog], duration_s: float) -> None:
@@ -106,18 +94,25 @@ def refuse_no_windows(windows: Sequence[Any], logs: Sequence[FlightLog], duratio
 
 
 def stack_windows(windows: Sequence[T]) -> T:
-    """Return windows of one shape along a new first axis, as 32-bit numbers.
+    """Return windows along a new first axis, as 32-bit numbers.
 
-    Their burn-ins are truncated to the number of decisions that all have, since flights with
-    slightly shorter periods have more decisions in the same time.
+    They are truncated to the number of decisions that all have, and so are their burn-ins, since
+    flights with slightly shorter periods have more decisions in the same time.
     """
     items: Sequence[Any] = windows
     count = min(len(item.burn_in.seen) for item in items)
-    truncated = [
+    items = [
         item._replace(burn_in=BurnIn(*(array[len(array) - count :] for array in item.burn_in)))
         for item in items
     ]
-    return jax.tree.map(lambda *arrays: np.stack(arrays).astype(np.float32), *truncated)
+
+    def stacked(*arrays: Any) -> np.ndarray:
+        if np.ndim(arrays[0]):
+            steps = min(map(len, arrays))
+            arrays = tuple(array[:steps] for array in arrays)
+        return np.stack(arrays).astype(np.float32)
+
+    return jax.tree.map(stacked, *items)
 
 
 def log_decisions(log: FlightLog) -> tuple[np.ndarray, np.ndarray]:

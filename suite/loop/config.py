@@ -17,10 +17,9 @@ from policies import shipped
 from suite.delta.fit import FitConfig
 from suite.judging.trials import is_track_file, parse_levels, parse_tracks
 from suite.train.config import TrainConfig, check
-from suite.train.overrides import check_owned, check_phases, override, phase_configs, with_changes
+from suite.train.overrides import at_rate, check_owned, check_phases, phase_configs, with_changes
 from suite.train.recipes import (
     RECIPES,
-    at_rate,
     finetune,
     named_recipe,
     with_iterations,
@@ -188,7 +187,7 @@ def resolve(
         "vehicle": digest_of(simulated),
         "sensors": digest_of(sensors_table(load_sensors(sensors))),
     }
-    _check_changes(changes, policy, iterations)
+    _check_changes(changes, policy, iterations, hidden)
     if not delta and not hidden:
         raise ValueError(
             "--no-delta: without --hidden-vehicle the loop needs the Delta Action Model; leave "
@@ -228,7 +227,7 @@ def resolve(
     if hidden:
         tuning = with_usual_spreads(with_quadrotor(tuning, simulated))
     if policy is not None:
-        tuning = override(tuning, changes)
+        tuning = with_changes(tuning, changes)
     fit_steps = size.fit_iterations if fit_iterations is None else fit_iterations
     check(tuning)
     config = LoopConfig(
@@ -253,13 +252,17 @@ def resolve(
     return config
 
 
-def _check_changes(changes: Sequence[str], policy: str | None, iterations: int | None) -> None:
+def _check_changes(
+    changes: Sequence[str], policy: str | None, iterations: int | None, hidden: bool
+) -> None:
     """Refuse options of a first training if there is none, and settings that the loop itself sets.
 
     Raises:
         ValueError: with the option and what to do instead.
     """
     owned = {"seed": "give --seed"}
+    if hidden:
+        owned["quadrotor.vehicle"] = "give --vehicle"
     if policy is None:
         owned["optimizer.iterations"] = "give --iterations"
     else:

@@ -296,6 +296,10 @@ def check(config: TrainConfig) -> None:
     check_ranges(config)
     check_spec(config.spec)
     check_network(config.spec)
+    if config.spec.action.kind != "acceleration":
+        raise ValueError(
+            f"spec.action.kind is {config.spec.action.kind}, allowed for a training is acceleration"
+        )
     if config.quadrotor is not None:
         from eval.vehicles.vehicle_check import check_vehicle
 

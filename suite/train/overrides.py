@@ -11,7 +11,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar, get_args, get_type_hints
 
@@ -36,6 +36,7 @@ NEEDS = {
     "loss.speed_range": "spec.speed_input",
     "episode.race_share": "spec.speed_input",
     "episode.stop_from": "episode.rest_share",
+    "spec.speed": "spec.speed_input",
 }
 """Setting -> the setting without which it has no effect (while that is 0 or False)."""
 ABSENT = {
@@ -55,6 +56,14 @@ def override(config: T, changes: Iterable[str]) -> T:
         ValueError: naming the setting, what is wrong with it and what is allowed.
     """
     changes = list(changes)
+    config = _changed(config, changes)
+    for change in changes:
+        _check_effective([config], _path(change), shown(change))
+    return config
+
+
+def _changed(config: T, changes: Iterable[str]) -> T:
+    """Return `config` with the changes made, also those that have no effect."""
     for change in changes:
         path, separator, text = change.partition("=")
         if not separator:
@@ -63,21 +72,24 @@ def override(config: T, changes: Iterable[str]) -> T:
         _check_model(config, keys, shown(change))
         config = _with_value(config, keys, text.strip(), shown(change))
         check_ranges(config, f"--set {shown(change)}: ")
-    for change in changes:
-        _check_effective(config, change.partition("=")[0].strip(), shown(change))
     return config
 
 
-def _check_effective(config: object, path: str, change: str) -> None:
-    """Refuse a setting that has no effect because of another one."""
+def _path(change: str) -> str:
+    """Return the path of a change PATH=VALUE."""
+    return change.partition("=")[0].strip()
+
+
+def _check_effective(phases: Sequence[object], path: str, change: str) -> None:
+    """Refuse a setting that has no effect in any of the `phases` because of another one."""
     for name, need in NEEDS.items():
         part, _, field = need.partition(".")
         if is_within(path, name):
-            value = getattr(getattr(config, part, None), field, None)
-            if value is not None and not value:
+            values = [getattr(getattr(phase, part, None), field, None) for phase in phases]
+            if all(value is not None and not value for value in values):
                 raise ValueError(
-                    f"--set {change}: {path} has no effect while {need} is {value!r}; set that as "
-                    "well, or leave this out"
+                    f"--set {change}: {path} has no effect while {need} is {values[0]!r}; set that "
+                    "as well, or leave this out"
                 )
 
 
@@ -108,9 +120,7 @@ def check_owned(changes: Iterable[str], owned: Mapping[str, str], option: str = 
         ValueError: naming the setting and what to do instead.
     """
     for change in changes:
-        path = change.partition("=")[0].strip()
-        if path.startswith(PREFIX):  # the same setting, from one phase on
-            path = path.removeprefix(PREFIX).partition(".")[2].strip()
+        path = _path(_phase_of(change)[1])
         for owned_path, advice in owned.items():
             if is_within(path, owned_path):
                 raise ValueError(f"{option} {shown(change)}: this command sets {path}; {advice}")
@@ -188,7 +198,7 @@ def phase_configs(config: TrainConfig) -> tuple[TrainConfig, ...]:
     phases = config.phases or (Phase(),)
     for number, (phase, end) in enumerate(zip(phases, phase_ends(config), strict=True), 1):
         try:
-            settings = override(settings, phase.set)
+            settings = _changed(settings, phase.set)
         except ValueError as error:
             raise ValueError(f"phase {number}: {error}") from error
         optimizer = replace(settings.optimizer, iterations=max(1, end - beginning))
@@ -236,29 +246,104 @@ def with_changes(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
     Args:
         config: settings of the run.
         changes: PATH=VALUE, such as "loss.progress=0.4", for every phase; "phases.2.PATH=VALUE"
-            holds from the second phase until a later phase changes that setting.
+            holds from the second phase until a later phase changes that setting. A change of
+            spec.rate_hz without one of episode.steps keeps the length of rollouts [s].
 
     Raises:
         ValueError: naming the setting, what is wrong with it and what is allowed.
     """
-    changes = [change.strip() for change in changes]
-    in_all_phases = [change for change in changes if not change.startswith(PREFIX)]
-    # These replace the recipe's own changes in its phases, but not the user's.
-    paths = {change.partition("=")[0].strip() for change in in_all_phases}
-    config = override(_without_phase_changes(config, paths), in_all_phases)
-    phases = list(config.phases)
+    # A run's record does not depend on the order of changes of different settings.
+    changes = sorted((change.strip() for change in changes), key=_path)
     for change in changes:
-        if not change.startswith(PREFIX):
-            continue
-        number, _, rest = change.removeprefix(PREFIX).partition(".")
-        if not (number.isdecimal() and 1 <= int(number) <= len(phases)):
-            raise ValueError(
-                f"--set {shown(change)}: this run has {len(phases)} phases; write phases.N.SETTING="
-                "VALUE with N from 1"
-            )
-        phase = phases[int(number) - 1]
-        phases[int(number) - 1] = replace(phase, set=(*phase.set, rest.strip()))
-    return replace(config, phases=tuple(phases))
+        _check_phase(change, len(config.phases))
+    in_all_phases = [change for change in changes if not change.startswith(PREFIX)]
+    in_all_phases = [*_same_seconds(config, in_all_phases), *in_all_phases]
+    # These replace the recipe's own changes in its phases, but not the user's.
+    config = _changed(_without_phase_changes(config, map(_path, in_all_phases)), in_all_phases)
+    phases = list(config.phases)
+    for index, phase in enumerate(config.phases):
+        own = [rest for text, rest in map(_phase_of, changes) if text and int(text) == index + 1]
+        own = [*_same_seconds(phase_configs(config)[index], own), *own]
+        phases[index] = replace(phase, set=(*phase.set, *own))
+        config = replace(config, phases=tuple(phases))
+    configs = phase_configs(config)
+    for change in changes:
+        number, rest = _phase_of(change)
+        _check_effective(configs[int(number or 1) - 1 :], _path(rest), shown(change))
+    return config
+
+
+def _phase_of(change: str) -> tuple[str, str]:
+    """Return the number of the phase from which a change holds, "" for all, and the change."""
+    if not change.startswith(PREFIX):
+        return "", change
+    number, _, rest = change.removeprefix(PREFIX).partition(".")
+    return number, rest.strip()
+
+
+def _check_phase(change: str, count: int) -> None:
+    """Refuse a change from a phase on that cannot be made in a run with `count` phases."""
+    number, rest = _phase_of(change)
+    if not change.startswith(PREFIX):
+        return
+    if not count:
+        raise ValueError(f"--set {shown(change)}: this run has no phases; write SETTING=VALUE")
+    if not (number.isdecimal() and 1 <= int(number) <= count):
+        raise ValueError(
+            f"--set {shown(change)}: this run has {count} phases; write phases.N.SETTING=VALUE "
+            "with N from 1"
+        )
+    if _path(rest) == "optimizer.iterations":
+        raise ValueError(
+            f"--set {shown(change)}: phases take shares of the run's gradient steps; set "
+            "optimizer.iterations without a phase"
+        )
+
+
+def _same_seconds(config: TrainConfig, changes: Sequence[str]) -> list[str]:
+    """Return further changes that keep rollouts and delays as long [s] if `changes` set the rate.
+
+    There are none if `changes` also set the number of steps.
+    """
+    paths = set(map(_path, changes))
+    rate = [change for change in changes if _path(change) == "spec.rate_hz"]
+    if not rate or "episode.steps" in paths:
+        return []
+    same = at_rate(config, _changed(config, rate).spec.rate_hz)
+    values: dict[str, object] = {
+        "episode.steps": same.episode.steps,
+        "episode.image_stride": same.episode.image_stride,
+        "physics.state_delay": same.physics.state_delay,
+        "physics.image_delay": same.physics.image_delay,
+    }
+    if config.quadrotor is None:
+        values["physics.action_delay"] = same.physics.action_delay
+    return [f"{path}={value!r}" for path, value in values.items() if path not in paths]
+
+
+def at_rate(config: TrainConfig, rate_hz: float) -> TrainConfig:
+    """Return `config` with decisions at `rate_hz`; rollouts and delays last as long as before [s].
+
+    The delay of the point mass's commands is limited to two decisions.
+    """
+    ratio, physics, episode = rate_hz / config.spec.rate_hz, config.physics, config.episode
+    stride = max(1, round(ratio * episode.image_stride))
+    least, most = (min(2.0, ratio * delay) for delay in physics.action_delay)
+    return replace(
+        config,
+        spec=replace(config.spec, rate_hz=rate_hz),
+        physics=replace(
+            physics,
+            action_delay=(least, most),
+            state_delay=round(ratio * physics.state_delay),
+            image_delay=round(ratio * physics.image_delay),
+        ),
+        episode=replace(
+            episode,
+            image_stride=stride,
+            steps=stride * max(1, round(ratio * episode.steps / stride)),
+        ),
+    )
 
 
 def in_every_phase(config: TrainConfig, part: str, **values: Any) -> TrainConfig:
@@ -277,7 +362,7 @@ def _without_phase_changes(config: TrainConfig, paths: Iterable[str]) -> TrainCo
     removed = tuple(paths)
 
     def is_kept(change: str) -> bool:
-        return not any(is_within(change.partition("=")[0].strip(), path) for path in removed)
+        return not any(is_within(_path(change), path) for path in removed)
 
     phases = (replace(phase, set=tuple(filter(is_kept, phase.set))) for phase in config.phases)
     return replace(config, phases=tuple(phases))

@@ -1,6 +1,6 @@
 """Recipes: named sets of all settings of a training, for `suite train --recipe NAME`.
 
-The functions after the recipes return a recipe with another vehicle, rate or sensors. The judge,
+The functions after the recipes return a recipe with another vehicle or sensors. The judge,
 which the docstrings mention, is the independent simulator that scores the policies. The paper is
 Su et al. 2026. The meaning of each setting is in `config.py`.
 """
@@ -162,31 +162,6 @@ def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
     return replace(config, optimizer=replace(config.optimizer, iterations=iterations))
 
 
-def at_rate(config: TrainConfig, rate_hz: float) -> TrainConfig:
-    """Return `config` with decisions at `rate_hz`; rollouts and delays last as long as before [s].
-
-    The delay of the point mass's commands is limited to two decisions.
-    """
-    ratio, physics, episode = rate_hz / config.spec.rate_hz, config.physics, config.episode
-    stride = max(1, round(ratio * episode.image_stride))
-    least, most = (min(2.0, ratio * delay) for delay in physics.action_delay)
-    return replace(
-        config,
-        spec=replace(config.spec, rate_hz=rate_hz),
-        physics=replace(
-            physics,
-            action_delay=(least, most),
-            state_delay=round(ratio * physics.state_delay),
-            image_delay=round(ratio * physics.image_delay),
-        ),
-        episode=replace(
-            episode,
-            image_stride=stride,
-            steps=stride * max(1, round(ratio * episode.steps / stride)),
-        ),
-    )
-
-
 def finetune(config: TrainConfig, share: float = 0.25) -> TrainConfig:
     """Return the settings of fine-tuning a policy that was trained with `config`.
 
@@ -213,8 +188,10 @@ def with_sensors(config: TrainConfig, sensors: str) -> TrainConfig:
     """Return `config` with the sensor models of a file or a shipped name.
 
     Raises:
-        ValueError: for invalid sensors, or ones that need the judge's state estimator.
+        ValueError: for invalid sensors, for ones that need the judge's state estimator, and for
+            models that do not change the observation.
     """
+    from eval.sensors import view_models
     from eval.sensors.sensors_file import load_sensors
 
     seen = load_sensors(sensors)
@@ -222,6 +199,11 @@ def with_sensors(config: TrainConfig, sensors: str) -> TrainConfig:
         raise ValueError(
             f"--sensors {sensors}: its estimator follows flights of the judge, not of the "
             "trainer; train with vio, or with what suite identify --sensors writes"
+        )
+    if seen.models and not view_models(seen.models) and not seen.has_delay:
+        raise ValueError(
+            f"--sensors {sensors}: {', '.join(seen.models)} does not change what a policy sees, so "
+            "training with it has no effect; leave --sensors out"
         )
     return replace(config, sensors=SensorsConfig(seen))
 

@@ -280,8 +280,10 @@ def _check_finite(iteration: int, row: dict[str, float], folder: Path) -> None:
     if bad:
         raise WorkFailed(
             f"training diverged at iteration {iteration}: {', '.join(bad)} not finite. The last "
-            f"finite state is in {folder / 'state'}. Lower optimizer.rate or set optimizer.clip. "
-            "If it diverged in the first iterations, narrow the randomisation: a vehicle may tumble"
+            f"finite state is in {folder / 'state'}. Lower optimizer.rate or set optimizer.clip, "
+            f"with another --out, and with --init-from {folder / 'policy'} to train its policy "
+            "further. If it diverged in the first iterations, narrow the randomisation: a vehicle "
+            "may tumble"
         )
 
 
@@ -300,19 +302,36 @@ def _save(run: Run, phase: RunPhase, state: Any) -> None:
     )
 
 
+def _refuse_lost_state(policy: Path) -> None:
+    """Refuse to train anew where a trained policy would be overwritten.
+
+    Raises:
+        ValueError: naming the policy, and what to do.
+    """
+    recover_folder(policy)
+    # A run that was interrupted before its first iteration has saved random weights.
+    if policy.exists() and read_config(policy).get("training", {}).get("iteration", 1):
+        raise ValueError(
+            f"{policy} is a trained policy, but {policy.with_name('state')}, from which its "
+            f"training would resume, is missing; give another --out (with --init-from {policy} to "
+            "train it further), or move it away to start over"
+        )
+
+
 def _resume(run: Run, fresh: Any) -> Any:
     """Return the state saved in the folder, or `fresh` if there is none.
 
     Rows of the curve after that state are removed.
 
     Raises:
-        ValueError: if the folder has another run, or the number of threads changed in a way that
-            makes sums round differently.
+        ValueError: if the folder has another run or a trained policy without a state, or the number
+            of threads changed in a way that makes sums round differently.
     """
     origin, folder = run.origin, run.folder
     saved = folder / "state"
     recover_folder(saved)
     if not saved.exists():
+        _refuse_lost_state(folder / "policy")
         folder.mkdir(parents=True, exist_ok=True)
         curve.cut(folder, 0)
         curve.cut(folder, 0, curve.WATCHED)

@@ -19,7 +19,8 @@ from suite.train.shards import Shard, batch_mean, curve_numbers, make_shards
 from suite.train.worlds import Worlds
 
 RATE_END, WEIGHT_DECAY = 1e-5, 1e-2
-"""Learning rate at the end of every phase, and AdamW's decoupled weight decay."""
+"""Learning rate at the end of every phase (or the peak rate, if that is lower), and AdamW's
+decoupled weight decay."""
 
 
 class TrainState(NamedTuple):
@@ -45,14 +46,18 @@ def make_optimizer(config: OptimizerConfig, begin: int = 0) -> optax.GradientTra
             AdamW's moments and its count of steps are kept.
     """
     rate = optax.warmup_cosine_decay_schedule(
-        0.0, config.rate, config.warmup, max(config.iterations, config.warmup + 1), RATE_END
+        0.0,
+        config.rate,
+        config.warmup,
+        max(config.iterations, config.warmup + 1),
+        min(RATE_END, config.rate),
     )
     adamw = optax.adamw(
         lambda step: rate(step - begin), b2=config.memory, weight_decay=WEIGHT_DECAY
     )
-    if config.clip <= 0:
-        return adamw
-    return optax.chain(optax.clip_by_global_norm(config.clip), adamw)
+    clip = optax.clip_by_global_norm(config.clip) if config.clip > 0 else optax.identity()
+    # A chain also without clipping: phases with and without it share one state.
+    return optax.chain(clip, adamw)
 
 
 def start_state(config: TrainConfig, params: network.Params | None = None) -> TrainState:

@@ -156,8 +156,8 @@ def test_json_is_one_object_on_standard_output_and_nothing_else(command, capfd):
         ("full", 1, "the disk is full: runs/x; free some space"),
         ("missing", 2, "no such file or directory: /no/such/file"),
         ("memory", 1, "out of memory"),
-        ("ctrl-c", 130, "interrupted; finished work is kept"),
-        ("kill", 130, "interrupted; finished work is kept"),
+        ("ctrl-c", 130, "interrupted; the same command continues"),
+        ("kill", 130, "interrupted; the same command continues"),
     ],
 )
 def test_what_a_person_may_meet_is_one_line(command, capsys, fault, code, words):

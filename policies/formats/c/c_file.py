@@ -78,10 +78,11 @@ def load_c(path: Path, trust: bool = False) -> CPolicy:
     (state_bytes, *sizes), text = loaded.sizes, loaded.labels[KEY]
     metadata = extract(loaded.labels, str(file))
     spec = metadata.spec
-    expected = [spec.state_size, spec.camera.height, spec.camera.width]
+    expected = [spec.state_size, spec.camera.height, spec.camera.width, spec.action.size]
+    sizes[3] = sizes[3] or spec.action.size  # 0: the header does not define it
     if sizes != expected or not 0 < state_bytes <= _STATE_MOST:
         raise PolicyError(
-            f"{file}: POLICY_STATE_SIZE, POLICY_IMAGE_HEIGHT and POLICY_IMAGE_WIDTH are {sizes}, "
+            f"{file}: POLICY_STATE_SIZE, _IMAGE_HEIGHT, _IMAGE_WIDTH and _ACTION_SIZE are {sizes}, "
             f"and a state has {state_bytes} bytes; expected by its POLICY_JSON are {expected} and "
             f"up to {_STATE_MOST} bytes; export it again"
         )

@@ -118,6 +118,8 @@ def random_observations(spec: PolicySpec, steps: int, seed: int = 0) -> Observed
 
 _COPIED = ("main.c", "CMakeLists.txt")
 """Templates that are copied without changes."""
+FILES = ("policy.c", "policy.h", "vectors.h", *_COPIED)
+"""Names of all files of an export."""
 
 
 def _vectors(observed: Observed, actions: np.ndarray, tolerance: float) -> str:

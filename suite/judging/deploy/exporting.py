@@ -50,7 +50,7 @@ def export(
         check_formats,
         export_policy,
         exported_checkpoint,
-        main_file,
+        file_names,
     )
     from policies.native import native_policy
 
@@ -58,7 +58,8 @@ def export(
     if "c" in formats:
         check_no_input(out / CARD, [shipped.locate(policy) / CARD], "--out")
     name, checkpoint = exported_checkpoint(policy)
-    _record_source(policy, out, [main_file(name, each) for each in formats], checkpoint.seed)
+    files = [(*file_names(name, each), *[CARD] * (each == "c")) for each in formats]
+    _record_source(policy, out, files, checkpoint.seed)
     # Inputs in flight set the scales of the activations in 8 bits.
     observed = None
     if dtype == "int8":
@@ -73,27 +74,33 @@ def export(
     return {"written": [*written, out / CARD], "parity": result}
 
 
-def _record_source(policy: str, out: Path, files: Sequence[str], seed: int | None) -> None:
-    """Record `policy` as the source of `files`, or refuse to overwrite those of another policy.
+def _record_source(
+    policy: str, out: Path, exports: Sequence[Sequence[str]], seed: int | None
+) -> None:
+    """Record `policy` as the source of `exports`, or refuse to overwrite files of another origin.
 
     The record is needed because file names do not show the policy: every training calls its
-    checkpoint policy/, and the names of C files are fixed.
+    checkpoint policy/, and the names of C files are fixed. An export is recorded under the name of
+    its first file.
 
     Raises:
         ValueError: naming the file and what to do.
     """
     source, digest = str(shipped.locate(policy).resolve()), policy_digest(policy)
     records = _read_sources(out / NOTE)
-    for file in files:
-        old = records.get(file, {})
+    for files in exports:
+        old = records.get(files[0], {})
+        present = [file for file in files if (out / file).exists()]
         # The same policy may be exported again, also from another place or with new weights.
-        if (out / file).exists() and source != old.get("source") and digest != old.get("sha256"):
-            old_source = old.get("source", "an unrecorded policy")
+        if present and source != old.get("source") and digest != old.get("sha256"):
+            origin = f"is not recorded in {NOTE}"
+            if "source" in old:
+                origin = f"was exported from {old['source']}"
             raise ValueError(
-                f"--out {out}: {file} was exported from {old_source} and would be overwritten by "
-                f"the export of {policy}; give another --out, or move the file away"
+                f"--out {out}: {present[0]} {origin} and would be overwritten by the export of "
+                f"{policy}; give another --out, or move the file away"
             )
-        records[file] = {"source": source, "sha256": digest}
+        records[files[0]] = {"source": source, "sha256": digest}
     write_json(out / NOTE, {**stamp(1, seed), "files": records})
 
 

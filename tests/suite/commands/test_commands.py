@@ -65,6 +65,20 @@ def test_options_become_settings():
         resolve(Config(recipe="rcaer"))
 
 
+def test_listed_settings_are_those_of_the_other_options(capsys):
+    asked = "train --list-settings --finetune --init-from race --sensors vio --set loss.tilt=3"
+    listed = {one["path"]: one["default"] for one in answer(capsys, asked)["settings"]}
+    assert (listed["spec.rate_hz"], listed["loss.tilt"]) == (30.0, 3.0)
+    assert listed["sensors.perfect_share"] == 0.1
+
+
+def test_sensors_that_change_nothing_in_a_training_are_refused(tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text('schema = 1\nname = "mine"\n[[imu]]\nkind = "imu"\ngyro_bias = 0.01\n')
+    with pytest.raises(ValueError, match=r"imu does not change what a policy sees"):
+        resolve(Config(sensors=str(file)))
+
+
 def test_training_goes_on_from_a_policy_by_its_name_and_does_not_write_over_it(
     tmp_path, capsys, monkeypatch
 ):
@@ -72,7 +86,12 @@ def test_training_goes_on_from_a_policy_by_its_name_and_does_not_write_over_it(
     said = refused(capsys, "train --init-from rac --out", tmp_path / "run")
     assert "--init-from rac: " in said and "a shipped policy's name (race, race-paper" in said
     assert not (tmp_path / "run").exists()
+    rates = []
+    monkeypatch.setattr(training, "load_start_params", lambda _, spec: rates.append(spec.rate_hz))
     monkeypatch.setattr(training, "train", None)
+    first = "phases.1.spec.rate_hz=20"
+    run(f"train --init-from race --set {first} --out", tmp_path / "run")
+    assert rates == [20.0], "of the first phase"
     own = shutil.copytree(shipped.folder("race-paper"), tmp_path / "policy")
     said = refused(capsys, "train --out", tmp_path, "--init-from", own)
     assert "config.json is also an input and would be overwritten" in said

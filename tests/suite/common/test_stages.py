@@ -57,6 +57,8 @@ def test_a_folder_of_another_configuration_is_refused(tmp_path):
     claim(tmp_path, Settings(), 0)
     with pytest.raises(ValueError, match="trials is 3 there, 5 here.*another --out"):
         claim(tmp_path, Settings(trials=5), 0)
+    with pytest.raises(ValueError, match=r"there, 'xxx.{,50}\(902 characters\) here\); give"):
+        claim(tmp_path, Settings(track="x" * 900), 0)
     (tmp_path / "run.json").write_text("{}")
     with pytest.raises(ValueError, match="not the record of a run"):
         claim(tmp_path, Settings(), 0)

@@ -104,7 +104,9 @@ def test_the_middle_of_the_ranges_the_rate_and_all_of_a_vehicle_but_its_name_cou
         corrects(physics, race_paper().physics)
     with pytest.raises(ValueError, match="delay 1 decisions; take"):
         corrects(physics, replace(physics, action_delay=(0.5, 1.5)))
-    with pytest.raises(ValueError, match="with 15 decisions a second, and this run has 30: .*=15"):
+    with pytest.raises(
+        ValueError, match="with 15 decisions a second, and this run has 30: .*--finetune .*=15"
+    ):
         corrects(physics, physics, rate_hz=30.0)
     renamed = replace(QUAD, vehicle=replace(QUAD.vehicle, name="mine"), mass_std=0.0)
     corrects(QUAD, renamed)

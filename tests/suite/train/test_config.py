@@ -9,6 +9,7 @@ from suite.common.console import Console
 from suite.train import losses
 from suite.train.config import Phase, TrainConfig, check
 from suite.train.overrides import (
+    at_rate,
     check_owned,
     check_phases,
     in_every_phase,
@@ -18,7 +19,7 @@ from suite.train.overrides import (
     with_changes,
     without_quadrotor,
 )
-from suite.train.recipes import RECIPES, at_rate, named_recipe, with_iterations, with_model
+from suite.train.recipes import RECIPES, named_recipe, with_iterations, with_model
 from suite.train.run import train
 from tests.support.training import small_config
 
@@ -61,11 +62,18 @@ def test_settings_that_would_do_nothing_or_that_the_command_sets_itself_are_refu
     for change, need, given in (
         ("loss.projection_decay=1", "loss.projection", "3"),
         ("episode.race_share=0.9", "spec.speed_input", "True"),
+        ("spec.speed=0.5", "spec.speed_input", "True"),
     ):
         with pytest.raises(ValueError, match=rf"has no effect while {need} is (0|False)"):
             override(run, [change])
         both = [change, f"{need}={given}"]
         assert override(run, both) == override(run, both[::-1])
+    # Only the user's changes must have an effect, and one in a later phase is enough.
+    off, own = "spec.speed_input=False", "phases.2.episode.race_share=0.9"
+    check_phases(with_changes(named_recipe("race"), [off]))
+    with pytest.raises(ValueError, match=r"'phases\.2.*has no effect while spec\.speed_input"):
+        with_changes(named_recipe("race"), [off, own])
+    with_changes(RUN, ["phases.2.loss.projection=1", "loss.projection_decay=1"])
     check_owned(["loss.progress=1"], {"loss.prog": "", "spec": ""})
     for change in ("spec.rate_hz=30", "phases.2.spec.rate_hz=30"):
         with pytest.raises(ValueError, match=rf"'{change}': this command sets spec.*; take"):
@@ -120,6 +128,20 @@ def test_another_rate_keeps_rollouts_and_delays_in_seconds():
     assert (late.state_delay, late.image_delay) == (2, 4)
 
 
+def test_a_changed_rate_keeps_the_length_of_rollouts_unless_that_is_changed_too():
+    def seconds(*changes, recipe="race"):
+        run = with_changes(named_recipe(recipe), changes)
+        check_phases(run)
+        return [phase.episode.steps / phase.spec.rate_hz for phase in phase_configs(run)]
+
+    assert seconds("spec.rate_hz=50") == seconds("phases.3.spec.rate_hz=60") == [6.0] * 3
+    assert seconds("phases.2.spec.rate_hz=30") == seconds("spec.rate_hz=15") == [6.0] * 3
+    assert seconds("spec.rate_hz=30", "episode.steps=90", "episode.image_stride=3") == [3.0] * 3
+    assert seconds("spec.rate_hz=30", recipe="paper") == [10.0]
+    late = with_changes(named_recipe("paper"), ["spec.rate_hz=30", "physics.image_delay=3"])
+    assert (late.physics.state_delay, late.physics.image_delay) == (2, 3)
+
+
 def test_the_papers_recipe_has_the_papers_weights():
     loss = named_recipe("paper").loss
     assert (loss.clearance, loss.collide) == (3.0, 3.0)
@@ -159,6 +181,12 @@ def test_a_phase_keeps_what_came_before_and_a_change_holds_in_all_or_in_the_one_
     for number in ("0", "4", "x"):
         with pytest.raises(ValueError, match="this run has 3 phases"):
             with_changes(RUN, [f"phases.{number}.loss.progress=1"])
+    with pytest.raises(ValueError, match="this run has no phases; write SETTING=VALUE"):
+        with_changes(TrainConfig(), ["phases.1.loss.progress=1"])
+    with pytest.raises(ValueError, match="shares .* set optimizer.iterations without a phase"):
+        with_changes(RUN, ["phases.2.optimizer.iterations=5"])
+    two = ["phases.2.loss.jerk=1", "phases.2.loss.collide=1"]
+    assert with_changes(RUN, two) == with_changes(RUN, two[::-1])
     recipe = without_quadrotor(named_recipe("race"))
     check_phases(recipe)
     assert all(one.quadrotor is None for one in phase_configs(recipe))
@@ -180,6 +208,7 @@ def test_recipes_are_within_the_limits_and_their_phases_share_any_number_of_iter
         (Phase(0.5, ("episode.batch=2",)), "phase 2 changes episode.batch"),
         (Phase(0.5, ("spec.hidden_size=64",)), "phase 2 changes spec"),
         (Phase(0.5, ("episode.image_stride=7",)), "image_stride is 7"),
+        (Phase(0.5, ("spec.action.kind=ctbr",)), "kind is ctbr, allowed .* is acceleration"),
     ],
 )
 def test_phases_that_cannot_be_trained_are_refused(second, words):

@@ -18,6 +18,7 @@ from suite.common.console import Console
 from suite.train import run, shards, training_loop
 from suite.train.config import OptimizerConfig
 from suite.train.rollout import make_rollout
+from suite.train.update import make_optimizer
 from tests.support.canonical import NOISY, update_of
 from tests.support.training import SPEC, assert_same_run, boxes_worlds, fresh_params, small_config
 
@@ -55,6 +56,17 @@ def test_a_run_leaves_its_policy_its_curve_and_what_it_was(whole):
     assert policy.config["training"]["iteration"] == 6
     fresh = run.start_state(NOISY).params
     assert all(np.any(policy.params[name] != np.array(value)) for name, value in fresh.items())
+
+
+def test_all_phases_share_an_optimiser_and_a_low_rate_does_not_rise():
+    params, low = {"w": jnp.ones(2)}, OptimizerConfig(iterations=9, warmup=0, rate=1e-6)
+    states = [make_optimizer(replace(low, clip=clip)).init(params) for clip in (0.0, 1.0)]
+    assert jax.tree.structure(states[0]) == jax.tree.structure(states[1])
+    optimizer, sizes = make_optimizer(low), []
+    for _ in range(10):
+        change, states[1] = optimizer.update(params, states[1], params)
+        sizes.append(float(jnp.abs(change["w"]).max()))
+    assert max(sizes) < 1.02e-6
 
 
 class Killed(BaseException):

@@ -1,6 +1,7 @@
 """A method that only counts, iterated in a folder: what is measured, resumed and refused."""
 
 import json
+import shutil
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -94,12 +95,29 @@ def test_rows_of_a_save_that_was_cut_off_are_computed_again(tmp_path, monkeypatc
         with pytest.raises(OSError, match="No space"):
             train(tmp_path, counting(3))
     assert len(curve.read(tmp_path)) == 3 and not (tmp_path / "state").exists()
+    shutil.rmtree(tmp_path / "policy")
     train(tmp_path, counting(3))
     assert [row["iteration"] for row in curve.read(tmp_path)] == [0, 1, 2]
 
 
+def test_a_trained_policy_without_its_state_is_not_written_over(tmp_path):
+    for trained, stop in ((10, None), (4, 4), (0, 0)):
+        folder = tmp_path / str(trained)
+        if stop is None:
+            train(folder, counting())
+        else:
+            with pytest.raises(KeyboardInterrupt):
+                train(folder, counting(stop=stop))
+        shutil.rmtree(folder / "state")
+        if trained:
+            with pytest.raises(ValueError, match=r"state, from which .* --out .*with --init-from"):
+                train(folder, counting())
+            assert len(curve.read(folder)) == trained
+    assert train(folder, counting()).iterations == 10, "of random weights nothing is lost"
+
+
 def test_a_number_that_is_not_finite_ends_the_run_with_the_last_good_state(tmp_path):
-    with pytest.raises(WorkFailed, match="diverged at iteration 3: loss not finite.*clip"):
+    with pytest.raises(WorkFailed, match="diverged at iteration 3: loss not finite.*another --out"):
         train(tmp_path, counting(bad=3))
     assert len(curve.read(tmp_path)) == 3
     outcome = train(tmp_path, counting())

@@ -28,6 +28,16 @@ static int all_finite(const float *x, int n)
     return !bad;
 }
 
+/* Whether an input is not finite; the action is then NaN. */
+static int refused(const float *observation, const float *image, float *action)
+{
+    const int bad = !all_finite(observation, INPUTS) || !all_finite(image, HEIGHT * WIDTH);
+    for (int k = 0; bad && k < POLICY_ACTION_SIZE; k++) {
+        action[k] = NAN;
+    }
+    return bad;
+}
+
 /* The largest of every 2 x 2 pixels: near things win. */
 static void pool(float *restrict out, const float *restrict image)
 {
@@ -68,6 +78,13 @@ static void felt(float *restrict out, const float *restrict observation)
         for (int j = 0; j < PADDED; j++) {
             out[j] += observation[i] * state_weight[i * PADDED + j];
         }
+    }
+}
+
+static void activate(float *embedding)
+{
+    for (int j = 0; j < PADDED; j++) {
+        embedding[j] = leaky(embedding[j]);
     }
 }
 

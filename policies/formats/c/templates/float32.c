@@ -141,10 +141,7 @@ void policy_step(policy_state *state, const float *observation, const float *ima
 {
     float *const first = state->first, *const second = state->second;
     float *const embedding = second, *const from_input = first;
-    if (!all_finite(observation, INPUTS) || !all_finite(image, HEIGHT * WIDTH)) {
-        for (int k = 0; k < POLICY_ACTION_SIZE; k++) {
-            action[k] = NAN;
-        }
+    if (refused(observation, image, action)) {
         return;
     }
     /* Every other step begins with what the one before ended with, and goes through each layer the
@@ -160,9 +157,7 @@ void policy_step(policy_state *state, const float *observation, const float *ima
     convolve(first, second, conv3_weight, ROWS2, COLUMNS2, CHANNELS2, CHANNELS3);
     felt(embedding, observation);
     dense(embedding, first, image_weight, FEATURES, PADDED, state->odd);
-    for (int j = 0; j < PADDED; j++) {
-        embedding[j] = leaky(embedding[j]);
-    }
+    activate(embedding);
     for (int j = 0; j < GATES; j++) {
         from_input[j] = gru_input_bias[j];
     }

@@ -68,10 +68,7 @@ void policy_step(policy_state *state, const float *observation, const float *ima
     float *const first = state->first, *const second = state->second;
     float *const embedding = second, *const from_input = first, *const from_hidden = state->gates;
     short *const bytes = state->bytes;
-    if (!all_finite(observation, INPUTS) || !all_finite(image, HEIGHT * WIDTH)) {
-        for (int k = 0; k < POLICY_ACTION_SIZE; k++) {
-            action[k] = NAN;
-        }
+    if (refused(observation, image, action)) {
         return;
     }
     pool(second, image);
@@ -85,9 +82,7 @@ void policy_step(policy_state *state, const float *observation, const float *ima
     to_bytes(bytes, first, IMAGE_INVERSE, IMAGE_ZERO, FEATURES);
     felt(embedding, observation);
     dense(embedding, bytes, image_weight, image_scale, image_offset, FEATURES, PADDED);
-    for (int j = 0; j < PADDED; j++) {
-        embedding[j] = leaky(embedding[j]);
-    }
+    activate(embedding);
     for (int j = 0; j < GATES; j++) {
         from_input[j] = gru_input_bias[j];
         from_hidden[j] = gru_hidden_bias[j];

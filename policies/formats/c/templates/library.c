@@ -3,10 +3,14 @@
 
 #include "policy.h"
 
+#ifndef POLICY_ACTION_SIZE
+#define POLICY_ACTION_SIZE 0 /* unknown */
+#endif
+
 int suite_size(int which)
 {
     const int sizes[] = {(int)sizeof(policy_state), POLICY_STATE_SIZE, POLICY_IMAGE_HEIGHT,
-                         POLICY_IMAGE_WIDTH};
+                         POLICY_IMAGE_WIDTH, POLICY_ACTION_SIZE};
     return sizes[which];
 }
 

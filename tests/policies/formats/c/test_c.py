@@ -14,7 +14,7 @@ from policies.formats.c import arrays, quantised, source
 from policies.formats.c.c_file import load_c
 from policies.formats.c.compiler import find_compiler
 from policies.formats.c.forward import Observed
-from policies.formats.c.project import c_project, native_actions, random_observations
+from policies.formats.c.project import FILES, c_project, native_actions, random_observations
 from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.policy import load_policy
 from policies.spec import NoAnswer, PolicyError
@@ -249,8 +249,9 @@ def test_any_c_with_this_door_flies_but_none_with_a_memory_of_its_own(tmp_path):
     assert (policy.spec.rate_hz, policy.state_bytes) == (30.0, 4)
     with pytest.raises(PolicyError, match="keep all memory of the policy in policy_state"):
         foreign(tmp_path, "(float)steps")
-    with pytest.raises(PolicyError, match="expected by its POLICY_JSON"):
-        foreign(tmp_path, "state->seen", size=15)
+    for size in ("15", "12\n#define POLICY_ACTION_SIZE 4"):
+        with pytest.raises(PolicyError, match="expected by its POLICY_JSON"):
+            foreign(tmp_path, "state->seen", size)
 
 
 def test_c_without_its_functions_is_refused_with_what_it_lacks(tmp_path):
@@ -285,6 +286,7 @@ def test_it_includes_only_math_and_its_header_says_sizes_and_weights(exports):
         assert f"#define {said}" in header
     assert export.checkpoint.config["weights"]["sha256"] in header
     for name, export in exports.items():
+        assert set(export.project.files) == set(FILES)
         policy = load_c(export.folder, trust=True)
         assert policy.state_bytes == source.memory_bytes(policy.spec, name.endswith("8"))
 

@@ -108,9 +108,17 @@ def test_an_export_of_another_policy_is_not_written_over(
     assert run(asked, one) == 0, "trained on, it is the same policy's"
     assert run(asked, other) == 0, "and now that of its content, too"
     (out / exporting.NOTE).unlink()
-    assert f"{file} was exported from an unrecorded policy" in refused(capsys, asked, other)
+    assert f"{file} is not recorded in exports.json" in refused(capsys, asked, other)
     (out / exporting.NOTE).write_text("[]")
     assert "not a record of exports" in refused(capsys, asked, other)
+
+
+@pytest.mark.parametrize("file", ["main.c", "CMakeLists.txt", exporting.CARD])
+def test_files_of_a_project_are_not_written_over(file, folder, tmp_path, capsys):
+    (tmp_path / file).write_text("mine")
+    said = refused(capsys, f"export --format c --out {tmp_path}", folder)
+    assert f"{file} is not recorded in exports.json and would be overwritten" in said
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(file, "mine")]
 
 
 def test_a_card_has_the_success_of_a_shipped_policys_card(folder):
