@@ -56,6 +56,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
     if not config.flights and not config.policy and not config.vehicle:
         raise ValueError("nothing to check: give flights, --vehicle or --policy")
+    if config.fix and not config.flights:
+        raise ValueError("--fix corrects flights, and none is given: add them, or leave it out")
     answer: dict[str, Any] = {"findings": [], "not_identifiable": []}
     policy = None
     if config.policy:

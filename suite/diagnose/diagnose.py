@@ -105,11 +105,19 @@ def _diagnose(given: DiagnosisInput, makers: Sequence[SourceMaker], seed: int) -
     verdict = verdict_on(unique, bool(tested or names), limits)
     # Effects that leave most of the gap are not the cause: remove them, and decide again.
     if verdict.label == "unknown" and names:
-        labels = ", ".join(named.candidate.label for named in names)
+        wrong = [
+            id(one) for one in deciding(unique) if one.remaining.share > limits.unexplained_share
+        ]
+        labels = ", ".join(
+            named.candidate.label for one in unique if id(one) in wrong for named in one.names
+        )
         warnings.append(f"nearest in the catalogue, but most of the gap remains: {labels}")
-        unique = tuple(without_names(one, seed) if one.names else one for one in unique)
+        unique = tuple(without_names(one, seed) if id(one) in wrong else one for one in unique)
         tested = tested_in(unique, flights)
-        verdict = verdict_on(unique, bool(tested), limits)
+        if any(one.names for one in unique):
+            verdict = verdict._replace(label="partly")
+        else:
+            verdict = verdict_on(unique, bool(tested), limits)
     for finding in unique:
         for named in finding.names:
             large = implausible(finding.source.space, finding.theta, named.candidate, limits)
@@ -205,19 +213,28 @@ def tested_in(findings: Sequence[Finding], flights: SourceSet) -> tuple[TestedEf
 def verdict_on(findings: Sequence[Finding], named: bool, limits: Thresholds) -> Verdict:
     """Return the verdict.
 
-    It follows from the findings with named effects, or from all findings if there are none. `named`
-    is whether the search or a separate test named an effect. An oscillating force (swing) always
-    counts as unexplained, since no fitted parameter reproduces it.
+    It follows from the findings that are `deciding`. `named` is whether the search or a separate
+    test named an effect. An oscillating force (swing) always counts as unexplained, since no fitted
+    parameter reproduces it.
+    """
+    swings = [one.remaining.swing for one in findings if one.remaining.swing]
+    worst = max((one.remaining for one in deciding(findings)), key=lambda one: one.share)
+    if not swings and not worst.structured:
+        return Verdict("named" if named else "no_gap", worst.share)
+    words = [swing.words for swing in swings]
+    words += [worst.where] if worst.structured and worst.where else []
+    partly = named and worst.share <= limits.unexplained_share
+    return Verdict("partly" if partly else "unknown", worst.share, "; ".join(words))
+
+
+def deciding(findings: Sequence[Finding]) -> list[Finding]:
+    """Return the findings whose remaining error decides the verdict.
+
+    They are those with more than noise among the findings with named effects, or among all if none
+    names an effect; without any, it is the main finding.
     """
     judged = [one for one in findings if one.names] or findings
-    swings = [one.remaining.swing for one in findings if one.remaining.swing]
-    share = main_of(findings).remaining.share
-    if not swings and not any(one.remaining.structured for one in judged):
-        return Verdict("named" if named else "no_gap", share)
-    worst = max(findings, key=lambda one: one.remaining.share).remaining.where
-    where = "; ".join([*(swing.words for swing in swings), *([worst] if worst else [])])
-    partly = named and share <= limits.unexplained_share
-    return Verdict("partly" if partly else "unknown", share, where)
+    return [one for one in judged if one.remaining.structured] or [main_of(findings)]
 
 
 def with_names(

@@ -110,9 +110,9 @@ class Thresholds:
     """Gain that noise never reaches; candidates nearly as good as the best are then real, too."""
     alike_share: float = 0.5
     """Share of the best gain from which a group of columns explains about as much as the best."""
-    few_windows: int = 10
+    few_windows: int = 12
     """Least number of windows for a permutation test. The signs of fewer windows have too few
-    permutations for a p-value of 1 %."""
+    permutations for a p-value of `name_p_value`."""
     name_p_value: float = 0.001
     """Probability of a false name at each step of the search."""
     most_names: int = 4

@@ -168,8 +168,8 @@ def check_log(
     """
     checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
     findings, readings, _ = run_checks(rows_of(log), checks, against, fix)
-    rates = {**_action_rows(log), **rows_of(log)}
-    findings += check_controller_rate(rates, against.policy_hz, "the policy")
+    measured = {"time": log.time_s, **_action_rows(log), **_measured(log)}
+    findings += check_controller_rate(measured, against.policy_hz, "the policy")
     again = {finding.fault for finding in findings if finding.fault}
     stored = [f for f in findings_of(log.about) if f.status in ("doubt", "corrected")]
     if against.vehicle is not None:
@@ -211,8 +211,13 @@ def check_before_diagnosis(
         accept: names of known faults to ignore.
 
     Raises:
-        ValueError: for a fault that a diagnosis would attribute to a wrong effect.
+        ValueError: for a fault that a diagnosis would attribute to a wrong effect, or two copies of
+            a flight, of which one could be held out to test the fit to the other.
     """
+    for number, log in enumerate(logs):
+        for other in logs[:number]:
+            if _is_copy(log, other):
+                raise ValueError(f"{other.name} and {log.name} are the same flight: give it once")
     unknown = [fault for fault in accept if fault not in FAULTS]
     if unknown:
         raise unknown_name("fault", unknown[0], list(FAULTS))
@@ -228,6 +233,19 @@ def check_before_diagnosis(
             + f"\ncorrect it, or continue anyway with --accept {faults}"
         )
     return [{**f._asdict(), "flight": name} for f, name in found if f.status != "ok"]
+
+
+def _is_copy(log: FlightLog, other: FlightLog) -> bool:
+    """Return whether two logs have the same times and rates or, without rates, positions."""
+    key = "rate_b" if log.rate_b is not None else "pos_w"
+    pairs = [(log.time_s, other.time_s), (getattr(log, key), getattr(other, key))]
+    return all(
+        a is not None
+        and b is not None
+        and a.shape == b.shape
+        and np.allclose(a, b, rtol=0.0, atol=1e-5, equal_nan=True)  # a CSV has rounded values
+        for a, b in pairs
+    )
 
 
 def lines_of(records: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -269,13 +287,10 @@ def rows_of(log: FlightLog) -> dict[str, np.ndarray]:
 
     Missing values of slower signals are interpolated linearly.
     """
-    columns = columns_from_log(log)
-    rows = {"time": log.time_s}
-    for group, names in GROUPS.items():
-        if group != "time" and all(name in columns for name in names):
-            value = np.stack([columns[name] for name in names], axis=1)
-            if np.isfinite(value).all(axis=1).sum() > LEAST_ROWS:
-                rows[group] = filled(log.time_s, value)
+    columns, rows = columns_from_log(log), {"time": log.time_s}
+    for group, value in _measured(log).items():
+        if np.isfinite(value).all(axis=1).sum() > LEAST_ROWS:
+            rows[group] = filled(log.time_s, value)
     for name in ("throttle", "baro"):
         if name in columns and np.asarray(columns[name]).dtype.kind in "fiu":
             rows[name] = np.asarray(columns[name], dtype=np.float64)[:, None]
@@ -295,7 +310,16 @@ def filled(time_s: np.ndarray, value: np.ndarray) -> np.ndarray:
     return result
 
 
+def _measured(log: FlightLog) -> dict[str, np.ndarray]:
+    """Return a log's signals (T, C) by name; NaN where a row lacks them."""
+    columns = columns_from_log(log)
+    return {
+        group: np.stack([columns[name] for name in names], axis=1)
+        for group, names in GROUPS.items()
+        if group != "time" and all(name in columns for name in names)
+    }
+
+
 def _action_rows(log: FlightLog) -> Mapping[str, np.ndarray]:
     """Return the policy's action as a signal `action`, where the log has one."""
-    action = log.action_b
-    return {} if action is None else {"action": action}
+    return {} if log.action_b is None else {"action": log.action_b}

@@ -142,16 +142,6 @@ def centred(values: np.ndarray, flight: np.ndarray) -> np.ndarray:
     return values - means_of(values, flight)[flight_place.ravel()]
 
 
-def validation_groups(flight: np.ndarray) -> np.ndarray:
-    """Return the cross-validation group (M,) of each row: its flight, or its third of a single one.
-
-    `flight` (M,) is the number of each row's flight.
-    """
-    if len(np.unique(flight)) > 1:
-        return flight
-    return np.arange(len(flight)) * 3 // len(flight)
-
-
 def weights_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> Weights:
     """Return the weights, estimated from the residuals `data`."""
     flights = [data.residual[data.flight == n] for n in np.unique(data.flight)]

@@ -31,7 +31,6 @@ from suite.diagnose.evidence.moments import (
     fast_changes_agree,
     means_of,
     stretch_numbers,
-    validation_groups,
     weights_of,
     whitened,
 )
@@ -135,10 +134,6 @@ class ViewEvidence(Evidence):
         if len(np.unique(block.flight)) >= 3:
             return block.flight
         return folds_of(block.flight, np.arange(len(block.flight), dtype=float), self.limits.folds)
-
-    def groups(self, block: Block) -> np.ndarray:
-        """Return the group of each stretch: its flight, or its third of a single flight."""
-        return validation_groups(block.flight)
 
     def explained_share(
         self, before: Block, at: Estimate, after: Block, candidate: Candidate, gains: np.ndarray

@@ -51,7 +51,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "after_ci95": control[1].ci95(diagnosis.seed, limits),
         },
         "unexplained": {
-            "share": remaining_share(main.before, main.after) if named else 1.0,
+            "share": remaining_share(main.before, main.after) if named or diagnosis.tested else 1.0,
             "judged": diagnosis.verdict.share_left,
             "where": diagnosis.verdict.where,
             "above_noise": above_noise(diagnosis),

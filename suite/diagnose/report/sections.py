@@ -252,7 +252,7 @@ def evidence_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section
         gaps["with the named effects"] = main.after
     before, floor, rows = main.before.rms, main.before.floor, []
     for label, gap in gaps.items():
-        (low, high), removed = gap.ci95(diagnosis.seed), ""
+        (low, high), removed = gap.ci95(diagnosis.seed, diagnosis.limits), ""
         if gap.rms != before and before > floor:
             removed = f"{100 * (before - gap.rms) / (before - floor):.0f} %"
         rows.append((label, f"{gap.rms:.3f}", f"{low:.3f} to {high:.3f}", removed))
@@ -270,8 +270,9 @@ def evidence_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section
 
 AGREEMENT = (
     "The fall of the squared error of each flight (of a single flight: of each third) with "
-    "parameters that were fitted to the others, in units of independent noise. An effect is named "
-    "only if all flights but one agree."
+    "parameters that were fitted to the others, in units of independent noise. If force and torque "
+    "are compared, or if no effect explains the whole error, an effect is named only if all flights "
+    "but one agree."
 )
 """Explanation of the table of flights."""
 

@@ -18,7 +18,7 @@ from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.flights import ready
 from suite.diagnose.data.view import FORCE
-from suite.diagnose.data.whitening import block_of, make_whitening
+from suite.diagnose.data.whitening import block_of, make_whitening, slow_energy
 from suite.diagnose.data.windows import (
     LENGTH_S,
     SLICES,
@@ -123,15 +123,15 @@ class RolloutSource(Source):
     def would_show(self, found: SearchResult, candidate: Candidate) -> bool:
         """Return whether held-out flights are sensitive to `candidate`, see `Source`.
 
-        They are if the effect's fitted size should change their chi-square significantly.
+        They are if the effect's fitted size should change their slow errors significantly.
         """
         theta, indices = found.estimate.theta, list(candidate.indices)
         linear = from_true_starts(self.model, theta, self.held, indices)
         whitening = make_whitening(linear, of_rollouts(found.last).noise, self.held, self.limits)
         slope = block_of(whitening, linear, indices, self.held).slope
         change = (theta - self.start.theta)[indices]
-        # Windows overlap, and `overlap` makes each row count once.
-        expected_chi2 = float(((slope @ change) ** 2).sum()) * overlap(self.held)
+        # Windows overlap, and `overlap` makes each row count once. Gaps compare slow errors only.
+        expected_chi2 = float(slow_energy(whitening, slope @ change).sum()) * overlap(self.held)
         return bool(expected_chi2 > self.limits.shown_chi2)
 
     def is_relevant(self, gap: Gap) -> bool:

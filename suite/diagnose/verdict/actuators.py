@@ -380,10 +380,10 @@ def find_rotor_lag(
     closed = 1.0 - sum(mismatch.rms_fitted**2 for mismatch in mismatches) / max(
         nominal_error, 1e-12
     )
-    if difference <= half_width or closed < limits.lag_closed_share:
-        return None
     t = (difference - half_step) / max(standard_error, 1e-9)
+    p_value = float(2.0 * stats.t.sf(t, len(lags) - 1))
+    if p_value > limits.name_p_value or closed < limits.lag_closed_share:
+        return None
     lag, low = float(lags.mean()), max(float(lags.mean()) - half_width, 0.0)
     parameters = {"time_constant": {"value": lag, "unit": "s", "ci95": [low, lag + half_width]}}
-    p_value = float(2.0 * stats.t.sf(t, len(lags) - 1))
     return TestedEffect(LAG, EFFECTS[LAG].values(lag), parameters, closed, p_value, "commands")

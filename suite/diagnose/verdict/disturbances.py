@@ -271,17 +271,23 @@ def find_turbulence(
     if _has_outliers(disturbance, roots[i], intensities[j], limits.wind_tail):
         return None
     likely = table >= ratio - limits.profile_fall  # 95 % by the profile likelihood
-    likely_m, likely_intensity = lengths_m[likely.any(axis=1)], intensities[likely.any(axis=0)]
     intensity, length = float(intensities[j]), float(lengths_m[i])
     parameters = {
-        name: {"value": value, "unit": unit, "ci95": [float(inside[0]), float(inside[-1])]}
-        for name, value, unit, inside in (
-            ("intensity", intensity, "m/s", likely_intensity),
-            ("length", length, "m", likely_m),
+        name: {"value": value, "unit": unit, "ci95": _range_of(tried, is_likely)}
+        for name, value, unit, tried, is_likely in (
+            ("intensity", intensity, "m/s", intensities, likely.any(axis=0)),
+            ("length", length, "m", lengths_m, likely.any(axis=1)),
         )
     }
     values, p_value = Gusts(intensity, length), float(np.exp(-ratio))
     return TestedEffect(GUSTS.name, values, parameters, None, p_value, "whole"), ratio
+
+
+def _range_of(tried: np.ndarray, is_likely: np.ndarray) -> list[float] | None:
+    """Return the least and the largest likely value of those `tried`; None at the end of these."""
+    if is_likely[0] or is_likely[-1]:
+        return None
+    return [float(tried[is_likely][0]), float(tried[is_likely][-1])]
 
 
 def _wind_transmission(model: RolloutModel, theta: np.ndarray, knot: Flown) -> np.ndarray:

@@ -118,3 +118,7 @@ def test_no_log_is_overwritten_by_its_correction_or_by_that_of_another(tmp_path,
     ):
         assert reason in refused(capsys, "check", *flights, "--fix", "--out", out)
     assert first.read_bytes() == second.read_bytes() and not (tmp_path / "out").exists()
+
+
+def test_fix_needs_flights(capsys):
+    assert "--fix corrects flights" in refused(capsys, "check --vehicle racer5 --fix")

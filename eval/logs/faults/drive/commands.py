@@ -291,7 +291,10 @@ def check_controller_rate(rows: Rows, wanted_hz: float | None, whose: str) -> li
                  if n in rows), None)  # fmt: skip
     if wanted_hz is None or name is None:
         return []
-    time_s, value = rows["time"], rows[name]
+    complete = np.isfinite(rows[name]).all(axis=1)
+    time_s, value = rows["time"][complete], rows[name][complete]
+    if len(time_s) < 20:
+        return unseen("controller", "its commands are in few rows", "controller_rate")
     change = np.flatnonzero(np.any(np.diff(value, axis=0) != 0.0, axis=1)) + 1
     row_hz = 1.0 / float(np.median(np.diff(time_s)))
     if len(change) < 20:

@@ -49,7 +49,7 @@ def delayed(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> tuple[
             np.sum(b.std(axis=0) * np.abs(np.sum(a * b, axis=0)) / np.maximum(norms, 1e-12))
         )
         if correlation > best + 1e-6:
-            best, delay, best_command = correlation, float(late), moved
+            best, delay, best_command = correlation, count * step, moved
     return delay, best_command
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eval.logs.faults.check import CheckContext, check_log
+from eval.logs.faults.check import CheckContext, check_before_diagnosis, check_log
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.reading import parse_readings, read_rows
 from tests.support.diagnosis_flights import fly
@@ -38,3 +38,25 @@ def test_a_stored_finding_on_another_vehicle_file_is_not_repeated_and_one_on_the
 
     assert faults(CheckContext()) == ["motor_map", "voltage"]
     assert faults(CheckContext(PLAIN)) == ["voltage"]
+
+
+def test_a_copy_of_a_flight_is_refused(tmp_path):
+    """One copy could be held out to test the fit to the other."""
+    log = fly(PLAIN, 0, duration_s=3.0)
+    rounded = replace(log, name="copy", rate_b=np.round(log.rate_b, 6))
+    with pytest.raises(ValueError, match=f"{log.name} and copy are the same flight"):
+        check_before_diagnosis([log, fly(PLAIN, 1, duration_s=3.0), rounded], CheckContext())
+
+
+def test_the_rate_of_slow_commands_is_that_of_their_own_rows():
+    log = fly(PLAIN, 0, duration_s=3.0)
+    has_command = np.arange(len(log.time_s)) % 5 == 0
+    held = np.repeat(log.rate_cmd_b[::10], 10, axis=0)[: len(log.time_s)]
+    slow = replace(log, rate_cmd_b=np.where(has_command[:, None], held, np.nan))
+    row_hz = 1.0 / float(np.median(np.diff(log.time_s)))
+
+    def status(policy_hz):
+        found = check_log(slow, CheckContext(policy_hz=policy_hz))[0]
+        return [one.status for one in found if one.signal == "controller"]
+
+    assert status(row_hz / 10) == ["ok"] and status(row_hz / 5) == ["doubt"]

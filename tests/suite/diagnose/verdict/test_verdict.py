@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data.windows import STATE
-from suite.diagnose.diagnose import Verdict, verdict_on
+from suite.diagnose.diagnose import Verdict, deciding, verdict_on
 from suite.diagnose.sources.rollout_source import of_rollouts, structure_where
 from suite.diagnose.sources.source import Remaining
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict.disturbances import Swing, _likelihood, find_turbulence
+from suite.diagnose.verdict.disturbances import Swing, _likelihood, _range_of, find_turbulence
 from suite.diagnose.verdict.gap import Gap, from_true_starts, gap_of, noise_floor, remaining_share
 from suite.diagnose.verdict.residual_structure import (
     AXES,
@@ -61,6 +61,20 @@ def test_sources_that_name_something_are_judged_and_a_swing_always_remains(drag)
     swing = Swing(1.4, (1.3, 1.5), 0.5, 1e-6)
     verdict = verdict_on([finding(drag, share=0.1, swing=swing)], True, THRESHOLDS)
     assert verdict.label == "partly" and verdict.where == swing.words
+
+
+def test_only_an_error_above_the_noise_decides(drag):
+    """A large share of a small unexplained error decides nothing, and is no reason."""
+    noisy = finding(drag, share=0.8, explainable=0.9, where="force x")
+    clear = finding(drag, structured=True, share=0.2, where="torque y")
+    assert verdict_on([noisy, clear], True, THRESHOLDS) == Verdict("partly", 0.2, "torque y")
+    wrong = finding(drag, structured=True, share=0.8, where="torque y")
+    right = finding(drag, share=0.02, explainable=0.9, where="force x")
+    assert verdict_on([right, wrong], True, THRESHOLDS) == Verdict("unknown", 0.8, "torque y")
+    assert deciding([right, wrong]) == [wrong] and deciding([right]) == [right]
+    swing = Swing(1.4, (1.3, 1.5), 0.5, 1e-6)
+    verdict = verdict_on([finding(drag, share=0.1, swing=swing, where="z")], True, THRESHOLDS)
+    assert verdict.where == swing.words
 
 
 def test_structure_is_a_shape_a_colour_or_the_largest_channel():
@@ -129,3 +143,9 @@ def test_the_likelihood_of_a_random_disturbance_peaks_at_its_size():
     sizes = np.array([0.5, 1.0, 2.0, 4.0, 8.0])
     found = _likelihood(equations, np.broadcast_to(np.eye(6), (count, 6, 6)), sizes)
     assert sizes[found.argmax()] == size
+
+
+def test_an_interval_at_the_end_of_the_tried_values_is_unknown():
+    tried = np.array([1.0, 2.0, 4.0, 8.0])
+    assert _range_of(tried, np.array([False, True, True, False])) == [2.0, 4.0]
+    assert _range_of(tried, np.array([False, False, True, True])) is None

@@ -15,6 +15,7 @@ from suite.diagnose.estimate.parameters import (
     make_space,
     usual_first,
 )
+from suite.diagnose.evidence.evidence import validation_groups
 from suite.diagnose.evidence.moments import (
     ForceModel,
     ViewData,
@@ -22,7 +23,6 @@ from suite.diagnose.evidence.moments import (
     fast_changes_agree,
     fast_share,
     successive_changes,
-    validation_groups,
     weights_of,
     whitened,
 )
