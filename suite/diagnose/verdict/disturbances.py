@@ -273,8 +273,8 @@ def find_turbulence(
     likely = table >= ratio - limits.profile_fall  # 95 % by the profile likelihood
     intensity, length = float(intensities[j]), float(lengths_m[i])
     parameters = {
-        name: {"value": value, "unit": unit, "ci95": _range_of(tried, is_likely)}
-        for name, value, unit, tried, is_likely in (
+        name: {"value": value, "unit": unit, "ci95": _range_of(tried, np.asarray(of))}
+        for name, value, unit, tried, of in (
             ("intensity", intensity, "m/s", intensities, likely.any(axis=0)),
             ("length", length, "m", lengths_m, likely.any(axis=1)),
         )
