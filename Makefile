@@ -22,7 +22,7 @@ env: $(STAMP)
 
 $(STAMP): requirements.lock pyproject.toml setup.py
 	@set -e; found=; \
-	for python in $(PYTHON) python3 python3.11 python3.12 python3.13; do \
+	for python in $(PYTHON) $(PY) python3 python3.11 python3.12 python3.13; do \
 		if "$$python" -c '$(USABLE)' >/dev/null 2>&1; then found=$$python; break; fi; \
 	done; \
 	if [ -z "$$found" ]; then \

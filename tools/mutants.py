@@ -229,8 +229,9 @@ def main() -> int:
             if not detected[name]:
                 survivors.append(name)
                 print(name, flush=True)
-    print(f"{len(survivors)} of {min(args.count, len(candidates))} survive")
-    return int(len(survivors) > 0.05 * args.count)
+    count = min(args.count, len(candidates))
+    print(f"{len(survivors)} of {count} survive")
+    return int(len(survivors) > 0.05 * count)
 
 
 if __name__ == "__main__":

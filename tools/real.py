@@ -52,7 +52,7 @@ def suite(*words: Any) -> dict[str, Any]:
 
 
 def import_flights(files: Iterable[Path], folder: Path, *options: Any) -> dict[str, Path]:
-    """Import logs that `folder` lacks, and return name -> path of all flights.
+    """Import logs into `folder`, and return name -> path of the flights.
 
     Args:
         files: logs of the authors.
@@ -62,10 +62,9 @@ def import_flights(files: Iterable[Path], folder: Path, *options: Any) -> dict[s
     flights = {}
     for file in sorted(files):
         flights[file.stem] = folder / f"{file.stem}.parquet"
-        if not flights[file.stem].is_file():
-            folder.mkdir(parents=True, exist_ok=True)
-            all_options = (*options, "--vehicle", "crazyflie21", "--rate", 100)
-            suite("import", file, "--out", flights[file.stem], *all_options)
+        folder.mkdir(parents=True, exist_ok=True)
+        all_options = (*options, "--vehicle", "crazyflie21", "--rate", 100)
+        suite("import", file, "--out", flights[file.stem], *all_options)
     return flights
 
 

@@ -235,10 +235,8 @@ def _columns(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             columns |= dict(zip(names, rows[group].T, strict=True))
     if "throttle" in rows:
         columns["throttle"] = rows["throttle"][:, 0]
-    kept = {name: value for name, value in rows.items() if name.startswith(KEPT)}
-    return columns | {
-        name.removeprefix(KEPT): value[:, 0] for name, value in kept.items() if value.shape[1] == 1
-    }
+    kept = {name: value[:, 0] for name, value in rows.items() if name.startswith(KEPT)}
+    return columns | {name.removeprefix(KEPT): value for name, value in kept.items()}
 
 
 def usable_for(rows: dict[str, np.ndarray], missing: list[str]) -> Finding:

@@ -55,20 +55,26 @@ def recording_of(
         ValueError: for `options.source` where the mapping has no sources.
     """
     name, parts, used_columns = str(path), {}, {}
+    about, findings = _text_file(path, mapping)
     if options.source and not any(c.source for each in mapping.columns.values() for c in each):
         raise ValueError(
             f"--source {options.source}: the mapping of {name} names no source of any signal; "
             'leave it out, or add source = "mocap" and "estimate" to the mapping'
         )
     for signal, alternatives in mapping.columns.items():
-        column, part = _first_alternative(signal, alternatives, find, options.source, name)
+        column, part = _first_alternative(alternatives, find, options.source)
         if part is None:
             if mapping.optional or signal == "time":
                 continue
             missing_column = next(c for c in alternatives[0].names if find((c,)) is None)
             raise FlightLogError(name, missing_column, None, missing(missing_column))
+        if options.source and column.source not in ("", options.source):
+            if signal == "pos":
+                reason = f"has no position of the {options.source}; it has --source {column.source}"
+                raise FlightLogError(name, None, None, reason)
+            text = f"{signal} is of the {column.source}; there is none of the {options.source}"
+            findings.append(Finding("note", "file", text))
         used_columns[signal], parts[signal] = column, _in_log_unit(part, column, name)
-    about, findings = _text_file(path, mapping)
     parts.pop("time", None)
     # Angles become quaternions, unless the file has quaternions too.
     for angles, quat in (("euler", "quat"), ("cmd_euler", "cmd_quat")):
@@ -84,7 +90,10 @@ def recording_of(
     for column in mapping.keep:
         part = find((column,))
         if part is not None:
-            parts[KEPT + column] = part
+            time_s, value = part
+            width = value.shape[1]  # a column of lists becomes one column per number
+            names = [column] if width == 1 else [f"{column}[{k}]" for k in range(width)]
+            parts |= {f"{KEPT}{n}": (time_s, value[:, k, None]) for k, n in enumerate(names)}
     signals, more_findings = collect(parts, name)
     for signal in ("vel", "rate", "acc"):
         if signal in signals and used_columns[signal].other_axes:
@@ -96,7 +105,7 @@ def recording_of(
 
 
 def _first_alternative(
-    signal: str, alternatives: tuple[Column, ...], find: Find, source: str, name: str
+    alternatives: tuple[Column, ...], find: Find, source: str
 ) -> tuple[Column, Part | None]:
     """Return the first alternative that the file has, with its samples.
 
@@ -106,9 +115,6 @@ def _first_alternative(
     for column in (*preferred, *(c for c in alternatives if c not in preferred)):
         part = find(column.names)
         if part is not None:
-            if source and signal == "pos" and column.source and column.source != source:
-                reason = f"has no position of the {source}; it has --source {column.source}"
-                raise FlightLogError(name, None, None, reason)
             return column, part
     return alternatives[0], None
 

@@ -196,7 +196,7 @@ def motor_side_of(frames: Table) -> tuple[tuple[float, float], ...] | None:
 
 
 def own_map(columns: Mapping[str, np.ndarray]) -> LogMap:
-    """Return the mapping of a table whose columns are named as in a flight log."""
+    """Return the mapping of a flight log's columns; other columns of numbers are kept."""
     present = {
         group: (Column(names, (1.0,) * len(names)),)
         for group, names in GROUPS.items()
@@ -204,7 +204,8 @@ def own_map(columns: Mapping[str, np.ndarray]) -> LogMap:
     }
     if "throttle" in columns:
         present["throttle"] = (Column(("throttle",), (1.0,)),)
-    return LogMap(present)
+    others = (name for name, v in columns.items() if name not in KNOWN and v.dtype.kind in "fiub")
+    return LogMap(present, keep=tuple(name for name in others if name != "throttle"))
 
 
 def _check_placeholders(about: Table, name: str) -> None:

@@ -24,8 +24,9 @@ class ImportOptions:
     """The vehicle file: order of the motors, mass, and thrust at full throttle."""
     full_thrust: float | None = None
     """Thrust per mass at full throttle [m/s^2]; overrides the vehicle's."""
-    motor_poles: int = 14
-    """Magnets on a motor's bell, to turn Betaflight's eRPM into revolutions."""
+    motor_poles: int | None = None
+    """Magnets on a motor's bell, to turn Betaflight's eRPM into revolutions; None: the number in
+    the log's header, or 14."""
     rate_hz: float = 250.0
     """At most this many rows a second; faster signals are smoothed over a row's period."""
     start_s: float = 0.0

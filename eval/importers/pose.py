@@ -120,8 +120,8 @@ def with_pose(
     )
     findings = [*pose.findings, *time_findings]
     if left_out := [name for name in OTHER_WORLD if name in recording.signals]:
-        text = f"{' and '.join(left_out)} of the log are in another world frame: left out"
-        findings.append(Finding("note", "pose", text))
+        note = f"{' and '.join(left_out)} of the log are in another world frame: left out"
+        findings.append(Finding("note", "pose", note))
     findings += [Finding("ok", "pose clock", text), *attitude_findings]
     if abs(alignment.drift) > max(DRIFT, 4.0 * alignment.drift_sd):
         text = (

@@ -59,7 +59,9 @@ def rows_at(recording: Recording, time_s: np.ndarray) -> dict[str, np.ndarray]:
     """
     rows = {"time": time_s - time_s[0]}
     for name, samples in recording.signals.items():
-        if name in HELD:
+        if name == "cmd_quat":  # a mean of opposite signs of one attitude would be none
+            rows[name] = held(samples._replace(value=continuous(samples.value)), time_s)
+        elif name in HELD:
             rows[name] = held(samples, time_s)
         elif name.startswith("kept:") and not name.startswith(MEASURED):
             rows[name] = unchanged(samples, time_s)

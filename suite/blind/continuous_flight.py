@@ -93,6 +93,7 @@ class _Pilot:
         references = [t.reference(stamp_s[:, index]) for index, t in enumerate(trajectories)]
         self._references = [np.stack(part, axis=1) for part in zip(*references, strict=True)]
         self._integral_w = np.zeros((len(trajectories), 3))
+        self._end_s = np.array([t.duration_s for t in trajectories]) + MARGIN_S
 
     def reference(self, row: int) -> Reference:
         """Return the set points (N, ...) at a row."""
@@ -105,7 +106,7 @@ class _Pilot:
         """
         row = states.number
         reference, motion = self.reference(row), _motion(states)
-        check_flights(motion, reference, states.time_s)
+        check_flights(motion, reference, states.time_s, states.time_s < self._end_s)
         dt = self._stamp_s[row] - self._stamp_s[max(row - 1, 0)]
         error_w = reference.pos_w - states.pos_w
         self._integral_w = self._integral_w + dt[:, None] * error_w

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -62,8 +62,8 @@ def make_set(
         workers: processes that make cases in parallel; None: this process.
 
     Raises:
-        ValueError: if `out` has a set of another seed, count, simulator or table of strengths, or
-            the simulator is not installed; nothing is written then.
+        ValueError: if `out` has a set of another seed, count, simulator or table of strengths, a
+            file of it has changed, or the simulator is not installed; nothing is written then.
     """
     if simulator == ROTORPY:
         world_class(ROTORPY)
@@ -75,6 +75,9 @@ def make_set(
         for name in cases
         if not ((out / "cases" / name).is_dir() and (out / "answers" / f"{name}.json").is_file())
     ]
+    if (out / "manifest.json").is_file():
+        manifest = load_manifest(out)
+        _check_files(out, manifest, [name for name in manifest.cases if name not in names])
     failed: dict[str, str] = {}
     before = len(cases) - len(names)
     numbers = itertools.count(before + 1)
@@ -143,18 +146,25 @@ def open_answers(out: Path) -> dict[str, dict[str, Any]]:
         ValueError: for a changed file.
     """
     manifest = load_manifest(out)
-    answers = {}
-    for name, files in manifest.cases.items():
-        answer = out / "answers" / f"{name}.json"
-        digests = {out / "cases" / name / file: digest for file, digest in files.items()}
-        for path, digest in {**digests, answer: manifest.answers[name]}.items():
+    _check_files(out, manifest, manifest.cases)
+    return {name: read_json(out / "answers" / f"{name}.json") for name in manifest.cases}
+
+
+def _check_files(out: Path, manifest: Manifest, names: Iterable[str]) -> None:
+    """Check that the files of the cases `names` are those of the manifest.
+
+    Raises:
+        ValueError: for a changed file.
+    """
+    for name in names:
+        files = {out / "cases" / name / file: sha for file, sha in manifest.cases[name].items()}
+        files[out / "answers" / f"{name}.json"] = manifest.answers[name]
+        for path, digest in files.items():
             if not path.is_file() or _hash(path) != digest:
                 raise ValueError(
                     f"{path}: not the file that the manifest was made with; make the set again "
                     "in another folder"
                 )
-        answers[name] = read_json(answer)
-    return answers
 
 
 def _check_options(out: Path, options: dict[str, Any]) -> None:

@@ -180,6 +180,12 @@ def not_run(out: Path, verdicts: Sequence[Verdict]) -> list[str]:
     return [name for name in load_manifest(out).cases if name not in scored]
 
 
+def commits_of(out: Path, verdicts: Sequence[Verdict]) -> list[str]:
+    """Return the git commits of the code that diagnosed the cases, each one once."""
+    paths = (out / RESULTS / v.case / "diagnosis.json" for v in verdicts if v.seconds is not None)
+    return sorted({(_read_if_valid(path) or {}).get("git_commit") or "unknown" for path in paths})
+
+
 def shares(verdicts: Sequence[Verdict]) -> list[Share]:
     """Return the rows of the table with shares; rows without any case are left out."""
 
@@ -189,9 +195,7 @@ def shares(verdicts: Sequence[Verdict]) -> list[Share]:
     single, null, pair = of("single"), of("null"), of("pair")
     # A failed diagnosis names nothing, which must not count as correct.
     completed = [v for v in verdicts if v.verdict != "failed"]
-    # Random effects (gusts) are left out of the gaps: naming them does not predict a flight.
-    random_effects = {name for name, effect in EFFECTS.items() if effect.random}
-    ratios = [v.gap_ratio for v in verdicts if v.found and not random_effects & set(v.hidden)]
+    ratios = _gap_ratios(verdicts)
     lines = [
         ("single effects: named, nothing else", "96 %", [v.exact for v in single]),
         *(
@@ -239,7 +243,7 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
         for s in counted
     ]  # fmt: skip
     times = [v.seconds for v in verdicts if v.seconds is not None]
-    ratios = [v.gap_ratio for v in verdicts if v.found and v.gap_ratio is not None]
+    ratios = _gap_ratios(verdicts)
     if times:
         lines.append(["seconds a case, median", f"{median(times):.3g} s", "", ""])
     if ratios:
@@ -255,7 +259,10 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
     title = f"{len(unexpected)} of {len(verdicts)} cases are not as expected:"
     missing, failed = not_run(out, verdicts), load_manifest(out).failed
     count = len(missing) + len(verdicts)
+    commits = commits_of(out, verdicts)
     notes = [
+        len(commits) > 1
+        and f"Diagnosed by {len(commits)} versions of the code: {', '.join(commits)}.",
         missing and f"Not run yet, so in none of these numbers: {len(missing)} of {count} cases.",
         failed and f"Not made: {', '.join(failed)}.",
     ]
@@ -272,10 +279,21 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
         "shares": counted,
         "seconds_median": median(times) if times else None,
         "not_run": missing,
+        "diagnosed_by": commits,
         "cases": verdicts,
     }
     write_json(out / "table.json", summary)
     return text
+
+
+def _gap_ratios(verdicts: Sequence[Verdict]) -> list[float]:
+    """Return the gaps over their noise floors of the cases whose effects are named.
+
+    Random effects (gusts) are left out: naming them does not predict a flight.
+    """
+    random_effects = {name for name, effect in EFFECTS.items() if effect.random}
+    named = (v for v in verdicts if v.found and not random_effects & set(v.hidden))
+    return [v.gap_ratio for v in named if v.gap_ratio is not None]
 
 
 def _without_hubs(verdicts: Sequence[Verdict]) -> tuple[str, str, list[bool]]:

@@ -44,8 +44,8 @@ class Config(Command):
     of --vehicle."""
     mass: Annotated[float, Range(0.0, 10_000.0, above=True)] | None = None
     """Nominal mass [kg], for a log with thrust in N. Without it that of --vehicle."""
-    motor_poles: Advanced[Annotated[int, Range(2, 1000)]] = 14
-    """Number of magnets in a motor, for Betaflight's eRPM."""
+    motor_poles: Advanced[Annotated[int, Range(2, 1000)] | None] = None
+    """Number of magnets in a motor, for Betaflight's eRPM. Without it that of the log, or 14."""
     rate: Advanced[Annotated[float, Range(1.0, 10_000.0)]] = 250.0
     """Largest number of rows per second."""
     start: Advanced[Annotated[float, Range(0.0, 1e9)]] = 0.0

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,8 +38,10 @@ from suite.experiments.injected.flights import (
 from suite.experiments.injected.kinds import KINDS, Kind, inject
 from suite.experiments.injected.writers import WRITERS
 from suite.experiments.pages.document import PageContents
-from suite.experiments.study.cache import Workspace, code_digest, digest
+from suite.experiments.study.cache import MEASURED, Workspace, code_digest, digest
+from suite.experiments.study.judging import policy_facts
 from suite.judging.collect import collect
+from suite.judging.flying import default_policy
 from suite.judging.requests import Collection
 from tracks.common.files import write_text
 from tracks.common.grid import Grid, table
@@ -48,8 +51,6 @@ from tracks.input.ranges import Range, Seed
 
 FLIGHT_LOG = "flight log"
 """Label of the suite's format of flight logs."""
-CODE = ("suite/experiments/injected", "eval/importers", "eval/logs/faults")
-"""Folders with the code that injects and finds faults."""
 FORMATS = (*WRITERS, FLIGHT_LOG)
 """Formats of the simulated logs."""
 POLICY_HZ = 30.0
@@ -103,9 +104,11 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
             "because the logs are files of this machine"
         )
     vehicle = load_vehicle(config.vehicle)
-    inputs = [vehicle, config.seed, git_commit(), code_digest("eval")]
+    policy = policy_facts({"policy": default_policy()})
+    count = max(config.clean, config.flights * len(FORMATS))
+    inputs = [vehicle, config.seed, git_commit(), code_digest("eval"), policy, count]
     folder = workspace.cache / f"faults-{digest(inputs)}"
-    flights = _fly(config, vehicle, folder, console)
+    flights = _fly(count, config, vehicle, folder, console)
     faulty = list(_simulated_cases(config, flights))
     clean = [
         Case("", FORMATS[k % len(FORMATS)], path, k)
@@ -124,6 +127,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     }
     parts["Logs without a fault"] = [_clean_grid([(c, answers[c]) for c in (*clean, *clean_real)])]
     facts = {
+        **policy,
         "flights": f"{len(flights)} simulated ones on all tracks, levels 0, 3 and 6, vehicle "
         f"{config.vehicle} with its centre of mass off by 6 and -3 mm, measured with noise; "
         f"checked against {config.vehicle} and a policy of {POLICY_HZ:g} Hz",
@@ -142,9 +146,10 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     )
 
 
-def _fly(config: Config, vehicle: Vehicle, folder: Path, console: Console) -> list[Path]:
-    """Return logs of flights of more than 4 s, without faults; missing ones are flown first."""
-    count = max(config.clean, config.flights * len(FORMATS))
+def _fly(
+    count: int, config: Config, vehicle: Vehicle, folder: Path, console: Console
+) -> list[Path]:
+    """Return `count` logs of flights of more than 4 s, without faults; missing ones are flown."""
     true_vehicle = with_effects(vehicle, TRUE_EFFECTS)
     folder.mkdir(parents=True, exist_ok=True)
     title = "the nominal vehicle, its centre of mass moved"
@@ -220,8 +225,13 @@ def _check_cases(
     cases: Sequence[Case], config: Config, folder: Path, console: Console, workspace: Workspace
 ) -> dict[Case, Answer]:
     """Return the answer to every case; those of an interrupted run are read from its file."""
-    path = folder / f"checked-{code_digest(*CODE)}.jsonl"
-    keys = {f"{c.kind}|{c.format}|{c.path.parent.name}/{c.path.name}|{c.number}": c for c in cases}
+    code = code_digest(*MEASURED["faults"])
+    path = folder / f"checked-{code}.jsonl"
+    names = {
+        log: f"{log.parent.name}/{log.name}|{sha256(log.read_bytes()).hexdigest()[:16]}"
+        for log in {case.path for case in cases}
+    }
+    keys = {f"{c.kind}|{c.format}|{names[c.path]}|{c.number}": c for c in cases}
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
     # If a kill left an incomplete last line, it is dropped.
     lines = text.splitlines(keepends=True)[: text.count("\n")]

@@ -74,8 +74,8 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     preset_conditions = [
         Condition(name, 1.0, "", vehicle, sensors) for name, sensors in presets.items()
     ]
-    results, _ = disturbed.fly_conditions(
-        [base, *preset_conditions], {}, policies, trials, workspace, console
+    results = disturbed.fly_conditions(
+        [base, *preset_conditions], policies, trials, workspace, console
     )
 
     # 2. Presets and single models at several magnitudes, on level 3.
@@ -88,10 +88,9 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
         """Return the results of each of `sets` at each of `magnitudes`."""
         sweeps = magnitude_sweeps(sets, magnitudes)
         conditions = {sweep: sweep_conditions(vehicle, sweep) for sweep in sweeps}
-        _, results = disturbed.fly_conditions(
-            [], conditions, policies, sweep_trials, workspace, console
-        )
-        return results
+        flown = [point for points in conditions.values() for point in points]
+        results = disturbed.fly_conditions(flown, policies, sweep_trials, workspace, console)
+        return disturbed.by_sweep(results, conditions)
 
     first_policy = dict([next(iter(policies.items()))])
     preset_sweeps = fly_sweeps(presets, PRESET_MAGNITUDES, policies)

@@ -12,7 +12,7 @@ from typing import Any
 
 from policies import shipped
 from suite.common.console import Console, duration
-from suite.experiments.study.cache import FLIES, code_digest
+from suite.experiments.study.cache import page_code
 from suite.judging.content import policy_digest
 from tracks.common.grid import Grid, table
 
@@ -61,8 +61,8 @@ def page_states(folder: Path) -> dict[str, dict[str, Any]]:
     """Return the state of every published page in `folder`, by name.
 
     A state has `commit`, which made the page, and `newer`, a list of what has changed since. It has
-    "policy" if a shipped policy now has other weights, and "code" if the code that flies (tracks,
-    policies, eval) is different, docstrings and comments apart. `newer` is None without a page.
+    "policy" if a shipped policy now has other weights, and "code" if the code that flies or that
+    the page measures is different, docstrings and comments apart. `newer` is None without a page.
     """
     return {name: _page_state(folder / f"{name}.json") for name in PUBLISHED}
 
@@ -78,7 +78,7 @@ def _page_state(path: Path) -> dict[str, Any]:
         policy_digest(name)[:16] != digest for name, digest in policies if name in shipped.names()
     )
     newer = ["policy"] if any(weights_differ) else []
-    newer += ["code"] if page.get("code_sha256") != code_digest(*FLIES) else []
+    newer += ["code"] if page.get("code_sha256") != page_code(path.stem) else []
     return {"commit": page["git_commit"] or "", "newer": newer}
 
 

@@ -43,9 +43,10 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     vehicle, policies = load_vehicle(config.vehicle), judging.named_policies(config.policy)
     singles, sweeps = disturbed.select_conditions(vehicle, config.only)
     base, trials = Condition("undisturbed", 0.0, "", vehicle), judging.judged_trials(config)
-    effects, sweep_results = disturbed.fly_conditions(
-        [base, *singles], sweeps, policies, trials, workspace, console
-    )
+    flown = [base, *singles, *(point for points in sweeps.values() for point in points)]
+    results = disturbed.fly_conditions(flown, policies, trials, workspace, console)
+    effects = results[: 1 + len(singles)]
+    sweep_results = disturbed.by_sweep(results[len(effects) :], sweeps)
     facts = {
         **judging.policy_facts(policies),
         "trials": f"three tracks, level {config.difficulty}, seeds "
@@ -66,7 +67,6 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
                 for s, points in sweep_results.items()
             ),
         ]
-    results = [*effects, *(point for points in sweep_results.values() for point in points)]
     numbers = [disturbed.tested_numbers(entry, effects[0]) for entry in results]
     return PageContents(facts, parts, {"conditions": numbers})
 

@@ -33,9 +33,10 @@ BASE = "mujoco"
 ROUNDING = "mjx"
 """The simulator that differs from `BASE` in numerics only: single precision, contacts by signed
 distance, and images from analytic rays."""
-REASONS = ("rounding", "air", "rest")
+REASONS = ("rounding", "air", "rest", "rest or rounding")
 """Why the success of a trial changes. `rounding`: it also changes in mjx. `air`: it also changes in
-mujoco with that simulator's aerodynamics (the control). `rest`: for another reason."""
+mujoco with that simulator's aerodynamics (the control). `rest`: for another reason; without mjx on
+the page it is `rest or rounding`."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     simulators = conditions(config)
     policies = judging.named_policies(config.policy or tuple(shipped.names()))
     trials = judging.judged_trials(config)
-    results, _ = fly_conditions(simulators, {}, policies, trials, workspace, console)
+    results = fly_conditions(simulators, policies, trials, workspace, console)
     changed = changed_trials(results)
     facts = {
         **judging.policy_facts(policies),
@@ -191,7 +192,8 @@ def changed_trials(results: Sequence[ConditionResult]) -> list[dict[str, Any]]:
                     and by_name[name].results[policy][number].success == result.success
                     for name in (ROUNDING, control_label(simulator))
                 )
-                why = "rounding" if rounding else "air" if air else "rest"
+                rest = "rest" if ROUNDING in by_name else "rest or rounding"
+                why = "rounding" if rounding else "air" if air else rest
                 changed.append(
                     {
                         "policy": policy,

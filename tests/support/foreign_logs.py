@@ -256,9 +256,12 @@ def pack_quaternion(wxyz):
 
 def write_mcap(
     path, span=(0.0, 6.0), imu=200.0, odometry=100.0, command=50.0, full_thrust=30.0, source=fly,
-    mask=0,
+    mask=0, pose=None,
 ):  # fmt: skip
-    """ROS 2: odometry (twist in the body), imu, mavros' attitude target and motors, in MCAP."""
+    """ROS 2: odometry (twist in the body), imu, mavros' attitude target and motors, in MCAP.
+
+    `pose` is the rate of a PoseStamped, if any [Hz].
+    """
     from mcap_ros2.writer import Writer
 
     origin = 1_700_000_000 * 10**9
@@ -294,6 +297,9 @@ def write_mcap(
                 "twist": {"twist": twist, "covariance": [0.0] * 36},
             }
 
+        def placed(truth, k):
+            return {"pose": moving(truth, k)["pose"]["pose"]}
+
         def measured(truth, k):
             names = ("orientation", "angular_velocity", "linear_acceleration")
             return {
@@ -316,6 +322,8 @@ def write_mcap(
 
         topics = ["/odom", "/odom_slow"]
         send(topics, "nav_msgs/msg/Odometry", odometry, moving)
+        if pose:
+            send(["/pose"], "geometry_msgs/msg/PoseStamped", pose, placed)
         send(["/imu"], "sensor_msgs/msg/Imu", imu, measured)
         send(["/target"], "mavros_msgs/msg/AttitudeTarget", command, wanted)
         send(["/motors"], "actuator_msgs/msg/Actuators", command, turning)

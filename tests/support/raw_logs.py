@@ -68,8 +68,11 @@ ARDUPILOT = {
 TYPES = {"Q": "Q", "N": "16s", "f": "f", "B": "B", "H": "H"}
 
 
-def write_bin(path, truth, pose=False, frame_type=1):
-    """Write ArduPilot's .bin: messages are two bytes, their number, and their packed columns."""
+def write_bin(path, truth, pose=False, frame_type=1, lowest=0):
+    """Write ArduPilot's .bin: messages are two bytes, their number, and their packed columns.
+
+    `lowest` is the first instance of IMU and battery.
+    """
     data = bytearray()
 
     def put(number, layout, *values):
@@ -91,15 +94,15 @@ def write_bin(path, truth, pose=False, frame_type=1):
     flip, motors = np.array([1.0, -1.0, -1.0]), truth.motor[:, [0, 2, 3, 1]]
     ned, angles = made.ned(truth.pos), _angles(truth)
     for k, t in enumerate((truth.time * 1e6).astype(int) + 7_000_000):
-        send("IMU", t, 0, *(truth.rate[k] * flip), *(truth.acc[k] * flip))
-        send("IMU", t, 1, *np.zeros(6))
+        send("IMU", t, lowest, *(truth.rate[k] * flip), *(truth.acc[k] * flip))
+        send("IMU", t, lowest + 1, *np.zeros(6))
         send("RATE", t, *np.rad2deg(truth.cmd_rate[k] * flip))
         pulse = np.round(1100 + 900 * motors[k] / 2100).astype(int)
         send("RCOU", t, *pulse[[3, 0, 1, 2]])
-        for esc in range(4):
-            send("ESC", t, esc, motors[k, esc] * 30 / np.pi)
-        send("BAT", t, 0, truth.voltage[k])
-        send("BAT", t, 1, 5.0)
+        for esc, motor in enumerate((3, 0, 1, 2)):  # in the order of the outputs
+            send("ESC", t, esc, motors[k, motor] * 30 / np.pi)
+        send("BAT", t, lowest, truth.voltage[k])
+        send("BAT", t, lowest + 1, 5.0)
         send("CTUN", t, truth.thrust[k] / 30.0)
         if pose:
             send("ATT", t, *angles[k])

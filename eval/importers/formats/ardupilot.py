@@ -5,13 +5,13 @@ ArduPilot's documentation of its log messages (Copter 4.x); the first one in the
 
 | signal | messages |
 |---|---|
-| rate, acc | IMU (rad/s, m/s^2), of the first instance |
+| rate, acc | IMU (rad/s, m/s^2), of the lowest instance |
 | quat | ATT (roll, pitch, yaw in deg) |
-| pos, vel | XKF1, NKF1 (PN PE PD in m, VN VE VD in m/s), of the first core |
+| pos, vel | XKF1, NKF1 (PN PE PD in m, VN VE VD in m/s), of the lowest core |
 | cmd_rate | RATE (RDes PDes YDes in deg/s) |
 | throttle | CTUN (ThO, 0 to 1) |
 | pwm | RCOU (pulses in us), the outputs that SERVOn_FUNCTION makes motors 1 to 4 |
-| motor | ESC (RPM by instance), where all four report |
+| motor | ESC (RPM by instance, in the order of these outputs), where all four report |
 | voltage | BAT (Volt) |
 """
 
@@ -116,7 +116,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
         parts["pwm"] = (time_s, np.clip((pulse - low) / (high - low), 0.0, 1.0))
         findings.append(Finding("note", "motors", f"pulses of {low:g} to {high:g} us are 0 to 1"))
     if "ESC" in messages:
-        parts |= _motors(messages["ESC"], findings)
+        parts |= _motors(messages["ESC"], outputs, findings)
     frame_class = int(parameters.get("FRAME_CLASS", 1.0))
     if frame_class != 1:
         text = f"FRAME_CLASS is {frame_class}, not 1: no quadrotor"
@@ -204,7 +204,8 @@ def _columns(rows: list[dict[str, Any]], name: str) -> Rows:
     """Return the numeric columns of a message: of its first instance or core, or of all ESCs."""
     if name != "ESC":
         key = next((k for k in INSTANCES if k in rows[0]), "")
-        rows = [r for r in rows if not r.get(key, 0)] or rows
+        first = min(r.get(key, 0) for r in rows)
+        rows = [r for r in rows if r.get(key, 0) == first]
     numeric = [k for k, v in rows[0].items() if isinstance(v, (int, float))]
     return {k: np.array([r.get(k, np.nan) for r in rows], dtype=np.float64) for k in numeric}
 
@@ -222,17 +223,21 @@ def _outputs(parameters: Mapping[str, float]) -> list[int]:
     return assigned if len(assigned) == 4 else []
 
 
-def _motors(esc: Rows, findings: list[Finding]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return rotor speeds [rad/s] at the times of the first motor controller (ESC).
+def _motors(
+    esc: Rows, outputs: list[int], findings: list[Finding]
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return rotor speeds [rad/s] of motors 1 to 4, whose numbers of outputs are `outputs`.
 
-    The speeds of the other three are interpolated to these times.
+    Motor controllers (ESCs) have instances in the order of their outputs. Speeds are interpolated
+    to the times of the first motor's ESC.
     """
     name = "Instance" if "Instance" in esc else "I"
     instances = sorted(set(esc.get(name, np.zeros(0)).tolist()))
     findings += check_count(len(instances), "by the ESCs of the log")
     if len(instances) != 4 or not {"RPM", "TimeUS"} <= set(esc) or not np.any(esc["RPM"]):
         return {}
-    rows_of = [esc[name] == k for k in instances]
+    order = np.argsort(np.argsort(outputs)) if outputs else range(4)
+    rows_of = [esc[name] == instances[k] for k in order]
     time_s = esc["TimeUS"][rows_of[0]] * 1e-6
     speeds = [np.interp(time_s, esc["TimeUS"][rows] * 1e-6, esc["RPM"][rows]) for rows in rows_of]
     return {"motor": (time_s, np.stack(speeds, axis=1) * RPM)}

@@ -153,8 +153,8 @@ def read(path: Path, options: ImportOptions) -> Recording:
         unit = box.unit("vbatLatest")
         parts["voltage"] = _volts(box.values(["vbatLatest"], _VOLT), unit, options.fix, findings)
     poles = options.motor_poles
-    if poles == ImportOptions.motor_poles:  # the default: the header's number comes first
-        poles = int(box.settings("motor_poles", (poles,))[0])
+    if poles is None:
+        poles = int(box.settings("motor_poles", (14,))[0])
     parts |= _motors(box, poles, findings)
     parts |= _outputs(box, findings)
     signals, more_findings = collect(

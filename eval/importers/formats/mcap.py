@@ -2,7 +2,8 @@
 
 ROS's worlds are z-up and its bodies forward-left-up; quaternions are xyzw. The velocity of an
 Odometry is in its child frame, the body. A mapping file's [topics] selects a topic where several
-hold the same kind of message; its `[frames] motors` gives the positions of the motors.
+hold the same kind of message; a pose without an odometry there replaces every odometry. Its
+`[frames] motors` gives the positions of the motors.
 
 | kind | messages |
 |---|---|
@@ -71,7 +72,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
     findings: list[Finding] = []
     for kind in KINDS:
         topics = {topic: messages for (k, topic), messages in recorded.items() if k == kind}
-        if not topics:
+        if not topics or (kind == "odometry" and kind not in topic_of and "pose" in topic_of):
             continue
         topic = topic_of.get(kind) or max(topics, key=lambda name: len(topics[name]))
         if topic not in topics:
@@ -210,8 +211,9 @@ def _signals(
     take("motor", "motors", _speeds)
     take("voltage", "battery", lambda m: [m.voltage])
     signals, findings = collect(parts, name)
-    if "vel" in signals and "quat" in signals:
-        signals["vel"] = in_world(signals["vel"], signals["quat"])
+    if "vel" in signals:
+        vel_b = signals.pop("vel")
+        signals |= {"vel": in_world(vel_b, signals["quat"])} if "quat" in signals else {}
     return without_empty(signals), findings
 
 

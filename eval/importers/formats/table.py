@@ -88,7 +88,7 @@ def _time(
     values = numbers(columns, column.names[0], name)
     if len(values) and values.dtype.kind in "iu" and abs(int(values[0])) > 2**52:
         # Unix times in nanoseconds exceed a float64's precision: subtract the first as integers.
-        values = values - values[0]
+        values = (values - values[0]).astype(np.int64)  # unsigned differences wrap below 0
     return values.astype(np.float64) * column.factor[0]
 
 

@@ -283,7 +283,7 @@ KINDS: dict[str, Kind] = {
     "commands act 150 ms later": Kind(
         ("command_delay",), change=_log_commands_early, needs=("cmd_rate", "rate", "throttle")
     ),
-    "loop at two thirds of its rate (40 of 60 Hz)": Kind(
+    "loop at two thirds of its rate (20 of 30 Hz)": Kind(
         ("controller_rate",), change=_hold_commands, race=True, needs=("cmd_rate", "throttle")
     ),
     # The other formats define the unit of time.

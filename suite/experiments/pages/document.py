@@ -16,7 +16,7 @@ from suite.common.console import Console
 from suite.common.provenance import machine, package_versions
 from suite.common.report import Picture
 from suite.experiments import EXPERIMENTS
-from suite.experiments.study.cache import FLIES, Workspace, code_digest
+from suite.experiments.study.cache import Workspace, page_code
 from tracks.common.files import plain, replacing_file, write_json, write_text
 from tracks.common.grid import Grid, markdown
 from tracks.common.provenance import stamp
@@ -74,7 +74,7 @@ def write_document(
     facts = {**contents.facts, **_provenance(header)}
     old_page = page.read_text(encoding="utf-8") if page.is_file() else _new_page(name)
     before, after = _split_page(old_page, page)
-    header["code_sha256"] = code_digest(*FLIES)
+    header["code_sha256"] = page_code(name)
     answer = {**header, "made_by": facts, "config": config, **contents.numbers}
     # Text of the page, and the charts as files; the first chart has no number in its name.
     figures: list[str] = []

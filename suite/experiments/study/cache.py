@@ -21,6 +21,12 @@ NO_RESULT = ("view", "importers", "faults", "envs")
 """Names of the folders within packages whose code cannot change a flight."""
 FLIES = ("tracks", "policies", "eval")
 """Packages whose code can change a flight."""
+MEASURED = {
+    "ablation": ("suite/train",),
+    "schemes": ("suite/train",),
+    "faults": ("suite/experiments/injected", "eval/importers", "eval/logs/faults"),
+}
+"""Page -> folders with the code that it measures, besides `FLIES`."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +69,11 @@ def code_digest(*folders: str) -> str:
                 tree = _tree_text(ast.parse(path.read_bytes()))
                 sha256.update(f"{name.as_posix()}\0{tree}\0".encode())
     return sha256.hexdigest()[:16]
+
+
+def page_code(page: str) -> str:
+    """Return the digest of the code that can change the results of a page."""
+    return code_digest(*FLIES, *MEASURED.get(page, ()))
 
 
 def _tree_text(node: Any) -> str:

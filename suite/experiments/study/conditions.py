@@ -34,7 +34,7 @@ class Condition:
     name: str
     """Name of the effect or the sweep."""
     size: float
-    """Size of the disturbance, in the unit of the sweep or the effect."""
+    """Size of the disturbance, in the unit of the sweep or, in its usual direction, the effect."""
     size_text: str
     """Size of the disturbance as text, with its unit."""
     vehicle: Vehicle
@@ -89,12 +89,13 @@ def _effect_condition(vehicle: Vehicle, effect: Effect, sign: int) -> Condition:
     new = np.clip(new, bound_value(parameter.low, vehicle), bound_value(parameter.high, vehicle))
     given = np.asarray(getattr(values, parameter.name), float)
     new = np.where(np.abs(given - zero) > np.abs(new - zero), given, new)
+    flown = np.vdot(new - zero, direction) / np.vdot(direction, direction)
     value = _plain(new)
     number = "(" + ", ".join(f"{v:.3g}" for v in new) + ")" if new.ndim else f"{value:.3g}"
     unit = "" if parameter.unit == "1" else parameter.unit
     size_text = f"{parameter.name} {number} {unit}".strip()
     changed = with_effects(vehicle, {effect.name: values._replace(**{parameter.name: value})})
-    return Condition(effect.name, sign * size, size_text, changed)
+    return Condition(effect.name, float(f"{flown:.6g}"), size_text, changed)
 
 
 def _plain(value: np.ndarray | np.floating) -> float | tuple[float, ...]:

@@ -6,7 +6,7 @@ which one disturbance grows. A single condition ("single") belongs to no sweep.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,24 +67,21 @@ def select_conditions(
 
 
 def fly_conditions(
-    singles: Sequence[Condition],
-    by_sweep: Mapping[Sweep, Sequence[Condition]],
+    conditions: Sequence[Condition],
     policies: Mapping[str, str],
     trials: Sequence[TrialSpec],
     workspace: Workspace,
     console: Console,
-) -> tuple[list[ConditionResult], SweepResults]:
-    """Return the results of every policy under the single conditions, and those under the sweeps.
+) -> list[ConditionResult]:
+    """Return the results of every policy under every condition.
 
     Args:
-        singles: conditions that belong to no sweep.
-        by_sweep: conditions of each sweep.
+        conditions: vehicles, sensors and simulators.
         policies: label -> name or path of a policy.
         trials: trials; each policy flies all of them under every condition.
         workspace: cache of flights, and workers.
         console: shows progress.
     """
-    conditions = [*singles, *(point for points in by_sweep.values() for point in points)]
     requests = {
         (number, name): TrialRequest(
             policy, condition.vehicle, trials, condition.sensors, condition.simulator
@@ -93,14 +90,18 @@ def fly_conditions(
         for number, condition in enumerate(conditions)
     }
     rows = fly_trials(requests, workspace, console, "flying under every condition")
-    results = [
+    return [
         ConditionResult(condition, {name: rows[number, name] for name in policies})
         for number, condition in enumerate(conditions)
     ]
-    sweep_results = iter(results[len(singles) :])
-    return results[: len(singles)], {
-        sweep: [next(sweep_results) for _ in points] for sweep, points in by_sweep.items()
-    }
+
+
+def by_sweep(
+    results: Iterable[ConditionResult], sweeps: Mapping[Sweep, Sequence[Condition]]
+) -> SweepResults:
+    """Return the results under the conditions of `sweeps`, which are in this order, by sweep."""
+    remaining = iter(results)
+    return {sweep: [next(remaining) for _ in points] for sweep, points in sweeps.items()}
 
 
 def tested_numbers(entry: ConditionResult, base: ConditionResult) -> dict[str, Any]:

@@ -307,6 +307,15 @@ def test_an_odometrys_twist_in_world_axes_is_found(tmp_path):
     near(log.vel_w, known_flight.fly(log.time_s).vel, 0.02)
 
 
+def test_a_velocity_in_the_body_without_an_attitude_is_left_out(tmp_path, monkeypatch):
+    none = property(lambda truth: np.zeros((len(truth.time), 4)))
+    monkeypatch.setattr(known_flight.Truth, "quat", none)
+    path = made.write_mcap(tmp_path / "log.mcap", span=(0, 4))
+    log, _ = import_log(path, None, ImportOptions(partial=True))
+    near(log.vel_w, known_flight.fly(log.time_s).vel, 0.1)
+    assert log.velocity_derived
+
+
 def test_a_height_alone_says_why_there_is_no_position(px4_log):
     with pytest.raises(FlightLogError, match="no position .xy_valid of vehicle_local_position"):
         px4_log(lambda topics, _: topics["vehicle_local_position"].data["xy_valid"].fill(0))

@@ -1,6 +1,7 @@
 """Logs of PX4, Betaflight, ArduPilot, Crazyflie and ROS 2, made from a flight that is known."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -208,6 +209,10 @@ def test_mcap_topics_are_chosen_by_a_map(tmp_path):
     # Rows at twice the rate of the slow poses: every other one has a pose, and that is exact.
     assert np.isnan(log.pos_w[1::2]).all() and np.isfinite(log.rate_b).all()
     near(log.pos_w[::2], known_flight.fly(log.time_s[::2]).pos, 1e-6)
+    path = made.write_mcap(tmp_path / "both.mcap", span=(0, 4), pose=120.0)
+    chosen.write_text('[topics]\npose = "/pose"\n')
+    log, findings = import_log(path, None, ImportOptions(map=chosen, full_thrust=30.0))
+    assert "120 Hz" in text(findings, "rows") and log.velocity_derived
     chosen.write_text('[topics]\nodometry = "/imu"\n')
     with pytest.raises(FlightLogError, match="'/imu' has no nav_msgs/Odometry"):
         import_log(path, None, ImportOptions(map=chosen))
@@ -238,6 +243,9 @@ PARTIAL = ImportOptions(partial=True, full_thrust=30.0)
 
 def test_a_raw_blackbox_log_equals_the_flight(tmp_path):
     path = write_raw(tmp_path / "LOG00001.BFL", known_flight.fly(np.arange(0.0, 6.0, 0.002)))
+    log, findings = import_log(path, None, replace(PARTIAL, motor_poles=14))
+    motor = known_flight.fly(log.time_s).motor
+    np.testing.assert_allclose(log.rotor_speed * 14 / 12, motor, atol=5.0)
     log, findings = import_log(path, None, PARTIAL)
     truth = known_flight.fly(log.time_s)
     assert log.partial == ("pos", "quat")
@@ -275,7 +283,8 @@ def test_the_longest_log_of_a_raw_file_is_read(tmp_path, monkeypatch):
 @pytest.mark.parametrize("pose", [False, True])
 def test_an_ardupilot_log_equals_the_flight(tmp_path, pose):
     truth = known_flight.fly(np.arange(0.0, 8.0, 0.01))
-    log, _ = import_log(write_bin(tmp_path / "00000001.BIN", truth, pose), None, PARTIAL)
+    path = write_bin(tmp_path / "00000001.BIN", truth, pose, lowest=int(pose))
+    log, _ = import_log(path, None, PARTIAL)
     assert log.partial == (() if pose else ("pos", "quat"))
     truth = known_flight.fly(log.time_s)
     np.testing.assert_allclose(log.rate_b, truth.rate, atol=0.01)

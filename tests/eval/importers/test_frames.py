@@ -19,6 +19,8 @@ from eval.importers.frames import (
 )
 from eval.importers.mapping_file import UNITS
 from eval.importers.options import ImportOptions
+from eval.importers.rows import rows_at
+from eval.importers.signals import Recording, Signal
 from eval.logs.faults.reading import TIMES
 from eval.vehicles.vehicle import MotorMap
 from tests.support.vehicles import PLAIN
@@ -180,3 +182,12 @@ def test_set_points_are_the_error_times_the_gain_within_the_limit_where_a_vehicl
     given = set_points(0.1)
     assert rates_wanted(given, None)[0].status == "doubt"
     assert set(given) == {"quat"}
+
+
+def test_set_points_whose_sign_flips_are_one_attitude():
+    times = np.arange(0.0, 1.0, 0.004)
+    quat = np.tile([0.8, 0.6, 0.0, 0.0], (len(times), 1))
+    turning = quat * np.where(np.arange(len(times)) % 3 == 0, -1.0, 1.0)[:, None]
+    signals = {"quat": Signal(times, quat), "cmd_quat": Signal(times, turning)}
+    rows = rows_at(Recording("log", signals), times[::2])
+    np.testing.assert_allclose(np.abs(rows["cmd_quat"]), quat[::2], atol=1e-12)

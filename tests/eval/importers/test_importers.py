@@ -27,10 +27,14 @@ def test_an_import_is_written_read_back_and_keeps_what_it_says_of_itself(tmp_pat
     again = read_flight(write_flight(tmp_path / "flight.parquet", log))
     np.testing.assert_array_equal(again.pos_w, log.pos_w)
     assert again.about["imported_from"] == "log00" and again.about["findings"]
+    others = {"baro": np.linspace(0.0, 1.0, len(log.time_s)), "gate": np.arange(len(log.time_s))}
+    log = replace(log, extra={**log.extra, **others, "note": np.full(len(log.time_s), "a")})
     told = {"integrator": "euler", "step_s": 0.002, "seed": 7, "partial": ["motor"]}
     path = write_flight(tmp_path / "ours.parquet", replace(log, about={**log.about, **told}))
     again, _ = import_log(path)
     assert (again.integrator, again.step_s, again.about["seed"]) == ("euler", 0.002, 7)
+    for column, values in others.items():
+        np.testing.assert_array_equal(again.extra[column], values[-len(again.time_s) :])
     assert again.partial == () and again.about["source"] == log.about["source"]
 
 

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from eval.importers import import_log, mapping
 from eval.importers.formats import table
-from eval.importers.mapping_file import MIXERS, Column, map_file, read_map, shipped_maps
+from eval.importers.mapping_file import MIXERS, Column, LogMap, map_file, read_map, shipped_maps
 from eval.importers.options import ImportOptions
 from eval.logs.columns import FlightLogError
 from tests.support import known_flight
-from tests.support.imported import TRUE, near, same_flight
+from tests.support.imported import TRUE, near, same_flight, text
 from tests.support.vehicles import PLAIN
 
 POSE = 'pos = {column = "p"}\nquat = {column = "q", order = "xyzw"}\n'
@@ -113,6 +113,9 @@ rate = {column = "w"}
     how = {"partial": True, "trim": False, "fix": False}
     log, _ = imported(tmp_path, mapping, columns, source="estimate", **how)
     near(log.pos_w, truth.pos + off, 1e-6)
+    one = mapping.replace(', source = "estimate"}]\nrate', "}]\nrate")
+    _, findings = imported(tmp_path, one, columns, source="estimate", **how)
+    assert "quat is of the mocap; there is none of the estimate" in text(findings, "file")
     assert not [name for name in log.extra if name.startswith("est_")]
     log, _ = imported(tmp_path, mapping, columns, **how)
     near(log.pos_w, truth.pos, 1e-9)
@@ -158,15 +161,23 @@ def test_a_velocity_without_an_attitude_is_left_out_and_a_mode_has_no_mean(tmp_p
     columns["q"][half:] = [""] * half
     columns["v"] = [""] * (half + 20) + cells(truth.vel[half + 20 :])
     columns["mode"] = [str(2 + (k > 151)) for k in range(2 * half)]
-    mapping = f'keep = ["mode"]\n{POSE}vel = {{column = "v", axes = "body"}}\n'
+    columns["list"] = cells(truth.pos)
+    mapping = f'keep = ["mode", "list"]\n{POSE}vel = {{column = "v", axes = "body"}}\n'
     log, _ = imported(tmp_path, mapping, columns, partial=True, rate_hz=20.0)
     assert log.velocity_derived and set(log.extra["mode"]) == {2.0, 3.0}
+    near(np.stack([log.extra[f"list[{k}]"] for k in range(3)], axis=1)[0], log.pos_w[0], 1e-9)
 
 
 def test_the_first_time_that_is_there_counts(tmp_path, truth):
     times = 'time = [{column = "stamp"}, {column = "t"}]\n'
     log, _ = imported(tmp_path, times + POSE, parts(truth), partial=True)
     assert log.duration_s == pytest.approx(truth.time[-1] - truth.time[0], abs=0.02)
+
+
+def test_unsigned_times_may_go_back_before_the_first_one():
+    stamps = np.array([2, 1, 3], dtype=np.uint64) * np.uint64(10**9) + np.uint64(17 * 10**17)
+    own = LogMap({"time": (Column(("time",), (1e-9,)),)})
+    np.testing.assert_array_equal(table._time({"time": stamps}, own, "log", True), [0.0, -1.0, 1.0])
 
 
 def test_every_shipped_mapping_is_read_by_its_name():

@@ -325,6 +325,7 @@ def test_attitudes_of_zeros_are_dropouts_and_a_velocity_in_the_logs_world_is_dro
     path.write_text("\n".join(lines))
     usd = made.write_usd(tmp_path / "log00")
     log, findings = import_log(usd, None, ImportOptions(pose=path, full_thrust=30.0))
+    assert "ppm off; rates correlate by" in text(findings, "pose clock")
     found = text(findings, "attitude") + text(findings, "pose")
     assert "10 samples of 'quat' are zeros" in found and "vel of the log are in another" in found
     truth = known_flight.fly(log.time_s + 1.0)

@@ -8,8 +8,9 @@ from eval.flights.follow import FlightFailed
 from eval.flights.simulate import SENSORS
 from eval.flights.trajectory import Trajectory
 from suite.blind.continuous.body import POS, QUAT
+from suite.blind.continuous.engine import Rows
 from suite.blind.continuous.timing import Conditions
-from suite.blind.continuous_flight import fly_continuous, logs_of, with_loop_frequency
+from suite.blind.continuous_flight import _Pilot, fly_continuous, logs_of, with_loop_frequency
 from suite.blind.outside import KINDS
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -78,3 +79,16 @@ def test_the_loop_of_the_conditions_is_the_one_that_flies():
     ticks = flown.schedule.start_s[flown.schedule.is_tick[:, 0], 0]
     np.testing.assert_allclose(np.diff(ticks), 0.005, atol=1e-9)
     assert with_loop_frequency(LAGGED, 321.0).controller.frequency == 321.0
+
+
+def test_a_flight_is_not_checked_after_its_end():
+    stamp_s = np.array([[0.7, 0.7], [0.8, 0.8]])  # the log of the second one needs 0.75 s
+    pilot = _Pilot(LAGGED, WAYS, stamp_s, None)
+    level, still, off_m = np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), np.array([[0.0], [99.0]])
+    before, after = (
+        Rows(row, stamp_s[row], pilot.reference(row).pos_w + off_m, level, still, still)
+        for row in range(2)
+    )
+    assert np.isfinite(pilot(after)[0]).all()
+    with pytest.raises(FlightFailed, match="flight 2"):
+        pilot(before)

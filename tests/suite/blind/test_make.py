@@ -51,6 +51,9 @@ def test_a_set_goes_on_where_it_stopped(small_set, monkeypatch):
     assert again["answers"] == manifest["answers"]
     with pytest.raises(ValueError, match="another --out"):
         make_set(small_set, 6, None, Console())
+    (small_set / "cases" / "case_001" / "vehicle.toml").write_text("")
+    with pytest.raises(ValueError, match=r"vehicle\.toml: not the file that the manifest"):
+        make_set(small_set, 5, None, Console())
 
 
 def test_without_its_simulator_nothing_is_begun(tmp_path, monkeypatch, capsys):
@@ -73,7 +76,7 @@ def test_a_diagnosis_runs_over_a_set_and_is_scored(small_set):
         if out.name == "case_002" and seen.count("case_002") == 1:
             raise RuntimeError("lost its way")
         named = {"name": "linear_drag", "alternatives": [], "parameters": {}}
-        found = {"verdict": "no_gap", "effects": [], "gap": {}}
+        found = {"verdict": "no_gap", "effects": [], "gap": {}, "git_commit": f"c{len(seen)}"}
         if out.name == "case_001":
             found |= {"verdict": "named", "effects": [named]}
         write_json(out / "diagnosis.json", found)
@@ -87,7 +90,11 @@ def test_a_diagnosis_runs_over_a_set_and_is_scored(small_set):
     assert seen == ["case_001", "case_002", "case_002"], "what was done is not done again"
     verdicts = score_set(small_set)
     assert [v.verdict for v in verdicts] == ["named", "no_gap"]
-    assert "nulls: something named" in report(small_set, verdicts)
+    text = report(small_set, verdicts)
+    assert "nulls: something named" in text
+    assert "Diagnosed by 2 versions of the code: c1, c3." in text
+    table = json.loads((small_set / "table.json").read_text())
+    assert table["diagnosed_by"] == ["c1", "c3"]
 
 
 def test_a_case_that_was_not_run_has_not_failed(small_set, capsys):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from suite.blind.score import report, score_case, shares
+from suite.blind.score import _gap_ratios, report, score_case, shares
 from tracks.common.files import write_json
 
 TRUTH = {
@@ -98,6 +98,8 @@ def test_the_table_counts_what_is_named_and_a_diagnosis_that_failed_as_no_null(t
     assert lines["outside the catalogue: `unknown` or `partly`"] == (1, 2)
     assert lines["95 % intervals that contain the true value"] == (1, 1)
     assert lines["gap after within 1.1 of the noise floor, where named"] == (0, 1)
+    gusts = score_case("f", hidden("gusts"), said(effect("gusts"), after=5.0), 2.0)
+    assert gusts.found and _gap_ratios([*verdicts, gusts]) == [1.12]
     assert lines["diagnosis failed"] == (1, 5)
     page = Path("docs/results/blind.md").read_text(encoding="utf-8").splitlines()
     goals = {

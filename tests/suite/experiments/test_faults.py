@@ -65,6 +65,7 @@ def test_answers_are_kept_for_each_case_and_an_incomplete_last_line_is_dropped(
     made = []
     monkeypatch.setattr(faults, "_check", lambda case, **_: [made.append(case) or "refused"])
     cases = [faults.Case("", "real", tmp_path / "log", number) for number in range(3)]
+    (tmp_path / "log").write_text("a log")
     place = (faults.Config(), tmp_path, Console(), Workspace(tmp_path, tmp_path))
     assert faults._check_cases(cases, *place) == dict.fromkeys(cases, "refused")
     (path,) = tmp_path.glob("checked-*.jsonl")
@@ -72,6 +73,9 @@ def test_answers_are_kept_for_each_case_and_an_incomplete_last_line_is_dropped(
     for _ in range(2):
         assert faults._check_cases(cases, *place) == dict.fromkeys(cases, "refused")
     assert made == [*cases, cases[-1]]
+    (tmp_path / "log").write_text("another log of this name")
+    faults._check_cases(cases, *place)
+    assert made == [*cases, cases[-1], *cases]
 
 
 def test_without_a_long_flight_the_page_is_refused_and_a_changed_vehicle_file_flies_again(
@@ -83,7 +87,9 @@ def test_without_a_long_flight_the_page_is_refused_and_a_changed_vehicle_file_fl
         save_vehicle(replace(PLAIN, mass=mass), config.vehicle, "")
         with pytest.raises(ValueError, match="mine.toml: no flight .*4 s"):
             faults.document(config, Workspace(tmp_path, tmp_path), Console())
-    assert len(list(tmp_path.glob("faults-*"))) == 2
+    with pytest.raises(ValueError, match="mine.toml"):
+        faults.document(replace(config, clean=300), Workspace(tmp_path, tmp_path), Console())
+    assert len(list(tmp_path.glob("faults-*"))) == 3
 
 
 def test_outcomes_are_counted_by_name(judged):

@@ -10,7 +10,7 @@ from suite.cli import parse
 from suite.commands import reproduce as command
 from suite.common.console import Console
 from suite.experiments import EXPERIMENTS, published
-from suite.experiments.study.cache import FLIES, code_digest
+from suite.experiments.study.cache import FLIES, code_digest, page_code
 from suite.judging.content import policy_digest
 
 
@@ -25,11 +25,14 @@ def test_a_page_is_older_than_another_policy_or_other_code(tmp_path, capsys):
     write_page(tmp_path, "table2", (shipped.DEFAULT, current), code)
     write_page(tmp_path, "simulators", (shipped.DEFAULT, "0" * 16), code)
     write_page(tmp_path, "robustness", ("runs/mine", current), "another")
+    write_page(tmp_path, "faults", (shipped.DEFAULT, current), code)
+    write_page(tmp_path, "schemes", (shipped.DEFAULT, current), page_code("schemes"))
     _, config = parse("reproduce", ["status", "--out", str(tmp_path)])
     pages = command.run(config, Console())["pages"]
     assert pages["table2"] == {"commit": "f8502435b6b42b44", "newer": []}
     assert pages["simulators"]["newer"] == ["policy"]
-    assert pages["robustness"]["newer"] == ["code"]
+    assert pages["robustness"]["newer"] == pages["faults"]["newer"] == ["code"]
+    assert pages["schemes"]["newer"] == []
     assert pages["ablation"]["newer"] is None
     assert "not made" in capsys.readouterr().out
 

@@ -114,6 +114,7 @@ def test_every_effect_that_touches_a_flight_is_flown_at_its_usual_size():
     flown = effect_conditions(with_effects(VEHICLE, **given))
     values = {condition.name: condition.vehicle.effects[condition.name] for condition in flown}
     assert values["gusts"] == (3.0, 9.0)
+    assert {c.name: c.size for c in flown}["gusts"] == 3.0
     assert values["slung_load"] == (0.1, 2.0) and values["ground_effect"] == (8.0, 0.09)
 
 
