@@ -61,7 +61,8 @@ def examine(
     if not found.named and source.fallback:
         by_fallback = source.fallback.search(say, seed)
         source, found = (source.fallback, by_fallback) if by_fallback.named else (source, found)
-    # Test on held-out flights: first all named effects together, then each one alone.
+    # Test on held-out flights: first all named effects together, then (in rollouts) each
+    # one alone.
     before = after = source.gap(found, found.start.theta)
     if found.named:
         after = source.gap(found, found.estimate.theta)
