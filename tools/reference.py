@@ -176,6 +176,8 @@ def catalogue(page: str, entries: Iterable[Any]) -> str:
             # The nine axes of `measured_state` differ in their names only.
             name = re.sub(r"_[xyz](?=_|$)", "_AXIS", parameter.name)
             shown = f"`{name}` [{parameter.unit}]"
+            shown += f", list of {parameter.size}" if parameter.size else ""
+            shown += "" if parameter.required else ", may be left out"
             rows[name] = f"| {shown} | {about} | {usual} | {low:g} to {high:g} |"
         parts.append("| parameter | meaning | usual size | allowed |\n|---|---|---|---|")
         parts.append("\n".join(rows.values()) + f"\n\nSource: {entry.source}.\n")

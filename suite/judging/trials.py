@@ -137,7 +137,7 @@ def read_trial_set(options: Evaluation | Collection, real_time: bool = False) ->
     Raises:
         ValueError: for an unknown simulator or track, too few trials, or an invalid file.
     """
-    from eval.effects import EFFECTS
+    from eval.effects import EFFECTS, without_signal
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.sensors.sensors_file import load_sensors
     from eval.worlds import differences, world_class
@@ -148,12 +148,13 @@ def read_trial_set(options: Evaluation | Collection, real_time: bool = False) ->
     names = parse_tracks(options.track)
     vehicle = load_vehicle(options.vehicle)
     sensors = load_sensors(options.sensors)
-    levels, tracks, notes = parse_levels(options.difficulty), custom_tracks(names), list[str]()
+    levels, tracks = parse_levels(options.difficulty), custom_tracks(names)
+    notes = without_signal(vehicle)
     # Without random effects every seed would give the same flight on a track from a file.
     is_random = sensors.models or any(EFFECTS[name].random for name in vehicle.effects)
     once = not (real_time or is_random)
     if once and options.trials > 1:
-        notes = [
+        notes += [
             f"{name}: flown once, not {options.trials} times: without random effects (gusts, "
             "noise) all flights on a track from a file are equal"
             for name in tracks
