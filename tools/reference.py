@@ -18,7 +18,7 @@ from typing import Any
 
 import suite
 from eval.effects import EFFECTS
-from eval.effects.interface import bound_value
+from eval.effects.interface import Effect, bound_value
 from eval.logs.faults.catalogue import FAULTS
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors import SENSORS
@@ -176,8 +176,9 @@ def catalogue(page: str, entries: Iterable[Any]) -> str:
             # The nine axes of `measured_state` differ in their names only.
             name = re.sub(r"_[xyz](?=_|$)", "_AXIS", parameter.name)
             shown = f"`{name}` [{parameter.unit}]"
-            shown += f", list of {parameter.size}" if parameter.size else ""
-            shown += "" if parameter.required else ", may be left out"
+            if isinstance(entry, Effect):
+                shown += f", list of {parameter.size}" if parameter.size else ""
+                shown += "" if parameter.required else ", may be left out"
             rows[name] = f"| {shown} | {about} | {usual} | {low:g} to {high:g} |"
         parts.append("| parameter | meaning | usual size | allowed |\n|---|---|---|---|")
         parts.append("\n".join(rows.values()) + f"\n\nSource: {entry.source}.\n")

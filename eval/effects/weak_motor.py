@@ -10,11 +10,11 @@ from tracks.input.ranges import is_number, shown
 
 
 class WeakMotor(NamedTuple):
-    """Values of `weak_motor`; a vehicle file may give `index` (from 1) and their `scale` instead."""
+    """Values of `weak_motor`; a vehicle file may give `index` (from 1) and `scale` of one rotor."""
 
     scale: Array
-    """(..., 4) thrust and torque of each rotor, relative to nominal. For one weak rotor,
-    `index = 2` and `scale = 0.9` do as well."""
+    """(..., 4) thrust and torque of each rotor, relative to nominal; with `index = 2`, a number for
+    this rotor alone."""
 
 
 def constants_of(values: WeakMotor, constants: Constants) -> Constants:
@@ -34,8 +34,8 @@ def read(table: Mapping[str, Any]) -> WeakMotor:
     for key in table:
         if key not in ("index", "scale"):
             raise ValueError(f"{key}: unknown key; allowed: index, scale")
-    scale = table.get("scale")
-    index = table.get("index", [1, 2, 3, 4] if isinstance(scale, list) else None)
+    scale: Any = table.get("scale")
+    index: Any = table.get("index", [1, 2, 3, 4] if isinstance(scale, list) else None)
     for key, value in (("index", index), ("scale", scale)):
         if value is None:
             raise ValueError(

@@ -64,7 +64,9 @@ def test_no_window_lies_over_a_hole_and_a_log_of_holes_is_named(log):
     windows, _ = cut([holed], PLAIN, False)
     assert windows.start_s.min() > 1.15 + BURN_IN_S, "the rotors follow commands before it"
     none, warnings = cut([holed], PLAIN, False, limits=Thresholds(longest_hole_s=1e-3))
-    assert none is None and warnings == [f"{log.name}: no stretch of 1.3 s in flight without a hole"]
+    assert none is None and warnings == [
+        f"{log.name}: no stretch of 1.3 s in flight without a hole"
+    ]
 
 
 @pytest.mark.parametrize("rotor_input", [False, True])
