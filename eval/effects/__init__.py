@@ -134,5 +134,5 @@ def without_signal(vehicle: Vehicle) -> list[str]:
             instead = " or ".join(p.name for p in effect.parameters if p.voltage is False)
             notes.append(f"{name}: acts only on logs with a voltage; for flights give {instead}")
         elif changed and not effect.in_flight and "acc_b" in effect.needs:
-            notes.append(f"{name}: acts only on logs with an accelerometer; these flights lack it")
+            notes.append(f"{name}: acts only on logs with an accelerometer; flights here have none")
     return notes
