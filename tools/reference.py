@@ -175,9 +175,11 @@ def catalogue(page: str, entries: Iterable[Any]) -> str:
             about = cell(_meaning(entry, parameter.name))
             # The nine axes of `measured_state` differ in their names only.
             name = re.sub(r"_[xyz](?=_|$)", "_AXIS", parameter.name)
+            shown = f"`{name}` [{parameter.unit}]"
+            shown += f", list of {parameter.size}" if getattr(parameter, "size", 0) else ""
             default = f"{bound_value(parameter.neutral, vehicle):g}"
             default = "required" if getattr(parameter, "required", False) else default
-            cells = (f"`{name}` [{parameter.unit}]", about, usual, f"{low:g} to {high:g}", default)
+            cells = (shown, about, usual, f"{low:g} to {high:g}", default)
             rows[name] = f"| {' | '.join(cells)} |"
         heads = "| parameter | meaning | usual size | allowed | if left out |"
         parts.append(f"{heads}\n|---|---|---|---|---|")

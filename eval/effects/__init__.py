@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from eval.effects import (
     body,
     drag,
@@ -112,3 +114,25 @@ def all_values(vehicle: Vehicle) -> dict[str, Any]:
         name: as_arrays(vehicle.effects.get(name, neutral(effect, vehicle)))
         for name, effect in EFFECTS.items()
     }
+
+
+def without_signal(vehicle: Vehicle) -> list[str]:
+    """Return a sentence for each effect that acts only on a signal that simulated flights lack.
+
+    Simulated flights of policies, and trainings, have neither a battery voltage nor an
+    accelerometer.
+    """
+    notes = []
+    for name, values in vehicle.effects.items():
+        effect, absent = EFFECTS[name], neutral(EFFECTS[name], vehicle)
+        changed = [
+            parameter
+            for parameter, value, other in zip(effect.parameters, values, absent, strict=True)
+            if np.any(np.asarray(value) != np.asarray(other))
+        ]
+        if changed and all(parameter.voltage for parameter in changed):
+            instead = " or ".join(p.name for p in effect.parameters if p.voltage is False)
+            notes.append(f"{name}: acts only on logs with a voltage; for flights give {instead}")
+        elif changed and not effect.in_flight and "acc_b" in effect.needs:
+            notes.append(f"{name}: acts only on logs with an accelerometer; flights here have none")
+    return notes

@@ -10,10 +10,11 @@ from tracks.input.ranges import is_number, shown
 
 
 class WeakMotor(NamedTuple):
-    """Values of `weak_motor`; the vehicle file has keys `index` (from 1) and `scale` instead."""
+    """Values of `weak_motor`; a vehicle file may give `index` (from 1) and `scale` of one rotor."""
 
     scale: Array
-    """(..., 4) thrust and torque of each rotor, relative to nominal."""
+    """(..., 4) thrust and torque of each rotor, relative to nominal; with `index = 2`, a number for
+    this rotor alone."""
 
 
 def constants_of(values: WeakMotor, constants: Constants) -> Constants:
@@ -25,7 +26,7 @@ def constants_of(values: WeakMotor, constants: Constants) -> Constants:
 
 
 def read(table: Mapping[str, Any]) -> WeakMotor:
-    """Read `index` and `scale` from a vehicle file's table.
+    """Read `scale` of all rotors, or `index` and `scale`, from a vehicle file's table.
 
     Raises:
         ValueError: naming the key, its value and what is allowed.
@@ -33,10 +34,14 @@ def read(table: Mapping[str, Any]) -> WeakMotor:
     for key in table:
         if key not in ("index", "scale"):
             raise ValueError(f"{key}: unknown key; allowed: index, scale")
-    for key in ("index", "scale"):
-        if key not in table:
-            raise ValueError(f"{key}: missing; needed: index (1 to 4) and scale, numbers or lists")
-    index, scale = table["index"], table["scale"]
+    scale: Any = table.get("scale")
+    index: Any = table.get("index", [1, 2, 3, 4] if isinstance(scale, list) else None)
+    for key, value in (("index", index), ("scale", scale)):
+        if value is None:
+            raise ValueError(
+                f"{key}: missing; give index = 2 and scale = 0.9, or a scale for each rotor: "
+                "scale = [1.0, 0.9, 1.0, 1.0]"
+            )
     entries = f"index = {shown(index)}, scale = {shown(scale)}"
     if isinstance(index, list) != isinstance(scale, list):
         raise ValueError(f"{entries}: must be both numbers or both lists")
@@ -67,7 +72,7 @@ def write(values: WeakMotor) -> dict[str, Any]:
 WEAK_MOTOR = Effect(
     name="weak_motor",
     summary="One or several rotors give less thrust and torque than nominal",
-    equation="thrust and torque of rotor index = scale x nominal",
+    equation="thrust and torque of rotor i = scale_i x nominal",
     source="loss-of-effectiveness fault model of an actuator",
     values=WeakMotor,
     parameters=(

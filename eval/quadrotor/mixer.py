@@ -12,6 +12,8 @@ from tracks.geometry.scene import Array
 
 NEGLIGIBLE = 1e-9
 """Thrusts below this count as rounding errors [N]."""
+SAME_SHARE = 1e-9
+"""Differences of the rotors' shares of a collective thrust that count as rounding errors."""
 
 
 def largest(values: Array) -> Array:
@@ -55,19 +57,33 @@ def mixer_matrix(position_b: Array, spin: Array, torque_per_thrust: float) -> np
     return np.stack([np.ones(4), y, -x, -np.asarray(spin, dtype=float) * torque_per_thrust])
 
 
-def mix(unmixer: Array, thrust_max: Array, force_z: Array, torque_b: Array) -> Array:
+def unequal_arms(unmixer: np.ndarray) -> np.ndarray | None:
+    """Return the rotors' shares (4,) of a collective thrust; None if they are equal."""
+    share = unmixer[:, 0]
+    return None if np.ptp(share) < SAME_SHARE else share
+
+
+def mix(
+    unmixer: Array,
+    thrust_max: Array,
+    force_z: Array,
+    torque_b: Array,
+    unequal: Array | None = None,
+) -> Array:
     """Return the rotor thrusts (..., 4) [N], each in [0, thrust_max].
 
     If the exact solution is out of range, three steps reduce it. Roll and pitch are scaled down
-    together until their spread fits. The collective thrust is clamped to the feasible range. Yaw is
-    scaled down to the remaining range. So the direction of thrust has priority over its magnitude,
-    and the magnitude over the heading.
+    together until their spread fits, and with unequal arms until a collective thrust is feasible.
+    The collective thrust is clamped to the feasible range. Yaw is scaled down to the remaining
+    range. So the direction of thrust has priority over its magnitude, and the magnitude over the
+    heading.
 
     Args:
         unmixer: (4, 4) inverse of `mixer_matrix`.
         thrust_max: largest thrust of one rotor [N].
         force_z: (...,) wanted collective thrust [N].
         torque_b: (..., 3) wanted torque [N m].
+        unequal: (4,) from `unequal_arms`.
     """
     xp = torque_b.__array_namespace__()
     per_force, per_yaw = unmixer[:, 0], unmixer[:, 3]
@@ -80,7 +96,13 @@ def mix(unmixer: Array, thrust_max: Array, force_z: Array, torque_b: Array) -> A
         return exact
 
     spread = largest(roll_pitch) - least(roll_pitch)
-    roll_pitch = roll_pitch * (thrust_max / xp.maximum(spread, thrust_max))[..., None]
+    scale = thrust_max / xp.maximum(spread, thrust_max)
+    if unequal is not None:
+        # Collective thrust that each rotor needs at least, and from there the range of a rotor.
+        need, room = -roll_pitch / unequal, thrust_max / unequal
+        span = largest(need)[..., None] - need
+        scale = xp.minimum(scale, least(room / xp.maximum(span, room)))
+    roll_pitch = roll_pitch * scale[..., None]
     lowest = largest(-roll_pitch / per_force)
     highest = least((thrust_max - roll_pitch) / per_force)
     force = xp.minimum(xp.maximum(force_z, lowest), highest)

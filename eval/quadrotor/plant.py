@@ -15,7 +15,7 @@ import numpy as np
 from eval.effects import EFFECTS, all_values, find_effect
 from eval.effects.interface import GRAVITY, Array, Constants, as_arrays
 from eval.quadrotor.loops import NOMINAL, Loop, loop_of
-from eval.quadrotor.mixer import mixer_matrix
+from eval.quadrotor.mixer import mixer_matrix, unequal_arms
 from eval.quadrotor.rotors import delay_weight
 from eval.vehicles.vehicle import Vehicle
 from tracks.geometry.rotation import cross, exp_rot, to_world
@@ -81,6 +81,8 @@ class Nominal(NamedTuple):
     """k_T: thrust of a rotor over its squared speed [N/(rad/s)^2]."""
     spin: Array
     """(4,) s_i: +1 for a rotor turning counter-clockwise seen from above, -1 clockwise."""
+    unequal_arms: Array | None = None
+    """(4,) shares of the rotors in a collective thrust; None if they are equal."""
 
 
 class Plant(NamedTuple):
@@ -156,17 +158,19 @@ def nominal_quadrotor(vehicle: Vehicle) -> tuple[Nominal, Constants]:
         else np.ones(3),
         delay=np.asarray(0.0),
     )
+    unmixer = np.linalg.inv(
+        mixer_matrix(
+            rotors.position, rotors.spin, rotors.torque_coefficient / rotors.thrust_coefficient
+        )
+    )
     nominal = Nominal(
         mass=np.asarray(vehicle.mass),
         inertia=np.asarray(vehicle.inertia),
-        unmixer=np.linalg.inv(
-            mixer_matrix(
-                rotors.position, rotors.spin, rotors.torque_coefficient / rotors.thrust_coefficient
-            )
-        ),
+        unmixer=unmixer,
         thrust_max=np.asarray(rotors.thrust_max),
         thrust_coefficient=np.asarray(rotors.thrust_coefficient),
         spin=np.asarray(rotors.spin, dtype=float),
+        unequal_arms=unequal_arms(unmixer),
     )
     return nominal, constants
 

@@ -156,7 +156,8 @@ def loop_update(
         )
         return memory, speed_command(thrust, nominal.thrust_coefficient)
     torque_b = rate_torque(command.rate_b, rate_b, plant.constants.rate_gain, nominal.inertia)
-    thrust = mix(nominal.unmixer, nominal.thrust_max, nominal.mass * command.thrust, torque_b)
+    force_z, unequal = nominal.mass * command.thrust, nominal.unequal_arms
+    thrust = mix(nominal.unmixer, nominal.thrust_max, force_z, torque_b, unequal)
     return memory, speed_command(thrust, nominal.thrust_coefficient)
 
 

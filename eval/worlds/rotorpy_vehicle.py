@@ -105,7 +105,11 @@ def as_flown(vehicle: Vehicle) -> Vehicle:
     if not differences(vehicle):
         return vehicle
     supported = (*ROTORPY_EFFECTS, *OUTSIDE)
-    effects = {name: value for name, value in vehicle.effects.items() if name in supported}
+    effects = {
+        name: value
+        for name, value in vehicle.effects.items()
+        if name in supported or not EFFECTS[name].in_flight
+    }
     parameters = rotorpy_parameters(vehicle)
     if parameters["tau_m"] < shortest_lag_s(vehicle):
         effects["motor_lag"] = EFFECTS["motor_lag"].values(shortest_lag_s(vehicle))

@@ -171,7 +171,7 @@ def _fly_missing(
         def keep(result: TrialResult, flight: Flight | None) -> None:
             name = None
             if flight is not None and result.time_s >= DURATION_MIN:
-                name = _write_log(out, result, flight, console)
+                name = _write_log(out, result, flight, trial_set.vehicle, console)
             rows[result.trial] = {"file": name, **result._asdict()}
             journal.append(result)
             update(len(rows), result.ended_by)
@@ -199,14 +199,21 @@ def _row(out: Path, result: TrialResult) -> Row | None:
     return {"file": name, **result._asdict()}
 
 
-def _write_log(out: Path, result: TrialResult, flight: Flight, console: Console) -> str | None:
-    """Write a log and return its name; None, with a warning, if the log is refused."""
+def _write_log(
+    out: Path, result: TrialResult, flight: Flight, vehicle: Vehicle, console: Console
+) -> str | None:
+    """Write a log, with the log faults of `vehicle`, and return its name.
+
+    It is None, with a warning, if the log is refused.
+    """
+    from eval.effects.log_faults import apply_log_faults
     from eval.logs.columns import FlightLogError
     from eval.logs.flight_log import log_from_flight, write_flight
 
     name = log_name(result.track, result.difficulty, result.seed)
+    logged = flight._replace(**apply_log_faults(vehicle.effects, flight._asdict()))
     try:
-        write_flight(out / name, log_from_flight(flight, name))
+        write_flight(out / name, log_from_flight(logged, name))
     except FlightLogError as error:
         console.note(f"warning: no log of this flight: {error}")
         return None

@@ -148,7 +148,7 @@ def read_trial_set(
     Raises:
         ValueError: for an unknown simulator or track, too few trials, or an invalid file.
     """
-    from eval.effects import EFFECTS
+    from eval.effects import EFFECTS, without_signal
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.sensors import SENSORS
     from eval.sensors.sensors_file import load_sensors
@@ -164,7 +164,7 @@ def read_trial_set(
         tracks = custom_tracks(names)
     else:
         names, levels, tracks = [track.family], [0], {track.family: track}
-    notes = list[str]()
+    notes = without_signal(vehicle)
     # Without random effects every seed would give the same flight on a track from a file.
     is_random = sensors.random or any(EFFECTS[name].random for name in vehicle.effects)
     once = () if real_time or is_random else tracks.keys()

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from eval.effects import without_signal
 from policies.networks import delta_network, network
 from policies.spec import PolicySpec
 from suite.common.console import Console
@@ -122,6 +123,9 @@ def train(
     hosts.check_same({"the configuration": origin["config"], "--init-from": origin["from"],
                  "--delta": origin["delta"], "threads": threads() > 1})  # fmt: skip
     configs, ends = phase_configs(config), phase_ends(config)
+    if configs[0].quadrotor is not None:
+        for note in without_signal(configs[0].quadrotor.vehicle):
+            console.note(note)
     begins = (0, *ends[:-1])
     # The spec before each phase: the rate may change, and the parameters are then converted.
     specs_before = (configs[0].spec, *(phase.spec for phase in configs[:-1]))

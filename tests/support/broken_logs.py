@@ -19,6 +19,17 @@ def changed(log, **functions):
     return replace(log, **{k: functions[k](v) for k, v in have.items() if v is not None})
 
 
+def on_the_ground(log, before_s, after_s):
+    """Return a log with so much time [s] on the ground before and after, rotors at rest."""
+    step = float(np.median(np.diff(log.time_s)))
+    count, ends = len(log.time_s), (round(before_s / step), round(after_s / step))
+    longer = rows(log, np.pad(np.arange(count), ends, mode="edge"))
+    flown = np.pad(np.ones(count), ends)
+    longer = replace(longer, time_s=step * np.arange(len(flown)))
+    names = ("vel_w", "rotor_speed", "thrust_cmd")
+    return changed(longer, **dict.fromkeys(names, lambda values: (values.T * flown).T))
+
+
 def dropped(log, rng):
     """A third of the rows are lost."""
     return rows(log, np.sort(rng.permutation(len(log.time_s))[: 2 * len(log.time_s) // 3]))

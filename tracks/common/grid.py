@@ -97,9 +97,9 @@ def rich_table(grid: Grid) -> Table:
     tones = {"good": "green", "bad": "red", "": ""}
     table = Table(
         *map(literal, grid.headers),
-        title=grid.title and literal(grid.title),
+        title=literal(grid.title),
         title_justify="left",
-        caption=grid.note or None,
+        caption=literal(grid.note) or None,
         caption_justify="left",
     )
     for number, row in enumerate(grid.rows):

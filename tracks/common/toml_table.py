@@ -149,7 +149,7 @@ class Table:
             return Table(self._source, self._at(key), value).read(kind)
         if parts[1:] == (...,):
             if not isinstance(value, list | tuple):
-                raise self.error(key, value, "a list")
+                raise self.error(key, value, _describe(kind))
             return tuple(self._typed(f"{key}[{i}]", v, parts[0]) for i, v in enumerate(value))
         if get_origin(kind) is tuple:
             if not isinstance(value, list | tuple) or len(value) != len(parts):
@@ -294,6 +294,8 @@ def _describe(kind: Any) -> str:
         names = {bool: "true or false", int: "a whole number", float: "a finite number"}
         return names.get(kind, "a text that is not empty" if kind is str else "a table")
     parts, inner = get_args(kind), get_args(get_args(kind)[0])
+    if parts[1:] == (...,):
+        return "a list"
     each = f"lists of {len(inner)} numbers" if inner else "numbers"
     return f"a list of {len(parts)} {each}"
 

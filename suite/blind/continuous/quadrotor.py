@@ -159,8 +159,9 @@ def allocate_thrust(
     """Return the thrust of each rotor (N, 4) [N].
 
     If a rotor would leave the range from 0 to f_max, three steps limit the thrusts. Roll and pitch
-    are scaled by one factor until their spread over the rotors is f_max. The collective thrust is
-    set to the nearest feasible value. Yaw is scaled to the range that remains.
+    are scaled by one factor until their spread over the rotors is f_max, and with unequal arms
+    until a collective thrust is feasible. The collective thrust is set to the nearest feasible
+    value. Yaw is scaled to the range that remains.
 
     Args:
         nominal: constants of the controller.
@@ -175,7 +176,12 @@ def allocate_thrust(
     if not saturated.any():
         return unlimited
     spread = tilt_thrust.max(axis=1) - tilt_thrust.min(axis=1)
-    tilt_thrust = tilt_thrust * np.minimum(1.0, limit / np.maximum(spread, TINY))[:, None]
+    factor = np.minimum(1.0, limit / np.maximum(spread, TINY))
+    if np.ptp(share) > TINY:
+        needed = -tilt_thrust / share
+        span = needed.max(axis=1, keepdims=True) - needed
+        factor = np.minimum(factor, (limit / share / np.maximum(span, TINY)).min(axis=1))
+    tilt_thrust = tilt_thrust * factor[:, None]
     least = (-tilt_thrust / share).max(axis=1)
     most = ((limit - tilt_thrust) / share).min(axis=1)
     without_yaw = np.minimum(np.maximum(collective, least), most)[:, None] * share + tilt_thrust

@@ -300,7 +300,7 @@ def acting_rotors(
     force = vehicle.mass * np.maximum(log.thrust_cmd, 0.0)
     torque_b = np.zeros((len(force), 3)) if log.torque_cmd_b is None else log.torque_cmd_b
     nominal, _ = nominal_quadrotor(vehicle)
-    each = mix(nominal.unmixer, nominal.thrust_max, force, torque_b)
+    each = mix(nominal.unmixer, nominal.thrust_max, force, torque_b, nominal.unequal_arms)
     speed = np.sqrt(np.maximum(each, 0.0) / vehicle.rotors.thrust_coefficient)
     if log.torque_cmd_b is None:
         return ActingRotors(_lagged(log, vehicle, speed), "commanded thrust", False)

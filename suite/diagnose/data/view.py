@@ -64,9 +64,7 @@ def rows_of(
 ) -> FlightRows:
     """Return the rows of `log` with rotor speeds `rotor_speed` (N, 4) [rad/s].
 
-    A row is on the ground if the vehicle is at rest with too little thrust to fly. Such rows, and
-    rows near them in time, are not `good`. Without a position the speed is unknown. Then a vehicle
-    is at rest if it does not turn and has too little thrust for longer than a cut of the throttle.
+    Rows on the ground, and rows near them in time, are not `good`.
     """
     rot_w = log.rot_w
     signals = (log.pos_w, log.vel_w, log.rate_b, rotor_speed)
@@ -77,17 +75,7 @@ def rows_of(
         good &= np.isfinite(imu_acc_w).all(axis=1)
         imu_acc_w = np.nan_to_num(imu_acc_w)
     pose_slope_b = log.pose_slope_b if isinstance(log, InertialLog) else None
-    thrust = vehicle.rotors.thrust_coefficient * (rotor_speed**2).sum(axis=1)
-    speed_known = "pos" not in log.partial or isinstance(log, InertialLog)
-    motion, least = (
-        (log.vel_w, limits.ground_speed) if speed_known else (log.rate_b, limits.ground_rate)
-    )
-    grounded = thrust < limits.ground_thrust * vehicle.mass * GRAVITY
-    grounded &= np.linalg.norm(motion, axis=1) < least
-    if not speed_known:
-        half_s = 0.5 * limits.ground_margin_s
-        grounded = _near(log.time_s, ~_near(log.time_s, ~grounded, half_s), half_s)
-    good &= ~_near(log.time_s, grounded, limits.ground_margin_s)
+    good &= ~near_ground(log, vehicle, rotor_speed, limits)
     pos_w, vel_w, rate_b, speed = (np.nan_to_num(signal) for signal in signals)
     return FlightRows(
         log.time_s - log.time_s[0],
@@ -101,6 +89,43 @@ def rows_of(
         imu_acc_w,
         pose_slope_b,
     )
+
+
+def near_ground(
+    log: FlightLog,
+    vehicle: Vehicle,
+    rotor_speed: np.ndarray | None,
+    limits: Thresholds = THRESHOLDS,
+    lasting: bool = False,
+) -> np.ndarray:
+    """Return (T,) bool, whether a row of `log` is on the ground or near such a row in time.
+
+    A row is on the ground if the vehicle is at rest with too little thrust to fly. Without a
+    position the speed is unknown. Then a vehicle is at rest if it does not turn and has too little
+    thrust for longer than a cut of the throttle.
+
+    Args:
+        log: the flight.
+        vehicle: the vehicle.
+        rotor_speed: (T, 4) rotor speeds [rad/s]; None: the commanded thrust is used.
+        limits: thresholds of thrust, speed and time.
+        lasting: whether only a rest longer than a cut of the throttle counts.
+    """
+    speed_known = "pos" not in log.partial or isinstance(log, InertialLog)
+    motion, least = (
+        (log.vel_w, limits.ground_speed) if speed_known else (log.rate_b, limits.ground_rate)
+    )
+    if rotor_speed is None:
+        assert log.thrust_cmd is not None
+        thrust = vehicle.mass * log.thrust_cmd
+    else:
+        thrust = vehicle.rotors.thrust_coefficient * (rotor_speed**2).sum(axis=1)
+    grounded = thrust < limits.ground_thrust * vehicle.mass * GRAVITY
+    grounded &= np.linalg.norm(motion, axis=1) < least
+    if lasting or not speed_known:
+        half_s = 0.5 * limits.ground_margin_s
+        grounded = _near(log.time_s, ~_near(log.time_s, ~grounded, half_s), half_s)
+    return _near(log.time_s, grounded, limits.ground_margin_s)
 
 
 def _near(time_s: np.ndarray, marked: np.ndarray, margin_s: float) -> np.ndarray:

@@ -35,6 +35,7 @@ from suite.diagnose.data.steps import (
     with_hidden_torque,
     with_lost_rows,
 )
+from suite.diagnose.data.view import near_ground
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.rotation import quat_to_rot
 from tracks.geometry.scene import Array
@@ -171,10 +172,13 @@ def cut(
     for number, (log, state) in enumerate(zip(logs, states, strict=True)):
         if number not in (range(len(logs)) if only is None else only):
             continue
-        rows = _start_rows(log, state.whole, rotor_input, since_s, stride_s, limits.longest_hole_s)
+        rotors = state.rotor_speed if rotor_input else None
+        flown = ~near_ground(state, vehicle, rotors, limits, lasting=True)
+        inputs = [*_input_rows(log, rotor_input), flown]
+        rows = _start_rows(log, state.whole & flown, inputs, since_s, stride_s, limits)
         if not rows:
             shortest_s = LENGTH_S + BURN_IN_S + HISTORY_S
-            warnings.append(f"{log.name}: no stretch of {shortest_s:g} s without a hole")
+            warnings.append(f"{log.name}: no stretch of {shortest_s:g} s in flight without a hole")
         starts += [(number, row) for row in rows]
     if not starts:
         return None, warnings
@@ -207,14 +211,14 @@ def take(data: Any, chosen: Array) -> Any:
 def _start_rows(
     log: FlightLog,
     complete: np.ndarray,
-    rotor_input: bool,
+    inputs: Sequence[np.ndarray],
     since_s: float,
     stride_s: float,
-    hole_s: float,
+    limits: Thresholds,
 ) -> list[int]:
-    """Return the rows at which windows start, among rows with a `complete` state, (T,) bool."""
+    """Return the `complete` rows at which windows without a hole in rows or `inputs` start."""
     time_s = log.time_s
-    inputs_s = [time_s[rows] for rows in _input_rows(log, rotor_input)]
+    inputs_s = [time_s[rows] for rows in inputs]
     next_s, starts = time_s[0] + max(BURN_IN_S + HISTORY_S, since_s), []
     while True:
         candidates = np.flatnonzero((time_s >= next_s - 1e-9) & complete)
@@ -229,7 +233,7 @@ def _start_rows(
             longest_gap_s(inside_s, begin_s, end_s),
             *(longest_gap_s(rows_s, input_begin_s, end_s) for rows_s in inputs_s),
         )
-        if len(inside_s) < LEAST_ROWS or longest_s > hole_s:
+        if len(inside_s) < LEAST_ROWS or longest_s > limits.longest_hole_s:
             next_s = begin_s + RETRY_S
         else:
             starts.append(row)

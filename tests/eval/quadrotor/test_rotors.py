@@ -1,5 +1,7 @@
 """Rotors' lag against an independent integration, late commands, and the mixer by hand."""
 
+from types import SimpleNamespace
+
 import jax
 import numpy as np
 import pytest
@@ -7,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from eval.quadrotor.mixer import mix, mixer_matrix
+from eval.quadrotor.mixer import mix, mixer_matrix, unequal_arms
+from eval.quadrotor.plant import nominal_quadrotor
 from eval.quadrotor.rotors import (
     acceleration,
     delay_weight,
@@ -15,6 +18,8 @@ from eval.quadrotor.rotors import (
     follow,
     whole_steps,
 )
+from eval.quadrotor.vehicle_file import load_vehicle
+from suite.blind.continuous.quadrotor import allocate_thrust
 from tests.support.vehicles import PLAIN
 
 
@@ -136,6 +141,50 @@ def test_mix_stays_in_range_and_keeps_directions(force, torque):
     without = MATRIX @ mixed(force, [*torque[:2], 0.0])
     np.testing.assert_array_less(np.abs(without[1:3]), np.abs(given[1:3]) + 1e-9)
     assert abs(given[0] - force) <= abs(without[0] - force) + 1e-9
+
+
+def mixed_by_spread(unmixer, limit, force, torque):
+    """Mix for equal arms, where a spread that fits has a collective thrust that fits."""
+    per_force, yaw = unmixer[:, 0], torque[:, 2, None] * unmixer[:, 3]
+    tilting = torque[:, 0, None] * unmixer[:, 1] + torque[:, 1, None] * unmixer[:, 2]
+    exact = force[:, None] * per_force + tilting + yaw
+    scaled = tilting * (limit / np.maximum(np.ptp(tilting, axis=1), limit))[:, None]
+    ends = (-scaled / per_force).max(1), ((limit - scaled) / per_force).min(1)
+    least = np.clip(np.clip(force, *ends)[:, None] * per_force + scaled, 0.0, limit)
+    margin, size = np.where(yaw > 0.0, limit - least, least), np.abs(yaw)
+    share = np.where(size > np.maximum(margin, 1e-9), margin / np.maximum(size, 1e-30), 1.0)
+    limited = np.clip(least + share.min(1)[:, None] * yaw, 0.0, limit)
+    return np.where(((exact < 0.0) | (exact > limit)).any(1)[:, None], limited, exact)
+
+
+@pytest.mark.parametrize("name", ["reference", "racer5", "crazyflie21"])
+def test_equal_arms_are_mixed_by_the_spread_to_the_bit(name):
+    nominal, _ = nominal_quadrotor(load_vehicle(name))
+    rng, limit = np.random.default_rng(0), float(nominal.thrust_max)
+    arm_m = np.abs(load_vehicle(name).rotors.position).max()
+    force = rng.uniform(-1.0, 6.0, 4000) * limit
+    torque = rng.normal(0.0, 1.0, (4000, 3)) * limit * arm_m * [2.0, 2.0, 0.3]
+    expected = mixed_by_spread(nominal.unmixer, limit, force, torque)
+    args = nominal.unmixer, limit, force, torque, nominal.unequal_arms
+    np.testing.assert_array_equal(mix(*args), expected)
+
+
+@given(NEWTONS, TORQUES)
+def test_unequal_arms_give_a_torque_in_the_wanted_direction(force, torque):
+    hubs = [[0.06, -0.1, 0.0], [-0.12, -0.1, 0.0], [-0.12, 0.1, 0.0], [0.06, 0.1, 0.0]]
+    matrix = mixer_matrix(hubs, PLAIN.rotors.spin, 2.2e-8 / 1.6e-6)
+    unmixer = np.linalg.inv(matrix)
+    args = unmixer, LIMIT, np.asarray(force), np.asarray(torque), unequal_arms(unmixer)
+    thrust = mix(*args)
+    assert np.all((thrust >= 0.0) & (thrust <= LIMIT))
+    given = matrix @ thrust
+    np.testing.assert_allclose(given[1] * torque[1] - given[2] * torque[0], 0.0, atol=1e-9)
+    assert abs(given[3]) <= abs(torque[2]) + 1e-9
+    traced = jax.jit(mix)(*map(jax.numpy.asarray, args))
+    np.testing.assert_allclose(traced, thrust, atol=1e-4)
+    apart = SimpleNamespace(shares=unmixer, thrust_max=LIMIT)
+    other = allocate_thrust(apart, args[2][None], args[3][None])[0]
+    np.testing.assert_allclose(other, thrust, atol=1e-9)
 
 
 MIX_SLOPE = jax.jit(jax.jacobian(lambda f, t: mix(UNMIXER, LIMIT, f, t), argnums=(0, 1)))

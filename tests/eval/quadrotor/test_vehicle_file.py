@@ -90,6 +90,8 @@ REFUSED = [
     ("effects", {"weak_motor": {"index": 5, "scale": 0.9}}, "weak_motor.*from 1 to 4"),
     ("effects", {"weak_motor": {"index": [1, 1], "scale": [0.9, 0.9]}}, "different"),
     ("effects", {"weak_motor": {"index": [1], "scale": 0.9}}, "both numbers or both lists"),
+    ("effects", {"weak_motor": {"scale": 0.9}}, "index: missing; give index = 2 and scale = 0.9,"),
+    ("effects", {"weak_motor": {"scale": [1.0, 0.9]}}, "one scale for each index"),
     ("effects", {"weak_motor": {"index": 1, "scale": 10**400}}, "scale = 1000.*finite number"),
     ("effects", {"weak_motor": {"index": 1, "scale": -0.5}}, "from 0 to 1.5"),
 ]
@@ -117,6 +119,14 @@ def test_unreadable_files_are_refused(tmp_path):
         vehicle_file.load_vehicle(tmp_path)
     with pytest.raises(ValueError, match="Did you mean 'racer5'"):
         vehicle_file.load_vehicle("racer")
+
+
+def test_a_weak_motor_has_an_index_or_a_scale_for_each_rotor():
+    every, one = (
+        vehicle_file.parse_vehicle({**TABLE, "effects": {"weak_motor": table}})
+        for table in ({"scale": [1.0, 0.9, 1.0, 1.0]}, {"index": 2, "scale": 0.9})
+    )
+    assert every == one and every.effects["weak_motor"].scale == (1.0, 0.9, 1.0, 1.0)
 
 
 def test_a_vehicle_that_flies_passes_and_is_a_key():

@@ -156,7 +156,9 @@ def test_every_difference_is_said_and_nothing_else():
     alike = with_lag(PLAIN, 0.03)
     assert differences(alike) == [] and as_flown(alike) is alike
     assert "flown with 0.002 s" in differences(PLAIN)[0]
+    biased = with_effects(gyro_bias=((0.1, 0.0, 0.0),))
     assert as_flown(PLAIN).effects == {"motor_lag": (0.002,)}
+    assert as_flown(biased).effects == {**biased.effects, "motor_lag": (0.002,)}
     said = " ".join(differences(drawn_effects(np.random.default_rng(0), PLAIN)))
     without = [name for name in EFFECTS if f"{name}: RotorPy does not have it" in said]
     assert set(without) == {

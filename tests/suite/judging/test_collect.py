@@ -4,12 +4,13 @@ import json
 import shutil
 
 import numpy as np
+import pytest
 
 import eval.judging.judge
 import eval.logs.flight_log
 import suite.judging.collect
 from eval.logs.flight_log import read_flight
-from eval.quadrotor.vehicle_file import load_vehicle
+from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.worlds import nearest
 from tests.support.commands import answer, refused, run
 from tests.support.engines import STAND_IN
@@ -105,6 +106,39 @@ def test_a_simulator_that_differs_from_the_vehicle_file_writes_the_file_that_des
     monkeypatch.setattr("eval.worlds.nearest", lambda *_: beyond)
     assert run(*line, "--policy", pilots["diver"], "--out", tmp_path / "beyond") == 0
     assert "no vehicle file describes these flights: effects.rotor_drag" in capfd.readouterr().err
+
+
+def test_a_log_has_the_log_faults_of_the_vehicle_and_what_acts_on_no_flight_is_said(
+    pilots, tmp_path, capfd
+):
+    bias = (0.1, -0.05, 0.08)
+    faults = {"gyro_bias": (bias,), "accelerometer_bias": (bias,), "battery_sag": (0.0, 0.1)}
+    logs = {}
+    for name, effects in (("plain", {}), ("faulty", faults)):
+        vehicle = with_effects(load_vehicle("reference"), **effects)
+        save_vehicle(vehicle, tmp_path / f"{name}.toml")
+        args = ("--vehicle", tmp_path / f"{name}.toml", "--out", tmp_path / name)
+        assert run(TWO, "--policy", pilots["pursuit"], *args) == 0
+        logs[name] = read_flight(tmp_path / name / "zigzag-0-7.parquet")
+        said = capfd.readouterr().err
+        for note in ("battery_sag: acts only on logs with a voltage; for flights give rate",
+                     "accelerometer_bias: acts only on logs with an accelerometer"):  # fmt: skip
+            assert (note in said) == (name == "faulty")
+    error = logs["faulty"].rate_b - logs["plain"].rate_b
+    np.testing.assert_allclose(error, np.tile(bias, (len(error), 1)), atol=1e-12)
+    np.testing.assert_array_equal(logs["faulty"].pos_w, logs["plain"].pos_w)
+
+
+@pytest.mark.slow
+def test_flights_with_a_log_fault_are_no_finding_for_their_own_vehicle_file(tmp_path, capfd):
+    vehicle = with_effects(load_vehicle("reference"), gyro_bias=((0.1, -0.05, 0.08),))
+    save_vehicle(vehicle, tmp_path / "biased.toml")
+    own = ("--vehicle", tmp_path / "biased.toml", "--out")
+    line = "collect --policy race-paper --track zigzag --difficulty 0 --trials 3"
+    assert run(line, *own, tmp_path / "flights") == 0
+    capfd.readouterr()
+    found = answer(capfd, "diagnose", tmp_path / "flights", *own, tmp_path / "diagnosis")
+    assert (found["verdict"], found["effects"]) == ("no_gap", [])
 
 
 def test_a_flight_whose_log_is_refused_does_not_stop_the_others(

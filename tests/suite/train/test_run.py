@@ -17,10 +17,12 @@ from suite.common import curve
 from suite.common.console import Console
 from suite.train import run, shards, training_loop
 from suite.train.config import OptimizerConfig
+from suite.train.recipes import with_quadrotor
 from suite.train.rollout import make_rollout
 from suite.train.update import make_optimizer
 from tests.support.canonical import NOISY, update_of
 from tests.support.training import SPEC, assert_same_run, boxes_worlds, fresh_params, small_config
+from tests.support.vehicles import PLAIN, with_effects
 
 make_update = run.make_update
 
@@ -67,6 +69,15 @@ def test_all_phases_share_an_optimiser_and_a_low_rate_does_not_rise():
         change, states[1] = optimizer.update(params, states[1], params)
         sizes.append(float(jnp.abs(change["w"]).max()))
     assert max(sizes) < 1.02e-6
+
+
+def test_an_effect_that_acts_on_no_rollout_is_said(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(run, "train_in_folder", lambda *_: None)
+    vehicle = with_effects(PLAIN, battery_sag=(0.0, 0.1), gyro_bias=((0.1, 0.0, 0.0),))
+    for rate, said in ((0.0, True), (0.01, False)):
+        sagging = with_effects(vehicle, battery_sag=(rate, 0.1))
+        run.train(with_quadrotor(NOISY, sagging), tmp_path, Console())
+        assert ("battery_sag: acts only on logs with a voltage" in capfd.readouterr().err) == said
 
 
 class Killed(BaseException):

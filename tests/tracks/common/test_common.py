@@ -69,24 +69,26 @@ def test_a_table_names_the_file_and_the_key_that_is_wrong(tmp_path):
         gate.close()
     with pytest.raises(ValueError, match=r"the file has no 'name'; add it \(a text\)"):
         table.text("name")
+    with pytest.raises(ValueError, match=r"has no 'names'; add it \(a list\)"):
+        table.value("names", tuple[str, ...])
 
 
 GRID = table(
-    ["name", "v [m/s]"], [["a|b", Cell("<3>", "bad")], ["all", "5 [4, 6]"]], "Title", "Below."
+    ["name", "v [m/s]"], [["a|b", Cell("<3>", "bad")], ["all", "5 [4, 6]"]], "Title", "Below [1]."
 )
 
 
 def test_a_table_is_written_as_markdown_html_and_on_a_terminal():
     assert markdown(GRID) == (
         "Title\n\n| name | v [m/s] |\n| --- | --- |\n"
-        "| a\\|b | <3> |\n| all | 5 [4, 6] |\n\nBelow.\n"
+        "| a\\|b | <3> |\n| all | 5 [4, 6] |\n\nBelow [1].\n"
     )
     file = io.StringIO()
     Console(width=80, file=file).print(rich_table(GRID))
-    assert all(text in file.getvalue() for text in ("Title", "v [m/s]", "<3>", "5 [4, 6]"))
+    assert all(text in file.getvalue() for text in ("Title", "v [m/s]", "<3>", "5 [4, 6]", "[1]."))
     page = html_table(GRID)
     assert "<caption>Title</caption>" in page and '<td class="bad">&lt;3&gt;</td>' in page
-    assert 'class="sum"' not in page and '<p class="note">Below.</p>' in page
+    assert 'class="sum"' not in page and '<p class="note">Below [1].</p>' in page
     summed = html_table(replace(GRID, strong_last=True))
     assert '<tr class="sum"><td>all</td>' in summed and summed.count("sum") == 1
 

@@ -114,19 +114,23 @@ def run_on_cluster(
         submit_more()
         while submitted:
             futures = _next_ended(ended, client, address)
-            packed_results = client.gather(
-                [f for f in futures if f.status == "finished"], errors="skip"
-            )
-            _refuse_failed(futures, address, submitted)
-            numbers = [submitted.pop(future) for future in futures]
-            del futures  # the cluster keeps a result while a future refers to it
-            submit_more()
+            finished = [future for future in futures if future.status == "finished"]
+            packed_results = client.gather(finished, errors="skip")
+            errors = _errors(futures, address, submitted)
+            numbers = [submitted.pop(future) for future in finished]
+            del futures, finished  # the cluster keeps a result while a future refers to it
+            if not errors:
+                submit_more()
+            # Finished pieces are kept before an error of another piece ends the work.
             for number, packed in zip(numbers, packed_results, strict=True):
                 results = unpack(packed)
                 if isinstance(results, Failure):
-                    raise remote_error(results)
+                    errors.append(remote_error(results))
+                    continue
                 for result in results:
                     keep(number, result)
+            if errors:
+                raise errors[0]
 
 
 class _WorkerCount:
@@ -208,22 +212,27 @@ def _next_ended(ended: SimpleQueue[Any], client: Any, address: str) -> list[Any]
     return futures
 
 
-def _refuse_failed(futures: list[Any], address: str, submitted: dict[Any, int]) -> None:
-    """Raise an error for pieces that the cluster gave up."""
+def _errors(futures: list[Any], address: str, submitted: dict[Any, int]) -> list[Exception]:
+    """Return an error for each piece that the cluster gave up."""
+    errors = list[Exception]()
     for future in futures:
         if future.status == "finished":
             continue
         error = future.exception() if future.status == "error" else None
         if isinstance(error, (ImportError, AttributeError)):
-            raise UnusableCluster(
+            text = (
                 f"--workers {address}: a worker cannot import the work ({error}); install the same "
                 "version of the suite there, and the packages that extend it"
             )
+            errors.append(UnusableCluster(text))
+            continue
         why = f": {error}" if error else ", or its scheduler has ended"
-        raise WorkerDied(
+        text = (
             f"the cluster at {address} gave up piece {submitted[future]}{why}; finished work is "
             "kept, the same command continues"
         )
+        errors.append(WorkerDied(text))
+    return errors
 
 
 def _body(packed: bytes) -> bytes:

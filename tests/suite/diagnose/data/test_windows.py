@@ -9,7 +9,7 @@ from suite.diagnose.data.hold_out import choose_held_out
 from suite.diagnose.data.noise import noise_of, rotor_noise
 from suite.diagnose.data.windows import BURN_IN_S, LENGTH_S, SLICES, STEPS, cut, take
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from tests.support.broken_logs import rows
+from tests.support.broken_logs import on_the_ground, rows
 from tests.support.diagnosis_flights import NOISE
 from tests.support.vehicles import PLAIN
 
@@ -64,7 +64,24 @@ def test_no_window_lies_over_a_hole_and_a_log_of_holes_is_named(log):
     windows, _ = cut([holed], PLAIN, False)
     assert windows.start_s.min() > 1.15 + BURN_IN_S, "the rotors follow commands before it"
     none, warnings = cut([holed], PLAIN, False, limits=Thresholds(longest_hole_s=1e-3))
-    assert none is None and warnings == [f"{log.name}: no stretch of 1.3 s without a hole"]
+    assert none is None and warnings == [
+        f"{log.name}: no stretch of 1.3 s in flight without a hole"
+    ]
+
+
+@pytest.mark.parametrize("rotor_input", [False, True])
+def test_no_window_has_rows_on_the_ground(log, rotor_input):
+    rested = on_the_ground(log, 3.0, 2.5)
+    windows, _ = cut([rested], PLAIN, rotor_input)
+    flown_s = 3.0 + THRESHOLDS.ground_margin_s, 3.0 + log.time_s[-1] - THRESHOLDS.ground_margin_s
+    assert windows is not None and windows.start_s.min() > flown_s[0]
+    assert (windows.start_s + LENGTH_S).max() < flown_s[1] + THRESHOLDS.longest_hole_s
+    # A short cut of the throttle in slow flight is no rest.
+    short = np.where((log.time_s > 1.0) & (log.time_s < 1.4), 0.0, 1.0)[:, None]
+    slow = replace(log, vel_w=short * log.vel_w, rotor_speed=short * log.rotor_speed,
+                   thrust_cmd=short[:, 0] * log.thrust_cmd)  # fmt: skip
+    for one, other in zip(cut([slow], PLAIN, False), cut([log], PLAIN, False), strict=True):
+        assert np.array_equal(getattr(one, "start_s", 0), getattr(other, "start_s", 0))
 
 
 @pytest.mark.parametrize("rotor_input", [False, True])

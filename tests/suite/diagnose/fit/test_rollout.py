@@ -58,7 +58,7 @@ def test_rollouts_begin_at_the_file_and_the_measured_states_of_the_windows(log):
     assert np.array_equal(start.theta, make_space(PLAIN).array("start"))
     assert start.free.shape == (len(windows.flight), STATE + 4 * KNOTS) and not start.free.any()
     assert len(model.starts) == start.free.shape[1]
-    with pytest.raises(ValueError, match=r"no stretch of 1\.\d+ s without a hole"):
+    with pytest.raises(ValueError, match=r"no stretch of 1\.\d+ s in flight without a hole"):
         rollouts_along(
             [fly_finely(PLAIN, 1, 0.5, 100.0, 0.3, 3.0, 0.0, 0.0, DRAG, 1e-3)], PLAIN, False
         )

@@ -8,9 +8,10 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 
 import pytest
 
@@ -180,6 +181,38 @@ def test_a_machine_that_would_come_to_other_numbers_is_refused(two_nodes, monkey
     monkeypatch.setattr("tracks.common.work.cluster.software", lambda: wanted)
     with pytest.raises(UnusableCluster, match=r"mujoco 3\S+ there, 2\.0 here.*same versions"):
         run_pieces(load, ["race"], two_nodes.address, lambda *_: None)
+
+
+class Future:
+    """A piece that has ended: piece 1 was given up, the others have a result."""
+
+    def __init__(self, number, value):
+        self.status, self.value = "error" if number == 1 else "finished", value
+
+    def exception(self):
+        return KeyError("lost")
+
+    def add_done_callback(self, call):
+        call(self)
+
+
+CLIENT = SimpleNamespace(
+    nthreads=lambda: {"node": 1},
+    submit=lambda function, packed, key: packed,
+    replicate=lambda futures: None,
+    map=lambda function, pieces, work, key: [
+        Future(n, function(piece, work)) for n, piece in enumerate(pieces)
+    ],
+    gather=lambda futures, errors: [future.value for future in futures],
+)
+
+
+def test_finished_pieces_are_kept_before_the_error_of_another_one(monkeypatch):
+    monkeypatch.setattr("tracks.common.work.cluster._connected", lambda _: nullcontext(CLIENT))
+    found = []
+    with pytest.raises(WorkerDied, match="gave up piece 1"):
+        run_pieces(partial(tens, {0: 1}), [[5], [6], [7]], "tcp://a:1", lambda *k: found.append(k))
+    assert [(number, item) for number, (item, _, _) in found] == [(0, 5), (2, 7)]
 
 
 NO_SCHEDULER = """

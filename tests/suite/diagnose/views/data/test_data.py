@@ -12,7 +12,7 @@ from suite.diagnose.data.flights import acting_rotors, completed, ready
 from suite.diagnose.data.hold_out import parted
 from suite.diagnose.data.view import FORCE, TORQUE, rows_of, weak_form
 from suite.diagnose.thresholds import THRESHOLDS
-from tests.support.broken_logs import rows
+from tests.support.broken_logs import on_the_ground, rows
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import with_effects
 
@@ -129,18 +129,6 @@ def test_the_noise_of_a_slow_signal_is_that_of_its_own_rows(pair):
 
     # Fewer values of the same noise make a mean acceleration less certain.
     assert 1.0 < floor(3) / floor(1) < 2.5
-
-
-def on_the_ground(log, before_s, after_s):
-    """Return a log with so much time [s] on the ground before and after, rotors at rest."""
-    step = float(np.median(np.diff(log.time_s)))
-    count, ends = len(log.time_s), (round(before_s / step), round(after_s / step))
-    longer = rows(log, np.pad(np.arange(count), ends, mode="edge"))
-    flown = np.pad(np.ones((count, 1)), (ends, (0, 0)))
-    time_s = step * np.arange(len(flown))
-    return replace(
-        longer, time_s=time_s, vel_w=flown * longer.vel_w, rotor_speed=flown * longer.rotor_speed
-    )
 
 
 def test_where_the_speed_is_unknown_a_short_cut_of_the_throttle_is_no_rest_on_the_ground():
