@@ -69,18 +69,6 @@ def test_behind_firmware_rate_loops_little_is_named_where_nothing_is_hidden(kind
         np.testing.assert_allclose(drag, (0.2, 0.2, 0.1), atol=0.03)
 
 
-def test_a_drag_is_named_with_its_value(drag):
-    found = diagnosis_json(drag)
-    assert found["verdict"] == "named" and found["gap"]["after"] < 1.15
-    (effect,) = found["effects"]
-    assert "linear_drag" in (effect["name"], *effect["alternatives"])
-    if effect["name"] == "linear_drag":
-        low, high = np.array(effect["parameters"]["coefficient"]["ci95"], dtype=float).T
-        assert np.all(np.abs([0.15, 0.15, 0.05] - (low + high) / 2) < high - low)
-    if found["control"] is not None:
-        assert found["control"]["after"] > found["gap"]["after"]
-
-
 @pytest.mark.slow
 def test_a_force_outside_the_catalogue_is_not_called_by_a_name_alone():
     def swing(motion, t):

@@ -11,6 +11,7 @@ import pytest
 from eval.logs.flight_log import read_flight, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.cli import main
+from suite.diagnose import run as diagnose_run
 from suite.diagnose.sources.rollouts import can_fly
 from tests.support.diagnosis_flights import fly
 from tests.support.real_flights import VEHICLE, flights
@@ -31,11 +32,24 @@ def test_files_come_out_whole_and_bad_flights_are_named(written):
     found = json.loads((written / "diagnosis.json").read_text(encoding="utf-8"))
     assert json.loads((written.parent / "said.json").read_text(encoding="utf-8")) == found
     assert any("bad.csv" in warning for warning in found["warnings"])
-    names = {effect["name"] for effect in found["effects"]}
-    assert names and set(load_vehicle(written / "vehicle.toml").effects) == names
+    assert set(load_vehicle(written / "vehicle.toml").effects) == {"linear_drag"}
     assert found["seed"] == 3
     assert found["actuators"][0]["followed"] > 0.9
-    assert found["plan"]["flights"] == [] or found["effects"][0]["alternatives"]
+    # One effect without alternatives leaves nothing to separate.
+    assert [(effect["name"], effect["alternatives"]) for effect in found["effects"]] == [
+        ("linear_drag", [])
+    ]
+    assert not found["plan"]["flights"] and "no flight is planned" in found["plan"]["words"][0]
+    assert not (written / "plan").exists()
+
+
+def test_without_a_recording_all_else_is_written(diagnosed, tmp_path, monkeypatch):
+    flights, made = diagnosed[0].parent, diagnosed[1]
+    monkeypatch.setattr(diagnose_run, "diagnose", lambda *_, **options: made)
+    line = [str(flights / "0.parquet"), "--vehicle", str(flights / "v.toml"), "--no-recording"]
+    assert main(["diagnose", *line, "--out", str(tmp_path)]) == 0
+    names = {"diagnosis.json", "report.html", "run.json", "vehicle.toml"}
+    assert {path.name for path in tmp_path.iterdir()} == names
 
 
 def test_every_step_is_in_the_report(written):
@@ -127,7 +141,10 @@ def test_a_change_is_written_as_every_diagnosis_is(tmp_path, capsys):
     names = {name for e in told["effects"] for name in (e["name"], *e["alternatives"])}
     assert "mass_offset" in names and told["views"] and len(told["reference"]) == 2
     assert any("--drive" in line for line in told["warnings"])
-    assert "warning: --drive needs rollouts" in said.err and "flights" in told["plan"]
+    assert "warning: --drive needs rollouts" in said.err
+    planned = {flight["file"] for flight in told["plan"]["flights"]}
+    assert planned and planned <= {path.name for path in (tmp_path / "out/plan").iterdir()}
+    assert any("mass_offset" in words for words in told["plan"]["words"])
     for axis in told["gap"]["channels"]["force"].values():
         assert {"before", "after", "noise_floor", "repeatability"} <= set(axis)
     assert json.loads((tmp_path / "out/diagnosis.json").read_text())["verdict"] == told["verdict"]

@@ -11,6 +11,7 @@ from eval.judging.statistics import over_seeds, paired_success, wilson
 from suite.commands import compare
 from suite.common.console import Quiet
 from suite.judging.comparing import compare_runs, compare_seeds, read_runs
+from tests.support import commands
 from tests.support.judged_cells import result
 
 
@@ -65,7 +66,7 @@ def run_of(folder, successes, **judged):
     return folder
 
 
-def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path):
+def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path, capsys):
     rng = np.random.default_rng(0)
     a = run_of(tmp_path / "a", rng.random(40) < 0.9)
     b = run_of(tmp_path / "b", rng.random(40) < 0.5)
@@ -74,6 +75,11 @@ def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path):
     assert " minus " in found["sentence"] and "McNemar" in found["sentence"]
     answer = compare.run(compare.Config((a, b), seeds=True), Quiet())
     assert "2 training seeds" in answer["comparisons"][0]["sentence"]
+    (there,), (back,) = (
+        commands.answer(capsys, "compare", one, "--against", other)["comparisons"]
+        for one, other in ((a, b), (b, a))
+    )
+    assert there["difference"]["value"] == -back["difference"]["value"] == found["difference"].value
     apart = run_of(tmp_path / "c", rng.random(40) < 0.5, time_limit_s=10.0)
     with pytest.raises(ValueError, match=r"another time_limit_s \(20.0 and 10.0\)"):
         compare_runs(*read_runs(a), *read_runs(apart))
