@@ -128,12 +128,6 @@ def test_state_beyond_any_flight_is_diverged(world, monkeypatch, tmp_path):
     assert all(map(math.isfinite, result[10:16])) and list(tmp_path.iterdir()) == []
 
 
-def test_collision_at_the_start():
-    result = one(Pursuit(), straight(wall_at=0.0), "mujoco")
-    assert (result.ended_by, result.time_s, result.collided_with) == ("collision", 0.0, "the wall")
-    assert result.v_max == 0.0
-
-
 DISTANCES = (1.0, 2.5, 4.5)
 
 
