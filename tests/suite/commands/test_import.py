@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 import suite
-from eval.logs.flight_log import FlightLog, read_flight, write_flight
+from eval.logs.flight_log import read_flight, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.diagnose.example.flights import FOLDER, HIDDEN
 from tests.support import foreign_logs as made
 from tests.support.commands import answer, refused, run
+from tests.support.log_tables import level
 
 FILES = sorted(FOLDER.glob("*.parquet"))
 
@@ -30,11 +31,10 @@ def test_a_log_becomes_a_flight_log_and_json_is_one_object(tmp_path, capsys):
 
 def test_time_on_the_ground_is_cut_or_kept(tmp_path, capsys):
     time_s = np.arange(0.0, 10.0, 0.01)
-    still = np.zeros((len(time_s), 3))
     height = np.interp(time_s, [2.0, 3.0, 7.0, 8.0], [0.0, 1.0, 1.0, 0.0])
-    pos_w, level = still + height[:, None] * [0.0, 0.0, 1.0], np.eye(4)[0] + np.zeros((1000, 4))
+    pos_w = height[:, None] * [0.0, 0.0, 1.0]
     motor = np.where((time_s > 2.0) & (time_s < 8.0), 800.0, 50.0)[:, None] + np.zeros(4)
-    log = FlightLog("it", time_s, pos_w, level, still, still, rotor_speed=motor)
+    log = level(time_s, pos_w=pos_w, rotor_speed=motor)
     path = write_flight(tmp_path / "log.parquet", log)
     line = (path, "--out", tmp_path / "out.parquet")
     assert 550 < answer(capsys, "import --no-fix", *line)["rows"] < 800

@@ -13,6 +13,7 @@ from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.cli import main
 from suite.diagnose import run as diagnose_run
 from suite.diagnose.sources.rollouts import can_fly
+from tests.support.commands import refused
 from tests.support.diagnosis_flights import fly
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.recordings import columns
@@ -89,26 +90,24 @@ def test_the_recording_has_what_was_measured_and_simulated(written):
 def test_a_file_with_a_load_on_a_line_is_refused_before_flights_are_read(command, tmp_path, capsys):
     file, none, out = (str(tmp_path / name) for name in ("loaded.toml", "none.csv", "out.toml"))
     save_vehicle(with_effects(slung_load=(0.05, 0.5)), file)
-    assert main([command, none, "--vehicle", file, "--out", out]) == 2
-    said = capsys.readouterr().err.strip()
-    assert "effects.slung_load" in said and "remove it" in said and "\n" not in said
+    said = refused(capsys, command, none, "--vehicle", file, "--out", out)
+    assert "effects.slung_load" in said and "remove it" in said
 
 
 def test_what_is_read_is_not_written_over_and_flights_too_short_or_missing_are_refused(
     tmp_path, capsys
 ):
     save_vehicle(PLAIN, tmp_path / "vehicle.toml")
-    own, out = str(tmp_path / "vehicle.toml"), ["--out", str(tmp_path)]
-    assert main(["diagnose", str(tmp_path), "--vehicle", own, *out]) == 2
-    assert "vehicle.toml is also an input and would be overwritten" in capsys.readouterr().err
-    assert main(["diagnose", str(tmp_path / "none.csv"), "--vehicle", "reference"]) == 2
+    own, out = tmp_path / "vehicle.toml", ("--out", tmp_path)
+    said = refused(capsys, "diagnose --vehicle", own, tmp_path, *out)
+    assert "vehicle.toml is also an input and would be overwritten" in said
+    assert "none.csv" in refused(capsys, "diagnose --vehicle reference", tmp_path / "none.csv")
     record = {"config_type": "suite.loop.config.LoopConfig", "command": ["suite", "loop"]}
     (tmp_path / "run.json").write_text(json.dumps(record))
-    assert main(["diagnose", str(tmp_path), "--vehicle", "reference", *out]) == 2
-    assert "holds a run of another kind (made by suite loop)" in capsys.readouterr().err
+    said = refused(capsys, "diagnose --vehicle reference", tmp_path, *out)
+    assert "holds a run of another kind (made by suite loop)" in said
     path = write_flight(tmp_path / "short.parquet", fly(PLAIN, 0, duration_s=1.2))
-    assert main(["diagnose", str(path), "--vehicle", "reference"]) == 2
-    assert "1.3 s" in capsys.readouterr().err
+    assert "1.3 s" in refused(capsys, "diagnose --vehicle reference", path)
 
 
 def test_logs_without_what_a_rollout_needs_are_diagnosed_by_views(log):
@@ -162,8 +161,7 @@ def test_a_single_reference_is_refused(tmp_path, capsys):
     save_vehicle(VEHICLE, tmp_path / "v.toml", "for a test")
     for number, log in enumerate(flights(2, duration_s=3.0)):
         write_flight(tmp_path / f"{number}.parquet", log)
-    words = ["diagnose", str(tmp_path / "0.parquet"), "--reference", str(tmp_path / "1.parquet"),
-             "--vehicle", str(tmp_path / "v.toml"), "--out", str(tmp_path / "out")]  # fmt: skip
-    assert main(words) == 2
-    assert "at least 2" in capsys.readouterr().err
+    words = ("--reference", tmp_path / "1.parquet", "--vehicle", tmp_path / "v.toml")
+    said = refused(capsys, "diagnose --out", tmp_path / "out", tmp_path / "0.parquet", *words)
+    assert "at least 2" in said
     assert not (tmp_path / "out" / "diagnosis.json").exists()
