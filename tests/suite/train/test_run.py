@@ -19,6 +19,7 @@ from suite.train import run, shards, training_loop
 from suite.train.config import OptimizerConfig
 from suite.train.rollout import make_rollout
 from tests.support.canonical import NOISY, update_of
+from tests.support.tools import BLOCKER
 from tests.support.training import SPEC, assert_same_run, boxes_worlds, fresh_params, small_config
 
 make_update = run.make_update
@@ -95,13 +96,9 @@ def test_a_run_that_is_stopped_or_killed_while_saving_resumes_exactly(
     assert_same_run(tmp_path, whole)
 
 
-BARE = """
-import os, sys
-class Blocker:
-    def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in ("mujoco", "torch", "dm_control", "gymnasium", "trimesh", "onnx"):
-            raise ImportError("blocked: " + name)
-sys.meta_path.insert(0, Blocker())
+BARE = f"""{BLOCKER}
+blocked.update(("mujoco", "torch", "dm_control", "gymnasium", "trimesh", "onnx"))
+import os
 from pathlib import Path
 import tracks.common.files
 from suite.common.console import Console
