@@ -1,7 +1,7 @@
 """Unusable input of users and other programs: exit 2, a message of one line, no files left.
 
 Every case is a whole command line in this process. Options and settings out of range are in
-tests/suite/test_cli.py; models that hang or abort, in tests/policies/formats/test_apart.py.
+tests/suite/test_cli.py; models that hang or abort, in tests/policies/formats/test_model_process.py.
 """
 
 import errno
@@ -15,18 +15,11 @@ import pytest
 from policies import shipped
 from suite import cli
 from suite.diagnose import example
+from tests.support.commands import refused
 from tests.support.mutations import DEEP
 from tracks.input.reading import read_toml
 
 EXAMPLE = Path(example.__file__).parent
-
-
-def refused(line, capsys):
-    """Run a command line and return the one line by which it is refused."""
-    assert cli.main(line) == 2
-    said = capsys.readouterr().err.strip()
-    assert len(said.splitlines()) == 1 and len(said) < 1000, said
-    return said
 
 
 def checkpoint(folder):
@@ -42,7 +35,7 @@ READ = {
     "script": ("it.pt", "eval --policy it.pt --trust --trials 1"),
     "policy to start from": ("policy/weights.safetensors", "train --init-from policy"),
     "policy to export": ("policy/config.json", "export policy"),
-    "Delta Action Model": ("policy/weights.safetensors", "train --delta policy"),
+    "Delta Action Model": ("policy/config.json", "train --delta policy"),
     "vehicle": ("it.toml", "eval --vehicle it.toml --trials 1"),
     "vehicle to train with": ("it.toml", "train --model quad --vehicle it.toml"),
     "track": ("it.toml", "eval --track it.toml --trials 1"),
@@ -91,8 +84,8 @@ def test_what_is_no_file_of_a_sensible_size_is_refused_unread(
                 file.truncate(3 * 2**30)  # a hole: takes no room on the disk
         case _:
             path.symlink_to("/dev/zero")
-    said = refused(line, capsys)
-    assert path.name in said or "policy" in said
+    said = refused(capsys, "", *line)
+    assert path.name in said
     assert not list(tmp_path.glob("out*"))
 
 
@@ -130,7 +123,9 @@ def test_damaged_text_is_refused_and_other_formats_are_called_what_they_are(
     damaged = CONTENT.get(content, ("", ""))[path.suffix == ".toml"]
     data, words = OTHERS.get(content, (damaged.encode(errors="surrogateescape"), ""))
     path.write_bytes(data)
-    assert words in refused(line, capsys)
+    said = refused(capsys, "", *line)
+    assert words in said
+    assert ("log.csv" if (what, content) == ("mapping", "empty") else path.name) in said
     assert not list(tmp_path.glob("out*"))
 
 
@@ -183,7 +178,7 @@ def test_a_place_that_cannot_be_written_is_refused(command, place, tmp_path, mon
         return mkdir(path, *args, **kwargs)
 
     monkeypatch.setattr(os, "mkdir", on_read_only)
-    refused([*WRITERS[command].split(), "--out", PLACES[place]], capsys)
+    refused(capsys, WRITERS[command], "--out", PLACES[place])
     assert Path("file").read_text() == "kept"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["circle", "file", "read-only"]
 
@@ -201,5 +196,5 @@ def test_a_recording_to_an_impossible_place_is_refused_before_flying(
     monkeypatch.setattr("suite.judging.evaluate.evaluate", flown)
     Path("file").write_text("kept")
     Path("circle").symlink_to("circle")
-    refused(["eval", "--trials", "1", "--out", "out", "--rerun", place], capsys)
+    refused(capsys, "eval --trials 1 --out out --rerun", place)
     assert not list(tmp_path.glob("out*"))

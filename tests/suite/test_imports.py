@@ -11,6 +11,7 @@ from pathlib import Path
 from suite.cli import COMMANDS
 from suite.experiments import EXPERIMENTS
 from tests.support.policy_files import small_checkpoint
+from tests.support.tools import BLOCKER
 
 ROOMS = ("tracks", "policies", "eval", "suite")
 ROOT = Path(__file__).resolve().parents[2]
@@ -99,15 +100,6 @@ def test_rooms_are_typed_and_open_empty_and_their_folders_without_a_heavy_librar
     assert not missing
 
 
-BLOCKER = """
-import json, sys
-blocked = set()
-class Blocker:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in blocked:
-            raise ImportError(f"{name} is blocked")
-sys.meta_path.insert(0, Blocker())
-"""
 LIGHT = f"""{BLOCKER}
 import contextlib, io
 from suite import cli

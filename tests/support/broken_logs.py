@@ -9,7 +9,7 @@ FIELDS = ("pos_w", "quat_wxyz", "vel_w", "rate_b", "thrust_cmd", "rate_cmd_b", "
 
 def rows(log, chosen):
     """Return `log` with the rows at `chosen` (indices or bool) only."""
-    names = (*FIELDS, "time_s", "acc_b", "voltage")
+    names = (*FIELDS, "time_s", "acc_b", "voltage", "torque_cmd_b", "pwm", "rotor_speed_cmd")
     return changed(log, **dict.fromkeys(names, lambda values: values[chosen]))
 
 

@@ -22,7 +22,9 @@ def refused(capture, line, *words, lines=1):
     capture.readouterr()
     assert run(line, *words) == 2
     said = capture.readouterr().err
-    assert said.splitlines()[-lines].startswith("suite: ") and said.count("suite: ") == 1, said
+    message = said.splitlines()[-lines:]
+    assert message[0].startswith("suite: ") and said.count("suite: ") == 1, said
+    assert len("".join(message)) < 1000, said
     return " ".join(said.split())
 
 

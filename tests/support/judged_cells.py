@@ -26,12 +26,24 @@ def result(seed, success=True, policy="ours", difficulty=3, speed=5.0):
 ROWS = [result(0), result(1, False), result(2), result(3)]
 
 
-def cut_short(monkeypatch, seconds):
-    """Let the judge end every trial after so many seconds."""
-    fly = eval.judging.judge.fly
+def cut_short(monkeypatch, seconds=None, stop_after=None):
+    """Let the judge end trials after so many seconds, and interrupt it after so many of them.
 
-    def short(policy, trials, vehicle, world="mujoco", options=None, *rest, **more):
-        options = replace(options or JudgeOptions(), rules=Rules(time_limit_s=seconds))
-        return fly(policy, trials, vehicle, world, options, *rest, **more)
+    Returns the list of the trials that it has flown.
+    """
+    fly, flown = eval.judging.judge.fly, []
+
+    def short(policy, trials, vehicle, world="mujoco", options=None, on_result=None, *rest, **more):
+        def keep(result, flight):
+            if on_result is not None:
+                on_result(result, flight)
+            flown.append(result.trial)
+            if len(flown) == stop_after:
+                raise KeyboardInterrupt
+
+        if seconds is not None:
+            options = replace(options or JudgeOptions(), rules=Rules(time_limit_s=seconds))
+        return fly(policy, trials, vehicle, world, options, keep, *rest, **more)
 
     monkeypatch.setattr(eval.judging.judge, "fly", short)
+    return flown

@@ -5,6 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from eval.logs.flight_log import FlightLog
+
 GRAVITY = np.array([0.0, 0.0, 9.81])
 FLIP = np.diag([1.0, -1.0, -1.0])
 
@@ -43,6 +45,13 @@ def fly(time):
     felt = np.einsum("tji,tj->ti", rot, acc + GRAVITY)
     voltage = 16.0 - 0.05 * time
     return Truth(time, pos, rot, vel, rate, thrust, cmd_rate, motor, felt, voltage)
+
+
+def log(end_s):
+    """A flight log of it, with rows of 10 ms, that the body follows 50 ms after its commands."""
+    truth = fly(np.arange(0.0, end_s, 0.01))
+    return FlightLog("known", truth.time, truth.pos, truth.quat, truth.vel, truth.rate,
+                     truth.thrust, fly(truth.time + 0.05).cmd_rate, truth.motor)  # fmt: skip
 
 
 def _motors(thrust, rate, time):

@@ -24,6 +24,13 @@ def columns(rows=150, groups=(*STATE, "vel", "cmd_thrust", "cmd_rate")):
     return made | dict(zip(GROUPS["quat"], quat.T, strict=True))
 
 
+def level(time_s, **columns):
+    """Return the log of a level body at rest; `columns` are further signals, or others."""
+    still, up = np.zeros((len(time_s), 3)), np.tile([1.0, 0.0, 0.0, 0.0], (len(time_s), 1))
+    rest = {"time_s": time_s, "pos_w": still, "quat_wxyz": up, "vel_w": still, "rate_b": still}
+    return FlightLog("level", **{**rest, **columns})
+
+
 def write_table(path, table, metadata=None):
     """Write the columns as they are to a file of either kind; return its path."""
     arrow = pa.table({name: pa.array(values) for name, values in table.items()})

@@ -63,6 +63,20 @@ class Steady(Scripted):
         self.actions_b = np.atleast_2d(self.actions_b)
 
 
+class Watcher:
+    """Keeps what a pilot is given and what it answers."""
+
+    def __init__(self, pilot):
+        self.pilot, self.spec, self.name = pilot, pilot.spec, pilot.name
+        self.start, self.given, self.answers_b = pilot.start, [], []
+
+    def act(self, hidden, state, image, fresh):
+        self.given.append((state.copy(), image.copy()))
+        action_b, hidden = self.pilot.act(hidden, state, image, fresh)
+        self.answers_b.append(action_b[0])
+        return action_b, hidden
+
+
 class RandomNetwork:
     """The CNN-GRU of the policies with random parameters, on top of a pursuit so that it flies."""
 

@@ -4,6 +4,17 @@ import importlib.util
 import subprocess
 import sys
 
+BLOCKER = """
+import json, sys
+blocked = set()
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in blocked:
+            raise ImportError(f"{name} is blocked")
+sys.meta_path.insert(0, Blocker())
+"""
+"""The start of a program in which packages cannot be imported whose names are in `blocked`."""
+
 
 def program(path):
     """Return a Python file as a module."""

@@ -227,21 +227,6 @@ def test_rewards_are_terms_by_name():
         assert env.step(np.zeros(3, np.float32))[1] == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ({"rewards": {"gates": 1.0}}, "unknown reward term 'gates'. Did you mean 'gate'"),
-        ({"level": (3, 0)}, r"level is \(3, 0\), allowed is 0 to 9"),
-        ({"level": 10}, "level is 10, allowed is 0 to 9"),
-        ({"spec": "raec"}, "unknown policy .* 'raec'. Did you mean 'race'"),
-        ({"num_envs": 0}, "num_envs is 0, allowed is 1 or more"),
-    ],
-)
-def test_what_cannot_be_flown_is_refused_when_it_is_made(settings, said):
-    with pytest.raises(ValueError, match=said):
-        RaceVectorEnv(**settings)
-
-
 def test_each_episode_may_draw_its_vehicle_and_its_level():
     drawn = []
 

@@ -25,21 +25,6 @@ VEHICLE = load_vehicle("racer5")
 SLOW = replace(VEHICLE, controller=replace(VEHICLE.controller, frequency=200.0))
 
 
-@pytest.mark.parametrize(
-    ("spec", "said"),
-    [
-        (PolicySpec(action=ActionSpec("ctbr")), "spec.action is .*ctbr.* allowed is acceleration"),
-        (PolicySpec(action=ActionSpec(scale=(20.0,))), "spec.action is .*20.* SI units"),
-        (PolicySpec(depth=DepthEncoding(channel_axis=True)), "spec.depth is .* channel_axis=False"),
-        (PolicySpec(depth=DepthEncoding(uint8=True)), "spec.depth is .* uint8=False"),
-        (PolicySpec(rate_hz=300.0), "the spec decides at 300 Hz; .* up to the 200 Hz"),
-    ],
-)
-def test_dm_control_refuses_a_spec_that_it_would_ignore(spec, said):
-    with pytest.raises(ValueError, match=said):
-        load(vehicle=SLOW, spec=spec)
-
-
 @pytest.mark.parametrize("action", [[np.nan, 0, 0], [0, np.inf, 0], [0, 0, -20.1], [0, 0]])
 def test_dm_control_refuses_a_bad_action(action):
     env = load()
@@ -51,9 +36,25 @@ def test_dm_control_refuses_a_bad_action(action):
 CTBR = PolicySpec(action=ActionSpec("ctbr"))
 
 
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
+REFUSED = {
+    load: [
+        ({"spec": CTBR}, "spec.action is .*ctbr.* allowed is acceleration"),
+        ({"spec": PolicySpec(action=ActionSpec(scale=(20.0,)))}, "spec.action is .*20.* SI units"),
+        ({"spec": PolicySpec(depth=DepthEncoding(channel_axis=True))}, "channel_axis=False"),
+        ({"spec": PolicySpec(depth=DepthEncoding(uint8=True))}, "spec.depth is .* uint8=False"),
+        (
+            {"spec": PolicySpec(rate_hz=300.0), "vehicle": SLOW},
+            "the spec decides at 300 Hz; .* 200 Hz",
+        ),
+    ],
+    RaceVectorEnv: [
+        ({"rewards": {"gates": 1.0}}, "unknown reward term 'gates'. Did you mean 'gate'"),
+        ({"level": (3, 0)}, r"level is \(3, 0\), allowed is 0 to 9"),
+        ({"level": 10}, "level is 10, allowed is 0 to 9"),
+        ({"spec": "raec"}, "unknown policy .* 'raec'. Did you mean 'race'"),
+        ({"num_envs": 0}, "num_envs is 0, allowed is 1 or more"),
+    ],
+    RaceEnv: [
         ({"spec": PolicySpec(rate_hz=0.0)}, "spec.rate_hz.* is 0"),
         (
             {"spec": PolicySpec(rate_hz=300.0), "vehicle": SLOW},
@@ -68,10 +69,16 @@ CTBR = PolicySpec(action=ActionSpec("ctbr"))
         ({"level": (1.5, 2)}, r"level is \(1.5, 2\), allowed is 0 to 9"),
         ({"level": 2.5}, "level is 2.5, allowed is 0 to 9"),
     ],
+}
+
+
+@pytest.mark.parametrize(
+    ("make", "settings", "said"),
+    [(make, *refusal) for make, refusals in REFUSED.items() for refusal in refusals],
 )
-def test_settings_that_were_ignored_or_crashed_later_are_refused(settings, said):
+def test_settings_that_cannot_be_used_are_refused(make, settings, said):
     with pytest.raises(ValueError, match=said):
-        RaceEnv(**settings)
+        make(**settings)
 
 
 def test_flags_of_the_spec_and_of_the_environment_are_joined():

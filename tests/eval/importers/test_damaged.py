@@ -14,7 +14,6 @@ import pytest
 from eval.importers import import_log
 from eval.importers.formats import mcap, px4
 from eval.importers.options import ImportOptions
-from eval.importers.signals import make_signal
 from eval.logs.columns import FlightLogError
 from tests.support import foreign_logs as made
 from tests.support import known_flight, raw_logs
@@ -116,12 +115,6 @@ def test_numbers_beyond_any_unit_are_refused_without_a_warning(tmp_path, column,
     columns[column] = columns[column] * factor
     with pytest.raises(FlightLogError, match="1e\\+20|does not increase"):
         import_log(write(tmp_path / "log.csv", columns))
-
-
-def test_steps_of_time_that_nothing_can_be_divided_by_are_no_steps():
-    time = np.array([0.0, 1e-310, 1.0, 2.0, *range(3, 60)])
-    found, finding = make_signal(time, np.zeros(len(time)), "log", "gyro")
-    assert found is not None and len(found.time_s) == len(time) - 1 and finding is not None
 
 
 FULL = ImportOptions(full_thrust=30.0)

@@ -133,7 +133,7 @@ def test_where_nothing_tells_the_scale_thrust_is_left_out_and_one_that_is_there_
 
 
 def test_a_throttle_goes_through_the_vehicles_motors_with_the_battery():
-    """u = 0.5 x 3/4: 4 x 0.159375 N over the mass; see test_motors.py."""
+    """u = 0.5 x 3/4: 4 x 0.159375 N over the mass; see test_vehicle_file.py."""
     vehicle = replace(PLAIN, motors=MotorMap((0.2, 0.6), 4.0))
     rows = {"throttle": np.full((3, 1), 0.5), "voltage": np.full((3, 1), 3.0)}
     findings = thrust_command(rows, ImportOptions(vehicle=vehicle))

@@ -12,7 +12,6 @@ import pytest
 
 from eval.importers import import_log
 from eval.logs.faults.check import CheckContext, check_before_diagnosis
-from eval.logs.flight_log import FlightLog
 from suite.experiments.injected.flights import flight_signals
 from suite.experiments.injected.kinds import KINDS, inject
 from suite.experiments.injected.writers import write_table
@@ -58,10 +57,8 @@ VEHICLES = {
 
 def imported(folder, lacks, change=lambda parts: parts, mapping=("", ""), vehicle=PLAIN):
     """Import such a flight; return its log and the findings."""
-    truth = known_flight.fly(np.arange(0.0, 16.0, 0.01))
-    log = FlightLog("known", truth.time, truth.pos, truth.quat, truth.vel, truth.rate, truth.thrust,
-                    known_flight.fly(truth.time + 0.05).cmd_rate, truth.motor)  # fmt: skip
-    written = write_table(folder, change(flight_signals(log, PLAIN, np.random.default_rng(1))))
+    parts = flight_signals(known_flight.log(16.0), PLAIN, np.random.default_rng(1))
+    written = write_table(folder, change(parts))
     tables = written.options.map.read_text(encoding="utf-8").replace(*mapping).split("\n[")
     text = "\n[".join(t for t in tables if t.split("]")[0] not in lacks)
     written.options.map.write_text(text, encoding="utf-8")

@@ -11,7 +11,7 @@ from eval.worlds.trial import Rules, TrialSpec
 from policies.observation import View
 from policies.spec import PolicySpec
 from tests.support.courses import fly_on, straight
-from tests.support.pilots import Pursuit, Scripted
+from tests.support.pilots import Pursuit, Scripted, Watcher
 
 VEHICLE = load_vehicle("reference")
 TRIALS = [TrialSpec("zigzag", 0, seed) for seed in range(3)]
@@ -94,20 +94,6 @@ def test_ages_that_jitter_have_the_mean_and_the_spread_that_are_asked_for(age_s,
     assert abs(np.corrcoef(state, image)[0, 1]) < 0.1, "that of the state says nothing of the other"
     turned = ages_seen(ages, TRIALS[::-1], 300)[6:]
     assert np.array_equal(turned[:, :, ::-1], found), "they are set by the trial"
-
-
-class Watcher:
-    """Keeps what a pilot is given and what it answers."""
-
-    def __init__(self, pilot):
-        self.pilot, self.spec, self.name = pilot, pilot.spec, pilot.name
-        self.start, self.given, self.answers_b = pilot.start, [], []
-
-    def act(self, hidden, state, image, fresh):
-        self.given.append((state.copy(), image.copy()))
-        action_b, hidden = self.pilot.act(hidden, state, image, fresh)
-        self.answers_b.append(action_b[0])
-        return action_b, hidden
 
 
 def watched(pilot, sensors, seconds, track):

@@ -137,6 +137,7 @@ def test_a_trial_that_ends_at_its_start_makes_no_decision():
         )[0]  # fmt: skip
         found = [(end.ended_by, end.decisions) for end in ends]
         assert found == [("collision", 0), ("timeout", 15)], world
+        assert (ends[0].time_s, ends[0].collided_with, ends[0].v_max) == (0.0, "the wall", 0.0)
 
 
 def rows(due, time_s):

@@ -40,7 +40,8 @@ def test_reference_is_what_the_tables_fly():
 def test_every_effect_survives_a_round_trip(tmp_path):
     for seed in range(5):
         vehicle = drawn_effects(np.random.default_rng(seed))
-        vehicle_file.save_vehicle(vehicle, tmp_path / "v.toml", comment="first line\nsecond line")
+        comment = "first\nsecond \x1b[31m\x0c\x00\x7f"
+        vehicle_file.save_vehicle(vehicle, tmp_path / "v.toml", comment)
         assert vehicle_file.load_vehicle(tmp_path / "v.toml") == vehicle
 
 
@@ -66,6 +67,7 @@ REFUSED = [
     ("mass", float("nan"), "mass is nan.*finite"),
     ("mass", 1e-300, "mass = 1e-300.*must be from 0.0001 to 10000 kg"),
     ("inertia", [1e-300] * 3, "inertia = .*must be from 1e-10"),
+    ("name", "a\x1b[31m", "a printable text"),
     ("schema", 2, "schema is 2, allowed is 1"),
     ("controller.kind", ["px4"], r"controller\.kind is \['px4'\], allowed is 'p' or 'beta"),
     ("controller.kind", "ardupilot", r"controller\.kind is 'ardupilot'"),

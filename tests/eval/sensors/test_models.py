@@ -363,7 +363,7 @@ def test_a_model_stays_within_bounds_and_is_alike_in_numpy_and_jax(name):
 
 
 @pytest.mark.parametrize("name", SENSING)
-def test_gradients_through_state_and_gates_are_finite(name):
+def test_gradients_through_state_and_gates_are_finite_and_not_cut(name):
     sensor, rng = SENSORS[name], np.random.default_rng(3)
     first, each = (random_draws(need, rng) for need in (sensor.trial, sensor.observation))
     truth = jax.tree.map(jnp.asarray, next(many_views(1, rng)))
@@ -379,4 +379,5 @@ def test_gradients_through_state_and_gates_are_finite(name):
 
     for moving in (0.0, 1.0):
         found = gradient(truth.pos_w, truth.rot_w, truth.vel_w, moving)
-        assert all(np.isfinite(part).all() and np.abs(part).max() < 1e3 for part in found)
+        # Position, attitude and velocity each reach what is sensed.
+        assert all(np.isfinite(part).all() and 0.5 < np.abs(part).max() < 1e3 for part in found)

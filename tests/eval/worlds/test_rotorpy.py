@@ -21,7 +21,7 @@ from eval.worlds import world_class
 from eval.worlds.rotorpy import Multirotor, StepInput
 from eval.worlds.rotorpy_vehicle import AIR, as_flown, differences, rotorpy_parameters
 from eval.worlds.trial import Rules
-from suite.cli import main
+from tests.support import commands
 from tests.support.courses import fly_on, straight
 from tests.support.engines import STAND_IN
 from tests.support.pilots import Pursuit, Steady
@@ -49,19 +49,16 @@ def test_without_rotorpy_the_install_line_is_said(missing, monkeypatch, tmp_path
     with pytest.raises(ValueError, match="world 'rotorpy' needs the package") as refused:
         world_class("rotorpy")
     assert line in str(refused.value)
-    assert main(["eval", "--simulator", "rotorpy", "--out", str(tmp_path / "out")]) == 2
-    assert line in capsys.readouterr().err and not (tmp_path / "out").exists()
+    assert line in commands.refused(capsys, "eval --simulator rotorpy --out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_body_falls_as_the_simulator_says_and_touches_our_ground(stand_in):
-    (result,), _ = flown(Steady(), TRACK, rules=RULES)
+    (result,), (flight,) = flown(Steady(), TRACK, record=Record(), rules=RULES)
     assert result[8:10] == ("collision", "ground") and result.world == "rotorpy"
     assert result.time_s == pytest.approx(np.sqrt(2 * 1.475 / 9.81), abs=0.003)
     assert torch.get_default_dtype() is torch.float32, "left as it was"
-
-
-def test_rows_are_the_simulators_states_and_count_as_continuous(stand_in):
-    _, (flight,) = flown(Steady(), TRACK, record=Record(), rules=RULES)
+    # Rows are the simulator's states, and count as continuous.
     t = flight.time_s
     np.testing.assert_allclose(flight.pos_w[:, 2], 1.5 - 0.5 * 9.81 * t**2, atol=1e-9)
     np.testing.assert_allclose(flight.vel_w[:, 2], -9.81 * t, atol=1e-9)

@@ -1,7 +1,7 @@
 """Every way in which a trial ends, provoked; what a policy is shown; and all worlds step alike."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from eval.worlds import reference as reference_world
 from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
 from tests.support.courses import fly_on, straight
-from tests.support.pilots import Pursuit, Scripted, Steady
+from tests.support.pilots import Pursuit, Scripted, Steady, Watcher
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 from tracks.families import make_track
 from tracks.geometry.camera import Camera
@@ -128,32 +128,15 @@ def test_state_beyond_any_flight_is_diverged(world, monkeypatch, tmp_path):
     assert all(map(math.isfinite, result[10:16])) and list(tmp_path.iterdir()) == []
 
 
-def test_collision_at_the_start():
-    result = one(Pursuit(), straight(wall_at=0.0), "mujoco")
-    assert (result.ended_by, result.time_s, result.collided_with) == ("collision", 0.0, "the wall")
-    assert result.v_max == 0.0
-
-
 DISTANCES = (1.0, 2.5, 4.5)
 
 
-@dataclass
-class Witness(Pursuit):
-    """A pursuit that keeps what it was shown."""
-
-    seen: list = field(default_factory=list)
-
-    def act(self, hidden, state, image, fresh):
-        self.seen.append(state[0].copy())
-        return super().act(hidden, state, image, fresh)
-
-
 def shown(world, trial, seconds, **more):
-    policy = Witness(spec=PolicySpec(camera=Camera(width=20, height=20), **more))
+    policy = Watcher(Pursuit(spec=PolicySpec(camera=Camera(width=20, height=20), **more)))
     options = JudgeOptions(slots=1, rules=Rules(time_limit_s=seconds))
     tracks = {"straight": straight(DISTANCES)}
     fly(policy, [trial], VEHICLE, world, options, tracks=tracks)
-    return np.array(policy.seen)
+    return np.array([state[0] for state, _ in policy.given])
 
 
 in_every_world = pytest.mark.parametrize(

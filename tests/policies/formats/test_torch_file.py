@@ -5,6 +5,7 @@ import io
 import json
 import os
 import pickle
+import re
 import zipfile
 
 import numpy as np
@@ -70,7 +71,11 @@ def test_without_trust_nothing_of_a_file_reaches_torch(exported, tmp_path, in_pr
 )
 def test_a_damaged_archive_is_refused(exported, tmp_path, change, said, in_process):
     path = rewrite(exported / "tiny.pt2", tmp_path / "bad.pt2", change)
-    with pytest.raises(PolicyError, match=said):
+    with pytest.raises(PolicyError, match=said) as caught:
+        load_policy(path, trust=True)
+    assert str(path) in str(caught.value)
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(PolicyError, match=re.escape(str(path))):
         load_policy(path, trust=True)
 
 

@@ -58,6 +58,16 @@ def test_an_option_of_another_work_is_refused(tmp_path, monkeypatch, capsys):
     assert not list(tmp_path.iterdir())
 
 
+def test_train_lists_the_settings_of_its_recipe_and_trains_nothing(tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr(training, "train", None)
+    found = answer(capfd, "train --recipe quick --list-settings --out", tmp_path / "run")[
+        "settings"
+    ]
+    paths = [setting["path"] for setting in found]
+    assert {"optimizer.rate", "loss.progress", "spec.camera.width"} <= set(paths)
+    assert all(setting["about"] for setting in found) and not list(tmp_path.iterdir())
+
+
 def test_options_become_settings():
     config = resolve(Config(recipe="quick", seed=4, iterations=7, set=("optimizer.rate=1",)))
     assert (config.seed, config.optimizer.iterations, config.optimizer.rate) == (4, 7, 1.0)

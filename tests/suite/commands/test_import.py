@@ -1,14 +1,18 @@
 """`suite identify`, `suite import` and `suite example` from the command line."""
 
 import shutil
+from pathlib import Path
 
+import numpy as np
 import pytest
 
-from eval.logs.flight_log import read_flight
+import suite
+from eval.logs.flight_log import read_flight, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.diagnose.example.flights import FOLDER, HIDDEN
 from tests.support import foreign_logs as made
 from tests.support.commands import answer, refused, run
+from tests.support.log_tables import level
 
 FILES = sorted(FOLDER.glob("*.parquet"))
 
@@ -23,6 +27,18 @@ def test_a_log_becomes_a_flight_log_and_json_is_one_object(tmp_path, capsys):
     found = answer(capsys, "import --vehicle racer5 --out", out, log)
     assert found["rows"] == len(read_flight(out).time_s)
     assert {"status", "signal", "evidence"} < set(found["findings"][0])
+
+
+def test_time_on_the_ground_is_cut_or_kept(tmp_path, capsys):
+    time_s = np.arange(0.0, 10.0, 0.01)
+    height = np.interp(time_s, [2.0, 3.0, 7.0, 8.0], [0.0, 1.0, 1.0, 0.0])
+    pos_w = height[:, None] * [0.0, 0.0, 1.0]
+    motor = np.where((time_s > 2.0) & (time_s < 8.0), 800.0, 50.0)[:, None] + np.zeros(4)
+    log = level(time_s, pos_w=pos_w, rotor_speed=motor)
+    path = write_flight(tmp_path / "log.parquet", log)
+    line = (path, "--out", tmp_path / "out.parquet")
+    assert 550 < answer(capsys, "import --no-fix", *line)["rows"] < 800
+    assert answer(capsys, "import --no-fix --keep-ground", *line)["rows"] == len(time_s)
 
 
 def test_bad_options_are_code_2_in_one_line(tmp_path, capsys):
@@ -115,8 +131,15 @@ def test_an_inertia_that_was_not_told_is_as_it_was_but_for_what_goes_with_the_ot
     drag = {"value": [0.3, 0.0, 0.0], "unit": "1/s", "ci95": [[0.2, 0.4], None, None]}
     parameters = {"inertia": inertia, "effects.linear_drag.coefficient": drag}
     found = {"drive": "pwm", "parameters": parameters, "not_identified": [], "warnings": ["noted"]}
-    monkeypatch.setattr("suite.diagnose.identify.run.identify_files", lambda *_: found)
-    assert run("identify none --vehicle reference --out", tmp_path / "v.toml") == 0
+    given = []
+    name = "suite.diagnose.identify.run.identify_files"
+    monkeypatch.setattr(name, lambda *args: given.append(args) or found)
+    line = "identify none --vehicle reference --leave drag lag --out"
+    assert run(line, tmp_path / "v.toml") == 0
+    assert suite.identify_vehicle(["none"], "reference", tmp_path / "v.toml") is found
+    inputs = ([Path("none")], "reference", tmp_path / "v.toml")
+    assert [(list(flights), *rest[:2]) for flights, *rest in given] == [inputs] * 2
+    assert [tuple(args[3]) for args in given] == [("drag", "lag"), ()]
     said = "".join(capsys.readouterr())
     assert "inertia: 2.5 (2 to 3), 2 (as it was), 4 (goes with the others) kg m^2" in said
     assert "coefficient: 0.3 (0.2 to 0.4), 0 (as it was), 0 (as it was) 1/s" in said

@@ -13,6 +13,7 @@ import contextlib
 import dataclasses
 import functools
 import importlib
+import inspect
 import io
 import os
 import re
@@ -23,6 +24,7 @@ from pathlib import Path
 
 import pytest
 
+import suite
 from policies import shipped
 from suite import cli
 from suite.commands.train import resolve
@@ -92,7 +94,7 @@ def _named(where):
     """Say where a wrong command stands."""
     try:
         yield
-    except (AssertionError, SystemExit, ValueError) as error:
+    except (AssertionError, KeyError, SystemExit, TypeError, ValueError) as error:
         raise AssertionError(f"{where}: {error}") from error
 
 
@@ -168,13 +170,23 @@ def test_marked_commands_run(where, tmp_path, monkeypatch, capfd):
         assert program == "suite" and cli.main(words) == 0, (words, capfd.readouterr().err)
 
 
-def test_python_on_a_page_imports_what_there_is():
+def test_python_on_a_page_imports_what_there_is_and_calls_it_as_defined():
     fences = [re.findall(r"```python\n(.*?)```", text, re.DOTALL) for text in TEXTS.values()]
     trees = [ast.parse(body) for bodies in fences for body in bodies]
+    defined = {f"suite.{name}": getattr(suite, name) for name in suite.__all__}
     for node in (node for tree in trees for node in ast.walk(tree)):
         if isinstance(node, ast.ImportFrom) and node.module:
             module = importlib.import_module(node.module)
-            assert all(hasattr(module, alias.name) for alias in node.names), node.module
+            defined |= {alias.name: getattr(module, alias.name) for alias in node.names}
+    bound = set()
+    for call in (node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call)):
+        name = ast.unparse(call.func)
+        if name in defined or name.startswith("suite."):
+            keywords = {str(word.arg): word.value for word in call.keywords}
+            with _named(ast.unparse(call)):
+                inspect.signature(defined[name]).bind(*call.args, **keywords)
+            bound.add(name)
+    assert "suite.evaluate_policy" in bound
 
 
 def test_the_card_of_the_default_policy_has_rows_of_the_page_of_its_results():

@@ -11,7 +11,9 @@ import pytest
 from eval.logs.flight_log import read_flight, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.cli import main
+from suite.diagnose import run as diagnose_run
 from suite.diagnose.sources.rollouts import can_fly
+from tests.support.commands import refused
 from tests.support.diagnosis_flights import fly
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.recordings import columns
@@ -31,11 +33,24 @@ def test_files_come_out_whole_and_bad_flights_are_named(written):
     found = json.loads((written / "diagnosis.json").read_text(encoding="utf-8"))
     assert json.loads((written.parent / "said.json").read_text(encoding="utf-8")) == found
     assert any("bad.csv" in warning for warning in found["warnings"])
-    names = {effect["name"] for effect in found["effects"]}
-    assert names and set(load_vehicle(written / "vehicle.toml").effects) == names
+    assert set(load_vehicle(written / "vehicle.toml").effects) == {"linear_drag"}
     assert found["seed"] == 3
     assert found["actuators"][0]["followed"] > 0.9
-    assert found["plan"]["flights"] == [] or found["effects"][0]["alternatives"]
+    # One effect without alternatives leaves nothing to separate.
+    assert [(effect["name"], effect["alternatives"]) for effect in found["effects"]] == [
+        ("linear_drag", [])
+    ]
+    assert not found["plan"]["flights"] and "no flight is planned" in found["plan"]["words"][0]
+    assert not (written / "plan").exists()
+
+
+def test_without_a_recording_all_else_is_written(diagnosed, tmp_path, monkeypatch):
+    flights, made = diagnosed[0].parent, diagnosed[1]
+    monkeypatch.setattr(diagnose_run, "diagnose", lambda *_, **options: made)
+    line = [str(flights / "0.parquet"), "--vehicle", str(flights / "v.toml"), "--no-recording"]
+    assert main(["diagnose", *line, "--out", str(tmp_path)]) == 0
+    names = {"diagnosis.json", "report.html", "run.json", "vehicle.toml"}
+    assert {path.name for path in tmp_path.iterdir()} == names
 
 
 def test_every_step_is_in_the_report(written):
@@ -75,26 +90,24 @@ def test_the_recording_has_what_was_measured_and_simulated(written):
 def test_a_file_with_a_load_on_a_line_is_refused_before_flights_are_read(command, tmp_path, capsys):
     file, none, out = (str(tmp_path / name) for name in ("loaded.toml", "none.csv", "out.toml"))
     save_vehicle(with_effects(slung_load=(0.05, 0.5)), file)
-    assert main([command, none, "--vehicle", file, "--out", out]) == 2
-    said = capsys.readouterr().err.strip()
-    assert "effects.slung_load" in said and "remove it" in said and "\n" not in said
+    said = refused(capsys, command, none, "--vehicle", file, "--out", out)
+    assert "effects.slung_load" in said and "remove it" in said
 
 
 def test_what_is_read_is_not_written_over_and_flights_too_short_or_missing_are_refused(
     tmp_path, capsys
 ):
     save_vehicle(PLAIN, tmp_path / "vehicle.toml")
-    own, out = str(tmp_path / "vehicle.toml"), ["--out", str(tmp_path)]
-    assert main(["diagnose", str(tmp_path), "--vehicle", own, *out]) == 2
-    assert "vehicle.toml is also an input and would be overwritten" in capsys.readouterr().err
-    assert main(["diagnose", str(tmp_path / "none.csv"), "--vehicle", "reference"]) == 2
+    own, out = tmp_path / "vehicle.toml", ("--out", tmp_path)
+    said = refused(capsys, "diagnose --vehicle", own, tmp_path, *out)
+    assert "vehicle.toml is also an input and would be overwritten" in said
+    assert "none.csv" in refused(capsys, "diagnose --vehicle reference", tmp_path / "none.csv")
     record = {"config_type": "suite.loop.config.LoopConfig", "command": ["suite", "loop"]}
     (tmp_path / "run.json").write_text(json.dumps(record))
-    assert main(["diagnose", str(tmp_path), "--vehicle", "reference", *out]) == 2
-    assert "holds a run of another kind (made by suite loop)" in capsys.readouterr().err
+    said = refused(capsys, "diagnose --vehicle reference", tmp_path, *out)
+    assert "holds a run of another kind (made by suite loop)" in said
     path = write_flight(tmp_path / "short.parquet", fly(PLAIN, 0, duration_s=1.2))
-    assert main(["diagnose", str(path), "--vehicle", "reference"]) == 2
-    assert "1.3 s" in capsys.readouterr().err
+    assert "1.3 s" in refused(capsys, "diagnose --vehicle reference", path)
 
 
 def test_logs_without_what_a_rollout_needs_are_diagnosed_by_views(log):
@@ -128,7 +141,10 @@ def test_a_change_is_written_as_every_diagnosis_is(tmp_path, capsys):
     assert "mass_offset" in names and told["views"] and len(told["reference"]) == 2
     assert any("--drive" in line for line in told["warnings"])
     assert any("depends on the motion" in line for line in told["warnings"]), "two new flights"
-    assert "warning: --drive needs rollouts" in said.err and "flights" in told["plan"]
+    assert "warning: --drive needs rollouts" in said.err
+    planned = {flight["file"] for flight in told["plan"]["flights"]}
+    assert planned and planned <= {path.name for path in (tmp_path / "out/plan").iterdir()}
+    assert any("mass_offset" in words for words in told["plan"]["words"])
     for axis in told["gap"]["channels"]["force"].values():
         assert {"before", "after", "noise_floor", "repeatability"} <= set(axis)
     assert json.loads((tmp_path / "out/diagnosis.json").read_text())["verdict"] == told["verdict"]
@@ -146,8 +162,7 @@ def test_a_single_reference_is_refused(tmp_path, capsys):
     save_vehicle(VEHICLE, tmp_path / "v.toml", "for a test")
     for number, log in enumerate(flights(2, duration_s=3.0)):
         write_flight(tmp_path / f"{number}.parquet", log)
-    words = ["diagnose", str(tmp_path / "0.parquet"), "--reference", str(tmp_path / "1.parquet"),
-             "--vehicle", str(tmp_path / "v.toml"), "--out", str(tmp_path / "out")]  # fmt: skip
-    assert main(words) == 2
-    assert "at least 2" in capsys.readouterr().err
+    words = ("--reference", tmp_path / "1.parquet", "--vehicle", tmp_path / "v.toml")
+    said = refused(capsys, "diagnose --out", tmp_path / "out", tmp_path / "0.parquet", *words)
+    assert "at least 2" in said
     assert not (tmp_path / "out" / "diagnosis.json").exists()

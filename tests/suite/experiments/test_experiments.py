@@ -4,7 +4,7 @@ import pytest
 
 from suite import cli
 from suite.experiments import EXPERIMENTS
-from tests.support.documents import reproduce
+from tests.support import commands
 
 
 def test_every_experiment_is_listed_and_has_help_for_every_option(capsys):
@@ -53,7 +53,6 @@ def test_what_cannot_be_used_is_said_before_anything_is_done(
     program.touch()
     place.mkdir()
     args = [word.replace("@", " ").format(folder=tmp_path) for word in line.split()]
-    assert reproduce(place, *args) == 2
-    said = capsys.readouterr().err
-    assert words in said and len(said.strip().splitlines()) == 1
+    out = ("--out", place / "docs", "--cache", place / "cache")
+    assert words in commands.refused(capsys, "reproduce", *args, *out)
     assert not list(place.iterdir())

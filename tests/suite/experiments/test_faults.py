@@ -7,7 +7,7 @@ import pytest
 
 from eval.importers import import_log
 from eval.logs.faults.reading import readings_in
-from eval.logs.flight_log import FlightLog, write_flight
+from eval.logs.flight_log import write_flight
 from eval.quadrotor.vehicle_file import save_vehicle
 from suite.common.console import Console
 from suite.experiments import faults
@@ -23,10 +23,7 @@ from tests.support.vehicles import PLAIN
 @pytest.fixture(scope="module")
 def judged(tmp_path_factory):
     truth = known_flight.fly(np.arange(0.0, 10.0, 0.01))
-    log = FlightLog(
-        "known", truth.time, truth.pos, truth.quat, truth.vel, truth.rate, truth.thrust,
-        known_flight.fly(truth.time + 0.05).cmd_rate, truth.motor,
-    )  # fmt: skip
+    log = known_flight.log(10.0)
     return write_flight(tmp_path_factory.mktemp("judged") / "known.parquet", log), log, truth
 
 

@@ -14,6 +14,7 @@ from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.worlds import nearest
 from tests.support.commands import answer, refused, run
 from tests.support.engines import STAND_IN
+from tests.support.judged_cells import cut_short
 from tests.support.vehicles import with_effects
 
 GATE = "[[gates]]\ncenter = [{x}, 0.0, 1.3]\nwidth = 1.0\nheight = 1.0\n"
@@ -34,13 +35,7 @@ def test_collect_writes_logs_that_read_back_and_goes_on(pilots, tmp_path, monkey
     found = json.loads((out / "flights.json").read_text())
     assert [row["file"] for row in found["flights"]] == [log.name for log in logs]
     logs[1].unlink()
-    flown, fly = [], eval.judging.judge.fly
-
-    def count(policy, trials, *rest, **more):
-        flown.extend(trials)
-        return fly(policy, trials, *rest, **more)
-
-    monkeypatch.setattr(eval.judging.judge, "fly", count)
+    flown = cut_short(monkeypatch)
     assert answer(capfd, *args)["flights"] == found["flights"]
     assert [trial.seed for trial in flown] == [8]
 

@@ -13,6 +13,7 @@ from suite.commands import compare
 from suite.common.console import Quiet
 from suite.judging.comparing import compare_runs, compare_seeds, read_runs
 from suite.judging.requests import Evaluation
+from tests.support import commands
 from tests.support.judged_cells import result
 
 
@@ -66,7 +67,7 @@ def run_of(folder, successes, judged=None, policy="ours", **digests):
     return folder
 
 
-def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path):
+def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path, capsys):
     rng = np.random.default_rng(0)
     a = run_of(tmp_path / "a", rng.random(40) < 0.9)
     b = run_of(tmp_path / "b", rng.random(40) < 0.5)
@@ -75,6 +76,11 @@ def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path):
     assert " minus " in found["sentence"] and "McNemar" in found["sentence"]
     answer = compare.run(compare.Config((a, b), seeds=True), Quiet())
     assert "2 training seeds" in answer["comparisons"][0]["sentence"]
+    (there,), (back,) = (
+        commands.answer(capsys, "compare", one, "--against", other)["comparisons"]
+        for one, other in ((a, b), (b, a))
+    )
+    assert there["difference"]["value"] == -back["difference"]["value"] == found["difference"].value
     for judged, digests, said in (
         (Evaluation(simulator="mjx"), {}, r"simulator \(mujoco and mjx\);"),
         ({"world": "mjx", "time_limit_s": 20.0}, {}, r"simulator \(mujoco and mjx\);"),

@@ -12,23 +12,7 @@ from eval.judging.results import read_trials
 from suite.common.console import Console
 from suite.judging.flying import Manner, load_in_manner, policy_for_workers
 from tests.support.commands import answer, evaluate, refused, run
-
-
-def interrupt_after(patch, count):
-    """Interrupt the judge after so many trials; return the list of those that it has flown."""
-    fly, flown = eval.judging.judge.fly, []
-
-    def fly_until(policy, trials, vehicle, world, options, on_result, **rest):
-        def keep(result, flight):
-            on_result(result, flight)
-            flown.append(result.trial)
-            if len(flown) == count:
-                raise KeyboardInterrupt
-
-        return fly(policy, trials, vehicle, world, options, keep, **rest)
-
-    patch.setattr(eval.judging.judge, "fly", fly_until)
-    return flown
+from tests.support.judged_cells import cut_short
 
 
 def printed(capture):
@@ -76,7 +60,7 @@ def test_an_interrupted_eval_goes_on_to_the_same_result(pilots, tmp_path, monkey
     asked = ("--track circular,zigzag --trials 1 --time-limit-s 1 --policy", pilots["pursuit"])
     whole, again = tmp_path / "whole", tmp_path / "again"
     assert evaluate(whole, *asked) == 0
-    flown = interrupt_after(monkeypatch, 1)
+    flown = cut_short(monkeypatch, stop_after=1)
     assert evaluate(again, *asked) == 130
     assert not (again / "trials.parquet").exists()
     with monkeypatch.context() as patch:
@@ -94,7 +78,7 @@ def test_trials_flown_before_under_another_label_are_the_same_policys(
     """Alone a policy is called by its name, beside a namesake by its path."""
     asked = ("--track zigzag --trials 2 --policy", pilots["diver"])
     with monkeypatch.context() as patch:
-        interrupt_after(patch, 1)
+        cut_short(patch, stop_after=1)
         assert evaluate(tmp_path, *asked) == 130
     (tmp_path / "journal-2.jsonl").write_text("of a command with more policies\n")
     assert evaluate(tmp_path, *asked, pilots["diver2"]) == 0
@@ -109,7 +93,7 @@ def test_a_later_policys_journal_is_looked_at_before_the_first_flight(
     """The first policy's trials may take hours."""
     out, asked = tmp_path / "out", "--track zigzag --trials 1 --policy"
     with monkeypatch.context() as patch:
-        interrupt_after(patch, 2)
+        cut_short(patch, stop_after=2)
         assert evaluate(out, asked, pilots["diver"], pilots["other"]) == 130
     (out / "journal-0.jsonl").unlink()
     monkeypatch.setattr(eval.judging.judge, "fly", None)
@@ -161,7 +145,7 @@ def test_trials_that_are_not_asked_for_again_are_kept_and_said(pilots, tmp_path,
     """A command that goes on with fewer trials must not lose what the first one has flown."""
     asked = ("--track zigzag --policy", pilots["diver"], "--trials")
     with pytest.MonkeyPatch.context() as patch:
-        interrupt_after(patch, 3)
+        cut_short(patch, stop_after=3)
         assert evaluate(tmp_path, *asked, 4) == 130
     capsys.readouterr()
     shown = []

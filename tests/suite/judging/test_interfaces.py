@@ -1,24 +1,32 @@
-"""Messages about a user's own policy file, track file and working folder."""
+"""The Python interface; messages about a user's own policy file, track file and working folder."""
 
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import onnx
 import pytest
 import torch
 
+import suite
+from eval.effects import EFFECTS
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds import WORLDS
 from eval.worlds.engine import refuse_start_contact
 from policies.contract import contract_of
 from policies.formats.export import export_module
 from policies.spec import PolicySpec
 from suite.commands import check
 from suite.common.console import Quiet
+from suite.diagnose.example import flights as example
 from suite.judging import checking
 from suite.judging.trials import _in_millimetres
 from tests.support.courses import straight
+from tracks.families import FAMILIES
+
+FLIGHT = min(path.name for path in example.FOLDER.glob("*.parquet"))
 
 
 def test_a_start_that_touches_the_ground_is_refused_and_a_track_in_millimetres_reported():
@@ -51,6 +59,26 @@ def test_modules_in_the_working_folder_do_not_stand_for_ours_or_pythons(tmp_path
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True
     )
     assert done.returncode == 0 and "mine" not in done.stderr, done.stderr
+
+
+def test_files_come_back_and_a_program_registers_names_for_its_process(tmp_path, monkeypatch):
+    vehicle, log = suite.load_vehicle("racer5"), suite.read_flight(example.FOLDER / FLIGHT)
+    suite.save_vehicle(vehicle, tmp_path / "it.toml")
+    assert suite.load_vehicle(tmp_path / "it.toml") == vehicle
+    again = suite.read_flight(suite.write_flight(tmp_path / "it.parquet", log))
+    np.testing.assert_array_equal(again.pos_w, log.pos_w)
+    effect = replace(EFFECTS["linear_drag"], name="mine")
+    for registry, value, register in (
+        (EFFECTS, effect, suite.register_effect),
+        (FAMILIES, lambda difficulty, rng: None, partial(suite.register_track, "mine")),
+        (WORLDS, type("Mine", (), {}), partial(suite.register_simulator, "mine")),
+    ):
+        for held in ("_entries", "_values"):
+            monkeypatch.setattr(registry, held, dict(getattr(registry, held)))
+        register(value)
+        assert registry["mine"] is value
+        with pytest.raises(ValueError, match="'mine' exists already"):
+            register(value)
 
 
 def test_check_reports_the_contract_and_an_unscaled_file_that_says_nothing(tmp_path, monkeypatch):

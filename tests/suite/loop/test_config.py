@@ -8,7 +8,6 @@ import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from policies import shipped
-from suite import cli
 from suite.common.errors import WorkFailed
 from suite.common.stages import is_done
 from suite.common.usage import renamed
@@ -16,6 +15,7 @@ from suite.loop import delta_action, hidden_effect, work
 from suite.loop.config import loop_by_content, resolve
 from suite.loop.variants import DeltaModel, Variant
 from suite.loop.work import LoopRun, Quiet, plan
+from tests.support import commands
 from tests.support.vehicles import with_effects
 
 EXAMPLE = "examples/hidden.toml"
@@ -45,10 +45,8 @@ EXAMPLE = "examples/hidden.toml"
 def test_what_cannot_be_used_is_said_before_anything_is_written(
     line, words, tmp_path, root, capsys
 ):
-    args = line.format(root / EXAMPLE).split()
-    assert cli.main(["loop", *args, "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert words in said and len(said.strip().splitlines()) == 1
+    asked = f"loop {line.format(root / EXAMPLE)} --out"
+    assert words in commands.refused(capsys, asked, tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 

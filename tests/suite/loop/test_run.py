@@ -211,6 +211,18 @@ def test_a_loop_with_a_hidden_effect_leaves_tables_report_and_recording(hidden):
     assert "<td>offset z [m]</td><td>not identifiable</td>" in rows
 
 
+def test_without_the_delta_none_is_fitted_and_two_policies_are_tuned(tmp_path, monkeypatch, root):
+    """As `make race` runs it."""
+    monkeypatch.chdir(root)
+    stub = Stub(monkeypatch)
+    assert cli.main([*HIDDEN, "--no-delta", "--out", str(tmp_path)]) == 0
+    stages = ["given", "eval-nominal", "eval-before", "flights", "measured", "diagnosis"]
+    stages += ["tuned-control", "tuned-named", "eval-control", "eval-named", "replays"]
+    found, *_ = finished(tmp_path, stages, 4)
+    assert [one["name"] for one in found["standings"]] == ["nominal", "before", "control", "named"]
+    assert not stub.fitted and not any(with_delta for _, with_delta, _ in stub.trained)
+
+
 def test_only_the_judge_flies_the_hidden_vehicle_and_all_are_tuned_alike(hidden):
     out, stub = hidden
     rows = {name: read_trials(out / f"eval-{name}" / "trials.parquet") for name in LABELS}

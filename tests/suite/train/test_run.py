@@ -21,6 +21,7 @@ from suite.train.recipes import with_quadrotor
 from suite.train.rollout import make_rollout
 from suite.train.update import make_optimizer
 from tests.support.canonical import NOISY, update_of
+from tests.support.tools import BLOCKER
 from tests.support.training import SPEC, assert_same_run, boxes_worlds, fresh_params, small_config
 from tests.support.vehicles import PLAIN, with_effects
 
@@ -118,13 +119,9 @@ def test_a_run_that_is_stopped_or_killed_while_saving_resumes_exactly(
     assert_same_run(tmp_path, whole)
 
 
-BARE = """
-import os, sys
-class Blocker:
-    def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in ("mujoco", "torch", "dm_control", "gymnasium", "trimesh", "onnx"):
-            raise ImportError("blocked: " + name)
-sys.meta_path.insert(0, Blocker())
+BARE = f"""{BLOCKER}
+blocked.update(("mujoco", "torch", "dm_control", "gymnasium", "trimesh", "onnx"))
+import os
 from pathlib import Path
 import tracks.common.files
 from suite.common.console import Console

@@ -13,14 +13,21 @@ import pytest
 from tracks.common import files
 
 
-def test_a_failed_write_leaves_the_old_file_and_nothing_beside_it(tmp_path):
+@pytest.mark.parametrize("replacing", [files.replacing_file, files.replacing_folder])
+def test_a_failed_write_is_named_and_leaves_what_was_there_and_nothing_beside_it(
+    tmp_path, replacing
+):
+    def file_of(place):
+        return place / "it" if place.is_dir() else place
+
     target = tmp_path / "a.json"
-    files.write_text(target, "old")
-    with pytest.raises(OSError, match="No space"), files.replacing_file(target) as beside:
-        beside.write_text("half")
-        assert target.read_text() == "old"
+    with replacing(target) as beside:
+        file_of(beside).write_text("old")
+    with pytest.raises(OSError, match="No space.*a.json"), replacing(target) as beside:
+        file_of(beside).write_text("half")
+        assert file_of(target).read_text() == "old"
         raise OSError(errno.ENOSPC, "No space left on device")
-    assert target.read_text() == "old"
+    assert file_of(target).read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
 
 

@@ -35,6 +35,19 @@ VEHICLE = with_linear_motors(PLAIN)
 HZ, POLICY_HZ = 100.0, 30.0
 NOISE = {"pos": 0.002, "vel": 0.02, "rate": 0.03, "quat": 0.001, "acc": 0.3, "motor": 3.0}
 
+OPEN = {
+    "gyro 20 % too large", "accelerometer's sign", "accelerometer forward-right-down",
+    "accelerometer's bias with throttle", "pose late by 60 ms", "pose's clock off by 0.5 %",
+    "12 poles declared of 14", "motor 3 never turns", "spin of all motors",
+    "thrust command in newtons", "linear stick map against a rates curve",
+    "commands act 150 ms later", "loop at two thirds of its rate (40 of 60 Hz)",
+    "throttle is a share of the motors' speed", "motor map of another curve",
+    "motor map of twice the thrust", "battery compensated twice", "mass on five links",
+    "arms in mm", "speed_max in rpm", "inertia x 1000", "barometer falls on spin-up",
+    "field of view", "thrust -10 %",
+}  # fmt: skip
+"""Kinds that are reported and left to the reader; all others are corrected."""
+
 
 def good(seed=0, end=16.0):
     """A flight as a logger has it: noise, commands that hold, and a body that follows in 50 ms."""
@@ -83,14 +96,13 @@ def test_a_fault_is_named_and_its_fix_restores_the_flight(name):
     findings, readings = checked(wrong, vehicle, kind.fov)
     assert named(findings) & set(kind.names)
     corrected = [f for f in findings if f.fault in kind.names and f.status == "corrected"]
-    if corrected and kind.change is None and "battery" not in name:
+    assert bool(corrected) == (name not in OPEN)
+    if corrected:
         fixed = read_rows(wrong, readings)
-        for signal in {text.partition("=")[0] for text in kind.readings}:
-            if signal == "quat":
-                alike = np.abs(np.sum(fixed[signal] * right[signal], axis=1))
-                np.testing.assert_allclose(alike, 1.0, atol=1e-9)
-            else:
-                np.testing.assert_allclose(fixed[signal], right[signal], rtol=1e-6, atol=1e-9)
+        fixed["quat"] *= np.sign(np.sum(fixed["quat"] * right["quat"], axis=1, keepdims=True))
+        assert right.keys() - fixed.keys() == ({"voltage"} if name == "battery of 0.1 V" else set())
+        for signal in fixed:
+            np.testing.assert_allclose(fixed[signal], right[signal], rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["motors 3 and 4 swapped", "accelerometer's bias with throttle"])

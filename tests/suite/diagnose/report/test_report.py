@@ -56,6 +56,9 @@ def test_the_json_has_what_was_found(drag, found):
     assert effect["name"] == "linear_drag" and effect["gap_removed"] > 0.9
     value = np.array(effect["parameters"]["coefficient"]["value"])
     np.testing.assert_allclose(value, drag.main.theta[drag.main.search.indices])
+    low, high = np.array(effect["parameters"]["coefficient"]["ci95"]).T
+    assert np.all(np.abs([0.15, 0.15, 0.05] - (low + high) / 2) < high - low)
+    assert found["control"]["after"] > 1.5 * found["gap"]["after"]
     assert found["gap"]["channels"]["1 s"]["velocity"]["noise_floor"] > 0.0
 
 

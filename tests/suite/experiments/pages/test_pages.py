@@ -1,13 +1,18 @@
-"""Pages from numbers made by hand; figures in README and docs are those of the JSON files."""
+"""Pages from numbers made by hand; main tables of README and docs/results.md are those of pages.
+
+The tables of table2, ablation and schemes are compared with JSON files, and the counts of blind
+cases with the sums of their sets.
+"""
 
 import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from eval.judging.statistics import Interval
+from eval.judging.statistics import Interval, wilson
 from suite.common.console import Console
 from suite.common.report import Picture
 from suite.experiments.pages.document import BEGIN, END, PageContents, check_page, write_document
@@ -165,3 +170,27 @@ def test_a_page_is_of_its_numbers(page):
     if page == "table2":
         wanted = set(intervals(NUMBERS[page]))
         assert wanted and not [one for one in wanted if one not in text]
+
+
+def test_the_counts_of_blind_cases_are_the_sums_of_their_sets():
+    text = (RESULTS / "blind.md").read_text("utf-8")
+    lines = [line.strip("|").split("|") for line in text.splitlines() if line.startswith("| ")]
+    rows = [[cell.strip() for cell in line] for line in lines]
+    sets = [row for row in rows if len(row) == 9 and " of " in row[3]]
+    totals = [row[1:5] for row in rows if len(row) == 6 and " of " in row[1]]
+    assert len(sets) == 11 and len(totals) == 6
+    for column, cells in enumerate(totals, 3):
+        pairs = {name: np.zeros(2, int) for name in ("continuous", "MuJoCo", "RotorPy")}
+        for row in sets:
+            pairs[row[0]] += [int(number) for number in (row[column] or "0 of 0").split(" of ")]
+        sums = [f"{a} of {b}" if b else "" for a, b in pairs.values()]
+        count, trials = (int(number) for number in sum(pairs.values()))
+        interval = wilson(count, trials)
+        ends = f"{percent(interval.low)}-{percent(interval.high)} %"
+        assert cells == [*sums, f"{count} of {trials} ({ends})"]
+    false, no_gap, single, *_ = totals
+    assert f"| {single[3].split(' (')[0]}; {false[3].split(' (')[0]}, in three" in readme("blind")
+    results = (ROOT / "docs" / "results.md").read_text("utf-8")
+    for cells in totals:
+        row = " | ".join(cell or "not tested" for cell in cells[:3])
+        assert (f"| {row} |" in results) == (cells != no_gap), row

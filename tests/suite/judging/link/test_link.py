@@ -278,6 +278,17 @@ def test_an_operator_who_ends_a_flight_is_told_to_the_vehicle_and_its_log_stays(
         assert "holds earlier flights" in refused(capsys, command)
 
 
+def test_each_limit_has_an_option(capsys, tmp_path, monkeypatch):
+    limits = Limits(
+        silence_s=0.2, image_age_s=0.3, tilt_deg=40.0, margin_m=5.0, floor_m=-2.0,
+        deadline_s=0.03, late_most=7, clock_jump_s=0.4, jump_m=0.6,
+    )  # fmt: skip
+    assert not set(vars(limits).items()) & set(vars(Limits()).items())
+    words = [f"--{name.replace('_', '-')}={value}" for name, value in vars(limits).items()]
+    monkeypatch.setattr(fly, "fly_over_link", lambda *given: {"limits": given[3]})
+    assert answer(capsys, "fly --out", tmp_path, *words)["limits"] == vars(limits)
+
+
 def printed(capsys):
     return " ".join(capsys.readouterr().err.split())
 
@@ -330,7 +341,10 @@ def test_two_tracks_of_one_name_are_refused(root, tmp_path, capsys):
 def test_a_flight_in_real_time_over_the_loopback(tmp_path, capsys):
     """Whether it finishes is the machine's affair: a busy one is handed over from."""
     assert server.WAIT_S > 1
-    (flight,) = answer(capsys, "fly --trials 1 --out", tmp_path)["flights"]
+    found = answer(capsys, "fly --trials 1 --out", tmp_path)
+    (flight,) = found["flights"]
+    assert found["set_points"] > found["decisions"] > 0 and found["judge_successes"] == 1
+    assert found["successes"] == flight["success"]
     assert flight["success"] or flight["handed_over"] or flight["vehicle_slips"]
 
 

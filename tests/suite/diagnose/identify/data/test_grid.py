@@ -1,10 +1,12 @@
 """Windows are exact on lines and parabolas; commands hold, holes stay holes."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
-from eval.logs.flight_log import FlightLog
 from suite.diagnose.identify.grid import ROTOR_NOISE, STEP_S, FlightGrid, grid_of
+from tests.support.log_tables import level
 
 
 def grid(values):
@@ -31,17 +33,14 @@ COUNT = 400
 SECONDS = 0.01 * np.arange(COUNT)
 
 
-def logged(**signals):
-    still, up = np.zeros((COUNT, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (COUNT, 1))
-    whole = {"time_s": SECONDS, "pos_w": still, "quat_wxyz": up, "vel_w": still, "rate_b": still}
-    return FlightLog("made", **{**whole, **signals})
+logged = partial(level, SECONDS)
 
 
 def test_a_command_counts_from_its_stamp_and_measurements_are_joined():
     rng = np.random.default_rng(0)
     time_s = np.concatenate([[0.0], np.cumsum(rng.uniform(0.004, 0.012, COUNT - 1))])
     pwm, rate_b = rng.standard_normal((COUNT, 4)), rng.standard_normal((COUNT, 3))
-    flight = grid_of(logged(time_s=time_s, pwm=pwm, rate_b=rate_b))
+    flight = grid_of(level(time_s, pwm=pwm, rate_b=rate_b))
     assert not flight.has("voltage")
     for k in (0, 17, 100, 250):
         fine_s = STEP_S * (k + (np.arange(4000) + 0.5) / 4000)
@@ -84,6 +83,6 @@ def test_a_signal_of_one_row_is_none(name, width):
     values = np.full((COUNT, *width), np.nan)
     values[0] = 0.5
     # Rates that are not logged are computed from the attitude.
-    level = np.full((COUNT, 4), np.nan)
-    flight = grid_of(logged(**{"quat_wxyz": level, name: values}))
+    flat = np.full((COUNT, 4), np.nan)
+    flight = grid_of(logged(**{"quat_wxyz": flat, name: values}))
     assert not flight.has({"quat_wxyz": "rot_w"}.get(name, name))

@@ -6,22 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import MotorMap
 from suite.diagnose.data.flights import acting_rotors, completed, ready
 from suite.diagnose.data.hold_out import parted
 from suite.diagnose.data.view import FORCE, TORQUE, rows_of, weak_form
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.broken_logs import on_the_ground, rows
+from tests.support.log_tables import level
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import with_effects
-
-
-def level(time_s, vel_w, **columns):
-    count = len(time_s)
-    quat = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
-    still = np.zeros((count, 3))
-    return FlightLog("level", time_s, still, quat, vel_w, still, **columns)
 
 
 def hover_speed(vehicle=VEHICLE, share=1.0):
@@ -58,14 +51,14 @@ def test_motor_commands_give_the_speeds_of_the_vehicles_map_with_its_delay_and_l
     time_s = np.arange(0.0, 2.0, 0.01)
     pwm, volt = np.full((200, 4), 0.6), np.full(200, 3.5)
     vehicle = replace(VEHICLE, motors=MotorMap((0.0, 8.0), 3.7, 1.0))
-    rotors = acting_rotors(level(time_s, np.zeros((200, 3)), pwm=pwm, voltage=volt), vehicle)
+    rotors = acting_rotors(level(time_s, pwm=pwm, voltage=volt), vehicle)
     thrust = 8.0 * (0.6 * 3.5 / 3.7) ** 2
     assert rotors is not None and rotors.each
     assert np.allclose(rotors.speed**2 * vehicle.rotors.thrust_coefficient, thrust)
     with pytest.raises(ValueError, match=r"\[motors\]"):
-        ready([level(time_s, np.zeros((200, 3)), pwm=pwm)], VEHICLE)
+        ready([level(time_s, pwm=pwm)], VEHICLE)
     step = np.where(time_s[:, None] < 1.0, 0.3, 0.6) * np.ones(4)
-    log = level(time_s, np.zeros((200, 3)), pwm=step)
+    log = level(time_s, pwm=step)
     vehicle = replace(VEHICLE, motors=MotorMap((0.0, 8.0), 3.7, 0.0))
     slow = with_effects(vehicle, motor_lag=(0.1,), command_delay=(0.05,))
     lagged = acting_rotors(log, slow)
@@ -77,7 +70,7 @@ def test_motor_commands_give_the_speeds_of_the_vehicles_map_with_its_delay_and_l
 
 def test_a_collective_thrust_gives_the_force_view_only():
     time_s = np.arange(0.0, 2.0, 0.01)
-    log = level(time_s, np.zeros((200, 3)), thrust_cmd=np.full(200, 9.81),
+    log = level(time_s, thrust_cmd=np.full(200, 9.81),
                 rate_cmd_b=np.zeros((200, 3)))  # fmt: skip
     rotors = acting_rotors(log, VEHICLE)
     assert rotors is not None and not rotors.each and np.allclose(rotors.speed, hover_speed())
@@ -88,7 +81,7 @@ def test_rows_on_the_ground_are_not_used():
     time_s = np.arange(0.0, 10.0, 0.01)
     on = (time_s < 4.0) | (time_s > 6.0)
     speed = np.where(on, hover_speed(), 0.0)[:, None] * np.ones(4)
-    good = np.asarray(rows_of(level(time_s, np.zeros((1000, 3))), VEHICLE, speed).good)
+    good = np.asarray(rows_of(level(time_s), VEHICLE, speed).good)
     margin = THRESHOLDS.ground_margin_s
     assert good[time_s < 4.0 - margin - 0.02].all()
     assert not good[(time_s > 4.0 - margin + 0.02) & (time_s < 6.0 + margin - 0.02)].any()
@@ -135,7 +128,7 @@ def test_where_the_speed_is_unknown_a_short_cut_of_the_throttle_is_no_rest_on_th
     time_s = np.arange(0.0, 10.0, 0.01)
     speed = np.full((1000, 4), hover_speed())
     speed[(time_s < 2.0) | ((time_s > 5.0) & (time_s < 5.3))] = 0.0
-    log = level(time_s, np.zeros((1000, 3)), rotor_speed=speed, about={"partial": ["pos", "vel"]})
+    log = level(time_s, rotor_speed=speed, about={"partial": ["pos", "vel"]})
     flown = rows_of(log, VEHICLE, speed).good
     assert not flown[time_s < 2.9].any() and flown[time_s > 3.1].all()
     turning = replace(log, rate_b=np.full((1000, 3), 0.5))
@@ -205,7 +198,7 @@ def test_a_model_is_believed_as_far_as_its_rotors_are_measured():
     time_s = np.arange(0.0, 20.0, 0.01)
     swing = np.sin(2.0 * np.pi * 1.5 * time_s)
     true = 900.0 + 4.0 * swing[:, None] * [1.0, 1.0, -1.0, -1.0]
-    log = level(time_s, np.zeros((len(time_s), 3)))
+    log = level(time_s)
     for sigma, least, most in ((0.0, 0.99, 1.01), (6.0, 0.6, 0.95)):
         speed = true + sigma * rng.standard_normal(true.shape)
         (flight,) = ready([replace(log, rotor_speed=speed)], VEHICLE).smoothed["torque"]
