@@ -84,10 +84,7 @@ def remove_plan(folder: Path) -> None:
 def write_plan(folder: Path, ways: Sequence[Trajectory], words: Sequence[str]) -> dict[str, Any]:
     """Write plan.json and the set points of each flight into `folder`; without flights, nothing.
 
-    Args:
-        folder: folder for the files. An earlier plan in it is removed.
-        ways: one trajectory for each flight.
-        words: advice for people, which the plan contains.
+    An earlier plan in it is removed. `words` are advice for people, which the plan contains.
 
     Returns:
         The content of plan.json.

@@ -192,13 +192,8 @@ def rollout_evidence(
 ) -> tuple[RolloutEvidence, Block]:
     """Return the evidence of `windows`, and its block where it was linearised.
 
-    Args:
-        model: the model that simulates the windows.
-        windows: W windows.
-        linear: their residuals, with slopes along parameters and then along the start numbers.
-        limits: thresholds of all steps.
-        noise: noise of the channels; by default it is estimated from `linear`.
-        along: parameters of the first slopes; all parameters if not given.
+    The slopes of `linear` are along the parameters `along` (default: all), then along the start
+    numbers. If no `noise` is given, it is estimated from `linear`.
     """
     near = trusted(windows, linear.residual, limits)
     noise = noise or measured_noise(linear.residual, linear.start_slope, near, limits)

@@ -104,8 +104,10 @@ class ViewEvidence(Evidence):
             """Return the means (M, ...) of `series` (N, ...) by the bumps of the flight."""
             return (mean @ series.reshape(len(series), -1)).reshape(count, *series.shape[1:])
 
+        # The model has six accelerations: three linear ones, then three angular ones.
+        columns = slice(0, 3) if view.in_world else slice(3, 6)
         value, slope = (
-            _attenuated(means(part[:, view.columns]), flight.reliability) for part in (value, slope)
+            _attenuated(means(part[:, columns]), flight.reliability) for part in (value, slope)
         )
         residual, pose_slope = flight.measured - value, np.zeros((count, 3, 0))
         if view.in_world:

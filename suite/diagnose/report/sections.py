@@ -271,8 +271,8 @@ def evidence_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section
 AGREEMENT = (
     "The fall of the squared error of each flight (of a single flight: of each third) with "
     "parameters that were fitted to the others, in units of independent noise. If force and torque "
-    "are compared, or if no effect explains the whole error, an effect is named only if all flights "
-    "but one agree."
+    "are compared, or if no effect explains the whole error, an effect is named only if all "
+    "flights but one agree."
 )
 """Explanation of the table of flights."""
 

@@ -291,9 +291,7 @@ def within_flights(data: ViewData) -> ViewData:
 def equations_by_flight(inside: ViewData, scatter: np.ndarray) -> NormalEquations:
     """Return the normal equations of each flight alone, along all parameters.
 
-    Args:
-        inside: residuals without the flights' means, from `within_flights`.
-        scatter: (3,) noise along each axis.
+    `inside` is from `within_flights`; `scatter` (3,) is the noise along each axis.
     """
     numbers, place = np.unique(inside.flight, return_inverse=True)
     residual, slope = inside.residual / scatter, inside.slope / scatter[:, None]
@@ -313,13 +311,8 @@ def search_motion_change(
     """Return the candidate that has changed since `reference`; None where none is significant.
 
     The parameters of the result are total values, not changes. Both sets of flights need at least
-    two flights; otherwise the result is None.
-
-    Args:
-        reference: evidence of the flights before a change.
-        task: evidence of the flights after it.
-        among: the candidates.
-        views: number of views that are searched, for Bonferroni's correction.
+    two flights; otherwise the result is None. Bonferroni's correction counts the number of searched
+    `views`.
     """
     start, limits, space = fit_balance(reference), task.limits, task.space
     sets = [within_flights(one.residuals(start, None)) for one in (reference, task)]
