@@ -221,11 +221,9 @@ def _align_pose(
 def align(quat: Signal, rate: Signal, name: str, mirrored: bool = False) -> Alignment:
     """Return the alignment of the attitude `quat` with the gyro `rate`.
 
-    Args:
-        quat: quaternions wxyz, body to world, on the pose's clock.
-        rate: body rates of the gyro [rad/s], on the log's clock.
-        name: name of the pose's file, for messages.
-        mirrored: fit a reflection instead of a rotation (one axis of the gyro is inverted).
+    Quaternions are wxyz, body to world, on the pose's clock; rates are in rad/s on the log's clock.
+    With `mirrored`, a reflection is fitted instead of a rotation (one axis of the gyro is
+    inverted).
 
     Raises:
         FlightLogError: where either signal is too short or has too few samples.

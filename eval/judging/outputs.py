@@ -81,12 +81,7 @@ class Outputs:
 
 
 def action_report(results: Sequence[TrialResult], action: ActionSpec) -> dict[str, Any]:
-    """Return the shares of limited and invalid actions of one policy, and warnings.
-
-    Args:
-        results: the policy's trials.
-        action: its kind of action and scaling.
-    """
+    """Return the shares of limited and invalid actions of one policy, and warnings."""
     decisions = sum(row.decisions for row in results)
     if not decisions:
         return {"decisions": 0, "limited": None, "bad": None, "warnings": []}

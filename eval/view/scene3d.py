@@ -93,11 +93,8 @@ def look_at(
 ) -> Viewpoint:
     """Return a camera without roll that looks from one point to another.
 
-    Args:
-        eye_w: (3,) position of the camera [m].
-        target_w: (3,) point in the middle of the picture [m].
-        fov_deg: horizontal field of view [deg].
-        size: width and height [pixels].
+    `eye_w` (3,) is the position, `target_w` (3,) the point in the middle of the picture [m]. The
+    horizontal field of view is in degrees; `size` is width and height [pixels].
     """
     forward = (target_w - eye_w) / np.linalg.norm(target_w - eye_w)
     right = np.cross(forward, [0.0, 0.0, 1.0])

@@ -152,9 +152,7 @@ def first_paragraph(text: str | None) -> str:
 def description(name: str, about: str) -> str:
     """Return the beginning of a command's help: its purpose, its examples, then further notes.
 
-    Args:
-        name: name of the command.
-        about: docstring of its options; the first paragraph is the purpose, the others are notes.
+    The first paragraph of `about` is the purpose, the others are notes.
     """
     purpose, *paragraphs = [" ".join(part.split()) for part in about.split("\n\n")]
     # A line that begins with a space keeps its break; others are joined, and not wrapped.

@@ -128,11 +128,8 @@ class TrialSet(NamedTuple):
 def read_trial_set(options: Evaluation | Collection, real_time: bool = False) -> TrialSet:
     """Return the trials that a command's options describe.
 
-    A track from a file is flown only once if all its flights would be equal.
-
-    Args:
-        options: the options of the command.
-        real_time: whether flights are in real time. Then no two flights are equal.
+    A track from a file is flown only once if all its flights would be equal. In real time no two
+    flights are equal.
 
     Raises:
         ValueError: for an unknown simulator or track, too few trials, or an invalid file.

@@ -108,13 +108,9 @@ def run_checks(
 ) -> tuple[list[Finding], Readings, dict[str, np.ndarray]]:
     """Return the findings, the readings that correct certain faults, and the corrected rows.
 
-    Args:
-        rows: name of a signal -> samples (T, C), and `time` -> (T,); NaN where unknown.
-        checks: checks in their order; each gets the rows after the corrections of earlier checks.
-        against: the references.
-        fix: report corrections as made; otherwise as doubts. Later checks get corrected rows in
-            both cases.
-        before: findings of earlier checks on the same rows.
+    Rows are samples (T, C) by name, NaN where unknown, and `time` (T,). Each check gets the rows
+    after the corrections of earlier ones; with `fix` these are reported as made, otherwise as
+    doubts. `before` are findings of earlier checks on the same rows.
     """
     findings, readings, rows = [], (), dict(rows)
     if len(rows["time"]) < LEAST_ROWS:
@@ -205,10 +201,7 @@ def check_before_diagnosis(
 ) -> list[dict[str, Any]]:
     """Return the findings of logs and files as records, before a diagnosis or identification.
 
-    Args:
-        logs: flights.
-        against: the references.
-        accept: names of known faults to ignore.
+    Known faults that are named in `accept` are ignored.
 
     Raises:
         ValueError: for a fault that a diagnosis would attribute to a wrong effect, or two copies of

@@ -244,12 +244,8 @@ def check_accelerometer(rows: Rows, body_is_frd: bool = False) -> list[Finding]:
     """Return the findings on the accelerometer, by the path's acceleration.
 
     Without a path only its unit and direction are checked: in flight it measures about one g,
-    upwards.
-
-    Args:
-        rows: see `check.run_checks`.
-        body_is_frd: the attitude or the gyro was found in forward-right-down axes, so these axes
-            are the first choice. A flight with little drag does not show the sign along x.
+    upwards. If attitude or gyro were found in forward-right-down axes (`body_is_frd`), these are
+    the first choice: a flight with little drag does not show the sign along x.
     """
     if "acc" in rows and not {"pos", "quat"} <= rows.keys():
         return _unit_alone(rows)

@@ -76,13 +76,7 @@ def fly_conditions(
 ) -> tuple[list[ConditionResult], SweepResults]:
     """Return the results of every policy under the single conditions, and those under the sweeps.
 
-    Args:
-        singles: conditions that belong to no sweep.
-        by_sweep: conditions of each sweep.
-        policies: label -> name or path of a policy.
-        trials: trials; each policy flies all of them under every condition.
-        workspace: cache of flights, and workers.
-        console: shows progress.
+    `policies` maps labels to names or paths. Each policy flies all trials under every condition.
     """
     conditions = [*singles, *(point for points in by_sweep.values() for point in points)]
     requests = {

@@ -67,13 +67,8 @@ class Companion:
     ) -> None:
         """Prepare a flight, which begins with the first state and image.
 
-        Args:
-            policy: the policy.
-            track: gates and start, in the frame of the vehicle's states.
-            vehicle: the vehicle, for its mass, thrust and attitude gains.
-            wire: converts messages to datagrams and back.
-            clock: returns monotonic time [s].
-            limits: limits of the watchdog; None: the defaults.
+        The track is in the frame of the vehicle's states. `clock` returns monotonic time [s]. The
+        vehicle gives mass, thrust and attitude gains.
 
         Raises:
             PolicyError: for a policy that commands motors.
