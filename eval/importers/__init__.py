@@ -30,9 +30,7 @@ class ImportedLog(NamedTuple):
 
 
 def import_log(
-    path: str | os.PathLike[str],
-    format: str | None = None,
-    options: ImportOptions | None = None,
+    path: str | os.PathLike[str], format: str | None = None, options: ImportOptions | None = None
 ) -> ImportedLog:
     """Read a log of another program, check it and convert it to a flight log.
 

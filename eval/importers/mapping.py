@@ -13,14 +13,7 @@ from typing import Any
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.frames import (
-    attitude,
-    body_vector,
-    conjugate,
-    from_euler,
-    rotate,
-    world_vector,
-)
+from eval.importers.frames import attitude, body_vector, conjugate, from_euler, rotate, world_vector
 from eval.importers.mapping_file import MIXERS, Column, LogMap
 from eval.importers.options import ImportOptions
 from eval.importers.rows import continuous, in_world, measured

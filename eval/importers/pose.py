@@ -41,11 +41,7 @@ CORRELATION_MIN = 0.6
 """Correlation of the rates below which the clocks count as not aligned."""
 SURE = 0.9
 """Correlation above which no other convention of the quaternion is tried."""
-READINGS = {
-    "xyzw": "xyzw",
-    "inverse": "world to body",
-    "xyzw+inverse": "xyzw and world to body",
-}
+READINGS = {"xyzw": "xyzw", "inverse": "world to body", "xyzw+inverse": "xyzw and world to body"}
 """Possible other conventions of a file's quaternions: steps of `read_as` -> description."""
 SIGNS = ("-roll", "-pitch", "-yaw")
 """Conventions with one wrong sign. They and a mirrored gyro serve to align the clocks only; later

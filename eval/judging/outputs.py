@@ -73,11 +73,7 @@ class Outputs:
         """Return the fields of `TrialResult` for the outputs in `slot`."""
         count = int(self._count[slot])
         up = float(self._up[slot]) / count if count and self._is_acceleration else 0.0
-        return {
-            "decisions": count,
-            "output_max": float(self._largest[slot]),
-            "action_up": up,
-        }
+        return {"decisions": count, "output_max": float(self._largest[slot]), "action_up": up}
 
 
 def action_report(results: Sequence[TrialResult], action: ActionSpec) -> dict[str, Any]:

@@ -152,10 +152,7 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]
             path,
             # One thread: only then does pyarrow report the numbers of bad rows.
             read_options=pyarrow.csv.ReadOptions(
-                column_names=names,
-                skip_rows=before + 1,
-                use_threads=False,
-                block_size=LONGEST_CELL,
+                column_names=names, skip_rows=before + 1, use_threads=False, block_size=LONGEST_CELL
             ),
             parse_options=pyarrow.csv.ParseOptions(invalid_row_handler=remember),
             convert_options=pyarrow.csv.ConvertOptions(

@@ -201,12 +201,7 @@ def _draw_path(
 
 
 def _draw_gate_number(
-    axes: Axes,
-    number: int,
-    center: np.ndarray,
-    direction: np.ndarray,
-    colour: str,
-    small: bool,
+    axes: Axes, number: int, center: np.ndarray, direction: np.ndarray, colour: str, small: bool
 ) -> None:
     """Draw a gate's number, from 0 as in `TrialResult.collided_with`, and its flight direction.
 

@@ -105,9 +105,7 @@ class SceneSlots(ABC):
         self._xmat = self._batch.bind("xmat")
 
     def load(
-        self,
-        entries: list[tuple[int, Track, TrialSpec]],
-        vehicles: Sequence[Vehicle] | None = None,
+        self, entries: list[tuple[int, Track, TrialSpec]], vehicles: Sequence[Vehicle] | None = None
     ) -> None:
         """Start trials from (slot, track, trial).
 

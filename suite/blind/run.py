@@ -27,12 +27,7 @@ LONGEST_ERROR = 500
 """Largest number of characters of a stored reason."""
 
 
-def run_set(
-    out: Path,
-    diagnose: Diagnose,
-    console: Console,
-    workers: Workers | None = None,
-) -> int:
+def run_set(out: Path, diagnose: Diagnose, console: Console, workers: Workers | None = None) -> int:
     """Diagnose every case without a result, and return how many cases have a result then.
 
     The result of a case is the folder OUT/results/CASE with `diagnosis.json` and `seconds.json`. If

@@ -55,11 +55,7 @@ def trajectories_for(result: Mapping[str, Any]) -> tuple[list[Trajectory], list[
 
 SCHEMA = 1
 """Version of plan.json."""
-COLUMNS = (
-    "time",
-    *(f"{stem}_{axis}" for stem in ("pos", "vel", "acc") for axis in "xyz"),
-    "yaw",
-)
+COLUMNS = ("time", *(f"{stem}_{axis}" for stem in ("pos", "vel", "acc") for axis in "xyz"), "yaw")
 """Columns of a CSV: time [s]; position [m], velocity [m/s] and acceleration [m/s^2] in the world
 frame; yaw [rad]."""
 NAME = "plan.json"

@@ -132,14 +132,7 @@ def fly_again(
             flights[result.trial] = flight
 
     results = fly(
-        loaded,
-        trials,
-        vehicle,
-        evaluation.simulator,
-        options,
-        keep,
-        Record(depth=True),
-        tracks,
+        loaded, trials, vehicle, evaluation.simulator, options, keep, Record(depth=True), tracks
     )
     rollouts = [
         (track_of(tracks, trial), flights[trial], result)

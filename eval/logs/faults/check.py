@@ -164,7 +164,8 @@ def check_log(
     """
     checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
     findings, readings, _ = run_checks(rows_of(log), checks, against, fix)
-    measured = {"time": log.time_s, **_action_rows(log), **_measured(log)}
+    action = {} if log.action_b is None else {"action": log.action_b}
+    measured = {"time": log.time_s, **action, **_measured(log)}
     findings += check_controller_rate(measured, against.policy_hz, "the policy")
     again = {finding.fault for finding in findings if finding.fault}
     stored = [f for f in findings_of(log.about) if f.status in ("doubt", "corrected")]
@@ -303,8 +304,3 @@ def _measured(log: FlightLog) -> dict[str, np.ndarray]:
         for group, names in GROUPS.items()
         if group != "time" and all(name in columns for name in names)
     }
-
-
-def _action_rows(log: FlightLog) -> Mapping[str, np.ndarray]:
-    """Return the policy's action as a signal `action`, where the log has one."""
-    return {} if log.action_b is None else {"action": log.action_b}

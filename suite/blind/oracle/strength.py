@@ -23,13 +23,7 @@ from eval.flights.simulate import SENSORS, fly, log_of
 from eval.flights.trajectory import long_flights, ordinary_flights
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
-from suite.blind.oracle.information import (
-    THRESHOLD,
-    Column,
-    detectable,
-    gust_strength,
-    information,
-)
+from suite.blind.oracle.information import THRESHOLD, Column, detectable, gust_strength, information
 from suite.common.console import Console
 from tracks.common.files import write_json
 from tracks.common.provenance import stamp

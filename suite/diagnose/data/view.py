@@ -57,10 +57,7 @@ class FlightRows(NamedTuple):
 
 
 def rows_of(
-    log: FlightLog,
-    vehicle: Vehicle,
-    rotor_speed: np.ndarray,
-    limits: Thresholds = THRESHOLDS,
+    log: FlightLog, vehicle: Vehicle, rotor_speed: np.ndarray, limits: Thresholds = THRESHOLDS
 ) -> FlightRows:
     """Return the rows of `log` with rotor speeds `rotor_speed` (N, 4) [rad/s].
 

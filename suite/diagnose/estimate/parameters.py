@@ -220,10 +220,7 @@ def indices_of(chosen: Sequence[Candidate]) -> list[int]:
 
 
 def implausible(
-    space: ParameterSpace,
-    theta: np.ndarray,
-    candidate: Candidate,
-    limits: Thresholds = THRESHOLDS,
+    space: ParameterSpace, theta: np.ndarray, candidate: Candidate, limits: Thresholds = THRESHOLDS
 ) -> list[str]:
     """Return a phrase for each implausible number of `candidate`, with its value in `theta` (P,).
 

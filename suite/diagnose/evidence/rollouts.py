@@ -29,15 +29,7 @@ from suite.diagnose.data.whitening import (
     make_whitening,
     slow_energy,
 )
-from suite.diagnose.data.windows import (
-    KNOTS,
-    LENGTH_S,
-    SLICES,
-    STATE,
-    FlightWindows,
-    cut,
-    take,
-)
+from suite.diagnose.data.windows import KNOTS, LENGTH_S, SLICES, STATE, FlightWindows, cut, take
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.gauss_newton import fit, gauss_newton_step
 from suite.diagnose.estimate.parameters import (
@@ -316,11 +308,7 @@ def compiled(
     """
 
     def fly(
-        given: VehicleArrays,
-        theta: Any,
-        offset: Any,
-        windows: FlightWindows,
-        push: Any = None,
+        given: VehicleArrays, theta: Any, offset: Any, windows: FlightWindows, push: Any = None
     ) -> tuple[Any, Flown]:
         values = effects_at(layout, given.base, theta)
         plant = assemble(given.nominal, given.constants, values, LONGEST_S, 0.0, given.loop)

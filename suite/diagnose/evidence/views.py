@@ -15,12 +15,7 @@ from eval.effects import EFFECTS
 from suite.diagnose.data.view import SmoothedFlight, View
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.composites import carried
-from suite.diagnose.estimate.parameters import (
-    Candidate,
-    ParameterSpace,
-    at_bound,
-    usual_first,
-)
+from suite.diagnose.estimate.parameters import Candidate, ParameterSpace, at_bound, usual_first
 from suite.diagnose.estimate.permutation import folds_of
 from suite.diagnose.evidence.evidence import Evidence, flights_agree
 from suite.diagnose.evidence.moments import (

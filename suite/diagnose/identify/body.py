@@ -185,8 +185,6 @@ TO_RATE_S = TORQUE_WIDTH_S / (2.0 * np.pi)
 """Factor from an angular acceleration to the change of rate that is compared in a window. The mean
 over the window is removed: the slow part of the motors' torque only balances trim and blade
 flapping, and does not turn the body [s]."""
-NO_OFFSETS = np.array([False, False, False])
-"""Body axes along which each flight has a free constant: none."""
 NOISE_BIASED = ("inertia_x", "inertia_y", "yaw")
 """For each body axis, the number that noise of the rotor speeds biases."""
 FORCE_NUMBERS = ("thrust", "curve", "battery")
@@ -294,7 +292,7 @@ def _torque_windows(flight: FlightGrid, drive: str) -> Windows:
     """Return the windows of `flight` for changes of its rates, where all signals are present."""
     form = flight.form(TORQUE_WIDTH_S, ("rate_b", DRIVES[drive][-1]), slope=True)
     measured = np.asarray(TO_RATE_S * (form.change @ np.nan_to_num(flight.signals["rate_b"])))
-    return Windows(flight, form, measured, NO_OFFSETS)
+    return Windows(flight, form, measured, np.zeros(3, bool))  # without free constants
 
 
 def _turning(

@@ -136,10 +136,7 @@ def from_true_starts(
 
 
 def gap_of(
-    linear: Linearisation,
-    windows: FlightWindows,
-    noise: Noise,
-    limits: Thresholds = THRESHOLDS,
+    linear: Linearisation, windows: FlightWindows, noise: Noise, limits: Thresholds = THRESHOLDS
 ) -> Gap:
     """Return the gap of the residuals in `linear`, which has slopes along the start states only.
 

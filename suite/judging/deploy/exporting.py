@@ -41,12 +41,7 @@ def export(
         ValueError: if the policy is not the suite's, a format or type is unknown, or an export of
             another policy would be overwritten.
     """
-    from policies.formats.export import (
-        check_formats,
-        export_policy,
-        exported_checkpoint,
-        main_file,
-    )
+    from policies.formats.export import check_formats, export_policy, exported_checkpoint, main_file
     from policies.native import native_policy
 
     check_formats(formats, dtype)

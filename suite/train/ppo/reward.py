@@ -56,9 +56,7 @@ class RewardTerms(NamedTuple):
         return self.collision + self.avoid + self.smooth + self.passing + self.progress
 
 
-def make_reward(
-    config: TrainConfig,
-) -> Callable[..., tuple[RewardTerms, jax.Array, jax.Array]]:
+def make_reward(config: TrainConfig) -> Callable[..., tuple[RewardTerms, jax.Array, jax.Array]]:
     """Return reward(worlds, before, after, target) -> (terms, clearance, passed), (B,) each.
 
     The step is that from the state `before` to the state `after` of worlds that have passed

@@ -8,13 +8,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from eval.quadrotor.mixer import mix, mixer_matrix
-from eval.quadrotor.rotors import (
-    acceleration,
-    delay_weight,
-    delayed,
-    follow,
-    whole_steps,
-)
+from eval.quadrotor.rotors import acceleration, delay_weight, delayed, follow, whole_steps
 from tests.support.vehicles import PLAIN
 
 
