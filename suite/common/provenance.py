@@ -142,8 +142,8 @@ def write_run_record(
 ) -> None:
     """Write `run_record` to `folder`/run.json.
 
-    If an interrupted run in this folder is `resumed`, the git commits in its record are kept as
-    `earlier_commits`, since their code made a part of the run.
+    With `resumed`, an interrupted run in this folder continues. The git commits in its record are
+    kept as `earlier_commits`, since their code made a part of the run.
 
     Raises:
         ValueError: if the existing record cannot be read.

@@ -58,8 +58,8 @@ LACKING = (
 def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     """Make the source of rollouts; None if the logs lack a signal that a rollout needs.
 
-    Unless this source was chosen by name, it is also None if even all effects of the catalogue
-    together leave the rollouts far from the flights.
+    Unless it was chosen by name, it is also None if even all effects of the catalogue leave the
+    rollouts far from the flights.
 
     Raises:
         ValueError: if no flight can be used, or none with the chosen drive (model input).
