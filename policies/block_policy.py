@@ -87,10 +87,6 @@ def verify_rows(policy: BlockPolicy, where: str) -> BlockPolicy:
     to fill a block, and each among zeros. If a row's output changes by rounding, the returned
     policy runs one row at a time.
 
-    Args:
-        policy: the policy as it was loaded.
-        where: the policy's file, for messages.
-
     Raises:
         PolicyError: where the outputs have wrong shapes, the same inputs give different outputs, or
             an output depends on the other rows by more than rounding.

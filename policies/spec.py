@@ -139,11 +139,7 @@ class PolicySpec:
 
 
 def check_spec(spec: PolicySpec, where: str = "spec.") -> None:
-    """Refuse an impossible spec.
-
-    Args:
-        spec: the specification.
-        where: prefix of a key in messages.
+    """Refuse an impossible spec; `where` is the prefix of keys in messages.
 
     Raises:
         ValueError: naming the key, its value and what is allowed.

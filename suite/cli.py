@@ -28,14 +28,7 @@ from suite.common.startup import (
     open_streams,
     suppress_warnings,
 )
-from suite.common.usage import (
-    COMMANDS,
-    JOINED,
-    description,
-    overview,
-    renamed,
-    with_lists,
-)
+from suite.common.usage import COMMANDS, JOINED, description, overview, renamed, with_lists
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -175,11 +175,7 @@ def pulls(
 ) -> dict[str, tuple[float, float]]:
     """Return name -> (pull, relative half-width) of every estimated parameter.
 
-    Args:
-        fleet: the true vehicle.
-        recordings: flights of this vehicle.
-        case: a key of `CASES`.
-        rng: random generator of the noise of the logs.
+    The case is a key of `CASES`; `rng` draws the noise of the logs.
     """
     drive, removed = CASES[case]
     spoil = partial(with_slow_errors, slow=Slow(), rng=rng)
@@ -215,11 +211,7 @@ def fly_fleet(seed: int, number: int) -> tuple[Fleet, list[Recording]] | None:
 def measure(count: int, seed: int, cases: Sequence[str], out: str) -> dict[tuple[str, str], list]:
     """Return (case, name of a parameter) -> rows, each (vehicle, pull, relative half-width).
 
-    Args:
-        count: number of vehicles.
-        seed: seed of the vehicles and the noise.
-        cases: keys of `CASES`.
-        out: JSON file to which the rows are also written; "" for none.
+    `count` vehicles are drawn. The rows are also written to the JSON file `out`; "" for none.
     """
     rows: dict[tuple[str, str], list] = defaultdict(list)
     start_s, number, done = time.monotonic(), 0, 0

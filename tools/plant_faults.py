@@ -154,10 +154,7 @@ def copy_tree(tree: Path, place: Path) -> list[str]:
 def place_of(fault: Fault, names: list[str], copy: Path) -> Path:
     """Return the file that has the text of the fault.
 
-    Args:
-        fault: the fault.
-        names: paths of all files, relative to the checkout.
-        copy: folder with the copies of the files.
+    `names` are paths relative to the checkout, and `copy` is the folder with the copies.
 
     Raises:
         SystemExit: if the text does not occur exactly once.

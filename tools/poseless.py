@@ -103,13 +103,7 @@ def fly_logs(nominal: Vehicle, true: Vehicle, rng: np.random.Generator) -> list[
 
 
 def run(cases: int, seed: int, first: int) -> Iterator[tuple[str, Any, dict[str, Any]]]:
-    """Yield the hidden effect ("" for none), its values and the diagnosis, case by case.
-
-    Args:
-        cases: number of cases.
-        seed: seed of all draws.
-        first: number of the first case.
-    """
+    """Yield the hidden effect ("" for none), its values and the diagnosis, case by case."""
     nominal = load_vehicle(NOMINAL)
     for number in range(first, first + cases):
         rng = np.random.default_rng([seed, number])

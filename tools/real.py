@@ -52,13 +52,7 @@ def suite(*words: Any) -> dict[str, Any]:
 
 
 def import_flights(files: Iterable[Path], folder: Path, *options: Any) -> dict[str, Path]:
-    """Import logs into `folder`, and return name -> path of the flights.
-
-    Args:
-        files: logs of the authors.
-        folder: folder of the imported flights.
-        options: options of `suite import`.
-    """
+    """Import logs into `folder`, and return name -> path of the flights."""
     flights = {}
     for file in sorted(files):
         flights[file.stem] = folder / f"{file.stem}.parquet"

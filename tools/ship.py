@@ -32,10 +32,8 @@ SHELF = Path(__file__).resolve().parent.parent / "policies" / "shipped"
 def card(name: str, run: Path, judged: Path | None) -> str:
     """Return the card as Markdown.
 
-    Args:
-        name: name of the shipped policy.
-        run: folder of the training.
-        judged: folder of the evaluation; None: the card has no table of results.
+    It is of the training in `run`. Without `judged`, the folder of the evaluation, it has no table
+    of results.
     """
     training, rows = json.loads((run / "run.json").read_text(encoding="utf-8")), curve.read(run)
     seconds = sum(row["seconds"] for row in rows)

@@ -288,7 +288,5 @@ def _make(cls: type, config: dict[str, Any], arguments: dict[str, Any]) -> Any:
 # Gymnasium loads no plugins; by its convention, an import registers environments.
 if ID not in gymnasium.registry:
     gymnasium.register(
-        id=ID,
-        entry_point=f"{__name__}:RaceEnv",
-        vector_entry_point=f"{__name__}:RaceVectorEnv",
+        id=ID, entry_point=f"{__name__}:RaceEnv", vector_entry_point=f"{__name__}:RaceVectorEnv"
     )

@@ -186,10 +186,8 @@ class Race:
 def remaining_path(pos_w: np.ndarray, centres_w: np.ndarray, gates: int) -> float:
     """Return the length of the path to the next gate, and from there from gate to gate [m].
 
-    Args:
-        pos_w: (3,) the drone's position [m].
-        centres_w: (G, 3) centres of all gates [m].
-        gates: number of passed gates, that is, the number of the next gate.
+    `pos_w` (3,) is the drone's position, `centres_w` (G, 3) are the centres of all gates [m]. The
+    first `gates` are passed.
     """
     path = np.vstack([pos_w, centres_w[gates:]])
     return float(np.sqrt((np.diff(path, axis=0) ** 2).sum(-1)).sum())

@@ -221,10 +221,8 @@ class Races:
     ) -> None:
         """Begin an episode in each of `slots`.
 
-        Args:
-            slots: numbers of the slots.
-            rngs: a random generator for each slot, for the level, the track and the vehicle.
-            track_seed: seed of the track; None: that of the configuration, or a random one.
+        Each slot has a random generator for the level, the track and the vehicle. Without
+        `track_seed`, it is that of the configuration, or a random one.
 
         Raises:
             ValueError: for a `track_seed` that is not a whole number.
@@ -287,8 +285,7 @@ class Races:
     def step(self, output: np.ndarray) -> np.ndarray:
         """Fly one action in each slot for a period of the policy's rate; return rewards (N,).
 
-        Args:
-            output: (N, size) actions, with components from -1 to 1.
+        `output` (N, size) are actions with components from -1 to 1.
         """
         output = np.asarray(output, float)
         finite = np.isfinite(output).all(-1)

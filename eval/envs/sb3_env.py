@@ -46,12 +46,7 @@ class RaceVecEnv(VecEnv):
     """`RaceVectorEnv` by the conventions of Stable-Baselines3: N races in one process."""
 
     def __init__(self, num_envs: int, **settings: Any) -> None:
-        """Make the environments.
-
-        Args:
-            num_envs: number of environments.
-            settings: arguments of `RaceVectorEnv`.
-        """
+        """Make `num_envs` environments; `settings` are arguments of `RaceVectorEnv`."""
         self.races = RaceVectorEnv(num_envs, **settings)
         self._actions = np.zeros(self.races.action_space.shape or (), np.float32)
         self._space = vector_space(self.races.single_observation_space)

@@ -98,10 +98,7 @@ class Bodies(Protocol):
 def reference_of(trajectories: Sequence[Trajectory], period: int, dt: float) -> Reference:
     """Return the set points of N trajectories at every command, (commands, N, ...).
 
-    Args:
-        trajectories: the trajectories.
-        period: physics steps between commands.
-        dt: length of a physics step [s].
+    `period` is the number of physics steps between commands, `dt` the length of a step [s].
     """
     steps = round(max(path.duration_s for path in trajectories) / dt)
     time_s = np.arange(0, steps, period) * dt
@@ -176,11 +173,8 @@ def check_flights(
 ) -> None:
     """Check that N flights are upright, above the ground and near their trajectories.
 
-    Args:
-        motion: (N, ...) states.
-        wanted: (N, ...) set points.
-        time_s: (N,) current times [s].
-        flying: (N,) whether a flight has not ended; the others are not checked.
+    `motion` and `wanted` are (N, ...), the current times `time_s` (N,) [s]. Only flights that are
+    still `flying` (N,) are checked.
 
     Raises:
         FlightFailed: where a flight has tipped over, hit the ground or left its trajectory.
@@ -242,12 +236,8 @@ def steer(
 ) -> Command:
     """Return the command that follows `wanted`, computed for the nominal vehicle.
 
-    Args:
-        vehicle: the nominal vehicle, of which the attitude loop's gains and limits are used.
-        gains: gains of the position loop.
-        wanted: (N, ...) current set points.
-        motion: (N, ...) true states.
-        summed_w: (N, 3) integral of the position error over time [m s].
+    `wanted` and the true states `motion` are (N, ...). `summed_w` (N, 3) is the integral of the
+    position error over time [m s].
     """
     pos_error_w, vel_error_w = wanted.pos_w - motion.pos_w, wanted.vel_w - motion.vel_w
     acc_w = corrected(gains, wanted.acc_w, pos_error_w, vel_error_w, summed_w)

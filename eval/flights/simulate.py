@@ -208,12 +208,8 @@ def log_of(
 ) -> FlightLog:
     """Return the log of a flight, with the true vehicle's log faults, then noise and gaps.
 
-    Args:
-        recording: the flight at every physics step.
-        truth: the vehicle with the log faults (such as a gyro bias), applied at the physics rate.
-        sensors: the logged signals and their noise; its rate must be the recording's.
-        rng: random generator of noise and gaps; None: neither noise nor gaps.
-        name: name of the flight.
+    The faults (such as a gyro bias) apply at the physics rate of the recording. The rate of
+    `sensors` must be the recording's. Without `rng` the log has neither noise nor gaps.
     """
     motion = recording.motion
     true = {

@@ -30,16 +30,11 @@ class ImportedLog(NamedTuple):
 
 
 def import_log(
-    path: str | os.PathLike[str],
-    format: str | None = None,
-    options: ImportOptions | None = None,
+    path: str | os.PathLike[str], format: str | None = None, options: ImportOptions | None = None
 ) -> ImportedLog:
     """Read a log of another program, check it and convert it to a flight log.
 
-    Args:
-        path: the file.
-        format: a name of `eval.importers.formats.FORMATS`; None: detect it by the first bytes.
-        options: how to read the log; None: the defaults of `ImportOptions`.
+    Without a format (a name of `eval.importers.formats.FORMATS`), the first bytes determine it.
 
     Returns:
         The flight log and the findings of its checks.

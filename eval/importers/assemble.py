@@ -67,10 +67,7 @@ def assemble(
 ) -> tuple[FlightLog, tuple[Finding, ...]]:
     """Return `recording` as a flight log, and the findings of all checks.
 
-    Args:
-        recording: the signals of the file.
-        format: name of the file's format, for the log's metadata.
-        options: settings of the import.
+    The name of the file's `format` goes into the log's metadata.
 
     Raises:
         FlightLogError: where a required signal is missing or breaks a rule.
@@ -242,9 +239,7 @@ def _columns(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def usable_for(rows: dict[str, np.ndarray], missing: list[str]) -> Finding:
     """Return the finding that lists what a log without the groups `missing` identifies.
 
-    Args:
-        rows: the log's signals, as `rows_at` returns them.
-        missing: required groups that the log lacks, keys of `GROUP_TEXTS`.
+    `rows` are as `rows_at` returns them, and `missing` are keys of `GROUP_TEXTS`.
     """
     no_pose = "pos" in missing and "quat" in missing
     identifiable = [

@@ -34,10 +34,8 @@ def order_motors(
 ) -> list[Finding]:
     """Sort `motor`, `motor_cmd` and `pwm` of `rows` into the vehicle's order, in place.
 
-    Args:
-        rows: see `eval.importers.rows`.
-        motor_side: (x forward, y left) of the file's motors 1 to 4; None: already in order.
-        vehicle: the vehicle whose motor order is wanted; None: the order of the shipped vehicles.
+    For the `rows` see `eval.importers.rows`. `motor_side` has (x forward, y left) of the file's
+    motors 1 to 4; None: already in order. Without a vehicle, the order is that of the shipped ones.
     """
     if motor_side is None or not ({"motor", "motor_cmd", "pwm"} & rows.keys()):
         return []
@@ -64,11 +62,8 @@ def thrust_command(
 ) -> list[Finding]:
     """Replace `throttle` of `rows` by `cmd_thrust` [m/s^2] in place, where possible.
 
-    Args:
-        rows: see `eval.importers.rows`.
-        options: settings of the import, of which `vehicle` and `full_thrust` are used.
-        by_acc: fit the thrust to the accelerometer where neither is given; False where the
-            accelerometer is in doubt.
+    For the `rows` see `eval.importers.rows`. Without `vehicle` and `full_thrust` in `options`, the
+    thrust is fitted to the accelerometer, unless `by_acc` is false, since that is in doubt.
     """
     if "cmd_thrust" in rows or "throttle" not in rows:
         return []
@@ -147,11 +142,8 @@ def rates_wanted(rows: dict[str, np.ndarray], vehicle: Vehicle | None) -> list[F
     """Replace `cmd_quat` (commanded attitudes) of `rows` by `cmd_rate` [rad/s], in place.
 
     A rate command that `rows` have already is kept. The rate is the attitude gain times the
-    rotation vector from the attitude to the set point, clipped to the vehicle's `rate_max`.
-
-    Args:
-        rows: see `eval.importers.rows`.
-        vehicle: has the attitude loop's gains; None: the set points are dropped, with a doubt.
+    rotation vector from the attitude to the set point, clipped to the vehicle's `rate_max`. Without
+    a vehicle the set points are dropped, with a doubt. For the `rows` see `eval.importers.rows`.
     """
     if "cmd_quat" not in rows:
         return []

@@ -13,14 +13,7 @@ from typing import Any
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.frames import (
-    attitude,
-    body_vector,
-    conjugate,
-    from_euler,
-    rotate,
-    world_vector,
-)
+from eval.importers.frames import attitude, body_vector, conjugate, from_euler, rotate, world_vector
 from eval.importers.mapping_file import MIXERS, Column, LogMap
 from eval.importers.options import ImportOptions
 from eval.importers.rows import continuous, in_world, measured
@@ -43,12 +36,9 @@ def recording_of(
 ) -> Recording:
     """Return the signals of the file at `path` by `mapping`.
 
-    Args:
-        path: the file, for messages and to locate the text file of the mapping.
-        mapping: the columns of each signal.
-        find: returns the times and values of columns.
-        missing: returns the error text for a missing column.
-        options: settings of the import, of which `source`, `mass` and `vehicle` are used.
+    The path is for messages, and to locate the text file of the mapping. `find` returns the times
+    and values of columns, `missing` the error text for a missing one. Of the options, `source`,
+    `mass` and `vehicle` are used.
 
     Raises:
         FlightLogError: for a column that the mapping needs and the file lacks.

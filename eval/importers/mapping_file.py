@@ -59,11 +59,7 @@ WIDTHS = {name: len(GROUPS[name]) if name in GROUPS else 3 for name in UNITS} | 
     "cmd_quat": 4,
 }
 """Number of columns of each signal."""
-AXES = {
-    "vel": ("world", "body"),
-    "rate": ("body", "world"),
-    "acc": ("body", "world"),
-}
+AXES = {"vel": ("world", "body"), "rate": ("body", "world"), "acc": ("body", "world")}
 """Signals with a choice of axes; the flight log's axes come first."""
 MIXERS: dict[str, np.ndarray] = {
     "crazyflie": np.array(

@@ -41,11 +41,7 @@ CORRELATION_MIN = 0.6
 """Correlation of the rates below which the clocks count as not aligned."""
 SURE = 0.9
 """Correlation above which no other convention of the quaternion is tried."""
-READINGS = {
-    "xyzw": "xyzw",
-    "inverse": "world to body",
-    "xyzw+inverse": "xyzw and world to body",
-}
+READINGS = {"xyzw": "xyzw", "inverse": "world to body", "xyzw+inverse": "xyzw and world to body"}
 """Possible other conventions of a file's quaternions: steps of `read_as` -> description."""
 SIGNS = ("-roll", "-pitch", "-yaw")
 """Conventions with one wrong sign. They and a mirrored gyro serve to align the clocks only; later
@@ -221,11 +217,9 @@ def _align_pose(
 def align(quat: Signal, rate: Signal, name: str, mirrored: bool = False) -> Alignment:
     """Return the alignment of the attitude `quat` with the gyro `rate`.
 
-    Args:
-        quat: quaternions wxyz, body to world, on the pose's clock.
-        rate: body rates of the gyro [rad/s], on the log's clock.
-        name: name of the pose's file, for messages.
-        mirrored: fit a reflection instead of a rotation (one axis of the gyro is inverted).
+    Quaternions are wxyz, body to world, on the pose's clock; rates are in rad/s on the log's clock.
+    With `mirrored`, a reflection is fitted instead of a rotation (one axis of the gyro is
+    inverted).
 
     Raises:
         FlightLogError: where either signal is too short or has too few samples.

@@ -52,10 +52,7 @@ def rows_at(recording: Recording, time_s: np.ndarray) -> dict[str, np.ndarray]:
     """Return the rows: `time` (T,) from 0 [s] and every signal as (T, C), NaN where unknown.
 
     Signals slower than the rows are interpolated; `sampled_rows` returns which rows are samples.
-
-    Args:
-        recording: holds at least one of pos, quat and rate.
-        time_s: (T,) of the rows, on the recording's clock [s].
+    The recording holds at least one of pos, quat and rate; `time_s` (T,) is on its clock [s].
     """
     rows = {"time": time_s - time_s[0]}
     for name, samples in recording.signals.items():
@@ -149,13 +146,10 @@ def row_times(
 def sampled_rows(recording: Recording, time_s: np.ndarray) -> Mapping[str, np.ndarray]:
     """Return which rows (T,) bool hold a sample, for each signal that is slower than the rows.
 
-    A sample belongs to the row nearest to it. But if a row of the slowest signal is within half
-    the time between samples, the sample belongs to that row, so that some rows have all signals.
-    A velocity that is fast enough, but has gaps, is listed too.
-
-    Args:
-        recording: the signals on their own times.
-        time_s: (T,) of the rows, on the recording's clock [s].
+    A sample belongs to the row nearest to it. But if a row of the slowest signal is within half the
+    time between samples, the sample belongs to that row, so that some rows have all signals. A
+    velocity that is fast enough, but has gaps, is listed too. `time_s` (T,) is on the recording's
+    clock [s].
     """
     row_step, is_sample = median_step(time_s), {}
     slowest_rows = nearest(time_s, recording.signals[slowest(recording)].time_s)
@@ -187,11 +181,8 @@ def nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 def measured(samples: Signal, time_s: np.ndarray, smooth: bool) -> np.ndarray:
     """Return a measured signal at `time_s` (T,) as (T, C), NaN in gaps and beyond the ends.
 
-    Args:
-        samples: the signal on its own times.
-        time_s: (T,) on the same clock [s].
-        smooth: interpolate by a cubic spline; otherwise linearly, or averaged over a row's period
-            where the signal is faster than the rows.
+    `time_s` is on the signal's clock [s]. It is interpolated by a cubic spline (`smooth`) or
+    linearly; linearly it is averaged over a row's period where it is faster than the rows.
     """
     value = continuous(samples.value) if smooth and samples.value.shape[1] == 4 else samples.value
     step, row_step = median_step(samples.time_s), median_step(time_s)

@@ -63,11 +63,7 @@ def make_signal(
 ) -> tuple[Signal | None, Finding | None]:
     """Return the finite samples with increasing time (None without any), and a note on the others.
 
-    Args:
-        time_s: (N,) times of the samples [s], NaN where unknown.
-        value: samples (N,) or (N, C); samples with a NaN are left out.
-        file: name of the file, for messages.
-        name: the signal, for messages.
+    `time_s` (N,) is NaN where unknown [s]. Samples, (N,) or (N, C), with a NaN are left out.
 
     Raises:
         FlightLogError: where time decreases too often (two flights in one file, or a wrong
@@ -106,9 +102,7 @@ def collect(
 ) -> tuple[dict[str, Signal], tuple[Finding, ...]]:
     """Return the signals that have samples, and findings on samples that were left out.
 
-    Args:
-        parts: signal's name -> times (N,) [s] and values (N,) or (N, C).
-        file: name of the file, for messages.
+    `parts` maps the signal's name to times (N,) [s] and values (N,) or (N, C).
 
     Raises:
         FlightLogError: where a signal of `NEEDED` is unusable; another unusable signal is dropped.
@@ -139,9 +133,7 @@ def collect(
 def with_readings(recording: Recording, readings: Readings) -> Recording:
     """Return the recording with its signals converted, such as by a changed sign or order.
 
-    Args:
-        recording: the signals of a file.
-        readings: the conversions of each signal: see `eval.logs.faults.reading`.
+    For the `readings` see `eval.logs.faults.reading`.
 
     Raises:
         ValueError: for a conversion that needs an attitude, where the recording has none.

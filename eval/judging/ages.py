@@ -50,15 +50,10 @@ class Aged:
     def __init__(
         self, age_s: float, jitter: float, slots: int, period_steps: float, dt: float
     ) -> None:
-        """Make the storage of views with an age.
+        """Make the storage of views with the mean age `age_s` [s].
 
-        Args:
-            age_s: mean age [s].
-            jitter: ages are uniformly distributed between (1 - jitter) and (1 + jitter) times the
-                mean.
-            slots: number of slots.
-            period_steps: number of physics steps between decisions.
-            dt: length of a physics step [s].
+        Ages are uniformly distributed between (1 - jitter) and (1 + jitter) times the mean.
+        Decisions are `period_steps` physics steps apart, of `dt` each [s].
         """
         self._mean, self._jitter, self._period = age_s / dt, jitter, period_steps
         longest = self._mean * (1.0 + jitter)
@@ -73,12 +68,9 @@ class Aged:
         self._rngs[slot] = rng
 
     def see(self, now: View, fresh: np.ndarray, flying: np.ndarray) -> View:
-        """Return the delayed view at a decision.
+        """Return the delayed view at a decision; `now` is the view without delay.
 
-        Args:
-            now: the view without delay.
-            fresh: (N,) bool, slots whose trial begins; they get `now`.
-            flying: (N,) bool, slots in flight.
+        Slots whose trial begins (`fresh`, (N,) bool) get `now`; `flying` (N,) bool are in flight.
         """
         if not self.ahead:
             return now

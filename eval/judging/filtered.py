@@ -59,12 +59,9 @@ class Filtered:
     ) -> None:
         """Make the filters.
 
-        Args:
-            wanted: the sensors; one of them is the estimator.
-            slots: number of trials that fly at once.
-            dt: length of a physics step, and time between IMU measurements [s].
-            camera: the policy's camera; corners are detected with its pitch and field of view.
-            corners: largest number of gate corners of a track.
+        One of the sensors is the estimator. `dt` is the length of a physics step, and the time
+        between IMU measurements [s]. Corners are detected with the camera's pitch and field of
+        view; a track has at most `corners` of them.
 
         Raises:
             ValueError: if the sensors file also delays the state, or has more frames than physics
@@ -134,11 +131,8 @@ class Filtered:
     def see(self, view: View, truth: View, fresh: np.ndarray, flying: np.ndarray) -> View:
         """Return `view` with position, velocity and attitude replaced by the estimates.
 
-        Args:
-            view: (N, ...) the view after the other sensor models.
-            truth: (N, ...) the true view; its depth is not used.
-            fresh: (N,) bool, slots whose trial starts now.
-            flying: (N,) bool, slots in flight.
+        `view` (N, ...) is that after the other sensor models. The depth of `truth` is not used. In
+        `fresh` slots (N,) bool a trial starts now, those `flying` (N,) bool are in flight.
         """
         starting = fresh & flying
         if starting.any():
@@ -174,11 +168,9 @@ class Filtered:
         self._memory = memory if self._memory is None else select(starting, memory, self._memory)
 
     def follow(self, view: View, flew: np.ndarray) -> None:
-        """Advance the filters by one physics step.
+        """Advance the filters by one physics step, to the true `view` after it.
 
-        Args:
-            view: the true view after the step.
-            flew: (N,) bool, slots that made the step.
+        Only the slots that `flew` (N,) bool made the step.
         """
         assert self._truth is not None and self.filters is not None and self._memory is not None
         truth_before, dt = self._truth, np.full(len(flew), self._dt)

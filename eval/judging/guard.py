@@ -124,12 +124,8 @@ def guard_action(
 ) -> Guarded:
     """Check and limit the actions that a policy returned.
 
-    Args:
-        limits: limits of the actions.
-        action_b: the policy's output, which should be (N, size) real numbers.
-        last_b: (N, size) last flown actions in SI units; at the start, `first_action`.
-        took_s: computing time of the policy [s].
-        policy: name of the policy, for messages.
+    The policy's output should be (N, size) real numbers, computed in `took_s` [s]. `last_b` (N,
+    size) are the last flown actions in SI units; at the start, `first_action`.
 
     Raises:
         ValueError: where the shape or type of `action_b` is wrong.

@@ -17,7 +17,7 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from policies.policy import Hidden, Policy
 from policies.spec import PolicyError, PolicySpec
-from tracks.geometry.camera import Camera, pixel_rays_b
+from tracks.geometry.camera import pixel_rays_b
 from tracks.input.ranges import Range
 
 SAMPLES = 24
@@ -117,14 +117,10 @@ def seen_of(spec: PolicySpec, state: np.ndarray, image: np.ndarray) -> Seen:
     depth, camera = spec.depth, spec.camera
     depth_m = depth.scale / np.maximum(np.asarray(image, float) + depth.offset, 1e-3)
     depth_m = depth_m.reshape(len(depth_m), -1)
-    points_b = _rays(camera) * depth_m[..., None]
+    points_b = np.asarray(pixel_rays_b(camera), float).reshape(-1, 3) * depth_m[..., None]
     hit = depth_m < HIT_SHARE * camera.range_m
     vel_b, up_b, last_b = (np.asarray(state[:, k : k + 3], float) for k in (0, 3, 9))
     return Seen(vel_b, up_b, last_b, points_b, hit)
-
-
-def _rays(camera: Camera) -> np.ndarray:
-    return np.asarray(pixel_rays_b(camera), float).reshape(-1, 3)
 
 
 def limited(limits: MonitorLimits, action_b: np.ndarray, seen: Seen) -> np.ndarray:

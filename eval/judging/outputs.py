@@ -73,20 +73,11 @@ class Outputs:
         """Return the fields of `TrialResult` for the outputs in `slot`."""
         count = int(self._count[slot])
         up = float(self._up[slot]) / count if count and self._is_acceleration else 0.0
-        return {
-            "decisions": count,
-            "output_max": float(self._largest[slot]),
-            "action_up": up,
-        }
+        return {"decisions": count, "output_max": float(self._largest[slot]), "action_up": up}
 
 
 def action_report(results: Sequence[TrialResult], action: ActionSpec) -> dict[str, Any]:
-    """Return the shares of limited and invalid actions of one policy, and warnings.
-
-    Args:
-        results: the policy's trials.
-        action: its kind of action and scaling.
-    """
+    """Return the shares of limited and invalid actions of one policy, and warnings."""
     decisions = sum(row.decisions for row in results)
     if not decisions:
         return {"decisions": 0, "limited": None, "bad": None, "warnings": []}

@@ -66,8 +66,7 @@ def plans() -> dict[TrialSpec, Plan]:
 def over_plan(results: Sequence[TrialResult]) -> list[OverPlan]:
     """Return each policy's laps compared with the plans, for trials on planned tracks.
 
-    Args:
-        results: trials on tracks of the families, with the vehicle `VEHICLE`.
+    The tracks are of the families, and the vehicle is `VEHICLE`.
     """
     comparisons = []
     for policy in dict.fromkeys(row.policy for row in results):

@@ -40,12 +40,8 @@ class Recorder:
     ) -> None:
         """Make a recorder.
 
-        Args:
-            slots: number of trials that fly at once.
-            depth: whether depth images are recorded (3 kB each at 24 x 32 pixels).
-            first: (size,) action that is recorded before the first decision; None: an acceleration
-                of zero (3,).
-            action_kind: the policy's kind of action.
+        Depth images take 3 kB each at 24 x 32 pixels. The action `first` (size,) is recorded before
+        the first decision; None: an acceleration of zero (3,).
         """
         self._depth, self._action_kind = depth, action_kind
         self._rows: list[list[tuple[Any, ...]]] = [[] for _ in range(slots)]

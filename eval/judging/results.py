@@ -39,12 +39,8 @@ def write_results(
 ) -> None:
     """Write trials.parquet, table.md and summary.json into `folder`, each completely or not at all.
 
-    Args:
-        folder: the output folder, made if missing.
-        results: the trials, in the order of the rows.
-        table_markdown: from `eval.judging.tables.markdown_table`.
-        summary: contents of summary.json without the provenance, from `tables.summarise`.
-        seed: the seed of the first trial, or None.
+    The folder is made if missing. Text and summary are from `eval.judging.tables`, the summary
+    without the provenance. `seed` is that of the first trial, or None.
 
     Raises:
         OSError: where the folder cannot be written.
@@ -194,10 +190,8 @@ class Journal:
     def __init__(self, path: str | os.PathLike[str], about: dict[str, Any]) -> None:
         """Open the journal at `path`, made if missing.
 
-        Args:
-            path: the file.
-            about: all settings that determine outcomes, except the trial: policy with the hash of
-                its file, vehicle, simulator, options; as JSON values.
+        `about` has all settings that determine outcomes, except the trial, as JSON values: policy
+        with the hash of its file, vehicle, simulator, options.
 
         Raises:
             ValueError: where the existing file has other settings.

@@ -27,14 +27,7 @@ class Sensors:
     """The sensors of N slots, with the errors of the trial that flies in each slot."""
 
     def __init__(self, wanted: SensorSet, slots: int, rate_hz: float, camera: Camera) -> None:
-        """Make the sensors.
-
-        Args:
-            wanted: the sensor models.
-            slots: number of trials that fly at once.
-            rate_hz: rate of the observations [Hz].
-            camera: the policy's camera.
-        """
+        """Make the sensors of `slots` trials at once, observed at `rate_hz` [Hz]."""
         self._models = sensors.view_models(wanted.models)
         self._dt_s, self._camera = 1 / rate_hz, camera
         used = (SENSORS[name] for name in self._models)
@@ -52,10 +45,8 @@ class Sensors:
     def see(self, truth: View, fresh: np.ndarray, flying: np.ndarray) -> View:
         """Return the view with sensor errors; call it once for each observation.
 
-        Args:
-            truth: (N, ...) the true views, with the number of the next gate.
-            fresh: (N,) bool, slots whose trial begins.
-            flying: (N,) bool, slots in flight; other rows are returned unchanged.
+        The true views are (N, ...), with the number of the next gate. In `fresh` slots (N,) bool a
+        trial begins. Slots that are not `flying` (N,) bool are returned unchanged.
         """
         rows = np.flatnonzero(flying)
         for name, generators in self._generators.items():

@@ -45,10 +45,7 @@ class PairedDifference(NamedTuple):
 def wilson(successes: float, trials: int, confidence: float = CONFIDENCE) -> Interval:
     """Return the success rate with its score interval (Wilson 1927, no continuity correction).
 
-    Args:
-        successes: number of successes; a trial that was flown several times counts with its mean.
-        trials: number of trials.
-        confidence: confidence of the interval.
+    A trial that was flown several times counts with its mean.
 
     Raises:
         ValueError: unless 0 <= successes <= trials and trials >= 1.
@@ -140,9 +137,7 @@ def paired_bootstrap(
 def mcnemar_exact(only_first: int, only_second: int) -> float:
     """Return the two-sided exact p-value of McNemar's test.
 
-    Args:
-        only_first: pairs in which only the first succeeded.
-        only_second: pairs in which only the second succeeded.
+    In `only_first` pairs only the first succeeded, in `only_second` pairs only the second.
     """
     n, fewer = only_first + only_second, min(only_first, only_second)
     tail = sum(comb(n, k) for k in range(fewer + 1))
@@ -155,12 +150,8 @@ def paired_success(
     """Return the difference of two success rates on the same trials.
 
     The interval is that of Newcombe (1998, method 10): Wilson intervals combined by the
-    square-and-add rule, with the correlation phi of the pairs.
-
-    Args:
-        first: (n,) bool, successes in the order of the trials.
-        second: (n,) bool, successes in the same trials.
-        confidence: confidence of the interval.
+    square-and-add rule, with the correlation phi of the pairs. Both are (n,) bool, in the order of
+    the trials.
 
     Raises:
         ValueError: where there is no trial, or the lengths differ.

@@ -114,12 +114,9 @@ def check_columns(
 ) -> tuple[dict[str, np.ndarray], np.ndarray, list[str]]:
     """Check `columns` (column name to values, one a row) by the rules of a flight log.
 
-    Args:
-        columns: column name -> values, one a row.
-        name: the file, for messages.
-        partial: accept a log without position, attitude, rates or commands.
-        limits: refuse values that no flight has. Checks of a log read it without, to name the
-            fault.
+    The values are one a row; `name` is the file. A `partial` log may lack position, attitude, rates
+    or commands. With `limits`, values that no flight has are refused; checks of a log read it
+    without, to name the fault.
 
     Returns:
         The known columns as float64 without the rows that have no time, NaN where a value is

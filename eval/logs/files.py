@@ -132,15 +132,9 @@ def _wanted(path: Path, file: Any) -> tuple[list[str], list[str]]:
 
 
 def _is_text(kind: pa.DataType) -> bool:
-    return any(
-        test(kind)
-        for test in (
-            pa.types.is_string,
-            pa.types.is_large_string,
-            pa.types.is_binary,
-            pa.types.is_large_binary,
-        )
-    )
+    t = pa.types
+    is_string = t.is_string(kind) or t.is_large_string(kind)
+    return is_string or t.is_binary(kind) or t.is_large_binary(kind)
 
 
 def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]:
@@ -158,10 +152,7 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]
             path,
             # One thread: only then does pyarrow report the numbers of bad rows.
             read_options=pyarrow.csv.ReadOptions(
-                column_names=names,
-                skip_rows=before + 1,
-                use_threads=False,
-                block_size=LONGEST_CELL,
+                column_names=names, skip_rows=before + 1, use_threads=False, block_size=LONGEST_CELL
             ),
             parse_options=pyarrow.csv.ParseOptions(invalid_row_handler=remember),
             convert_options=pyarrow.csv.ConvertOptions(

@@ -296,10 +296,7 @@ def read_flights(
 ) -> tuple[list[FlightLog], list[str]]:
     """Read many flights; the warnings name files that cannot be used.
 
-    Args:
-        paths: paths of the files.
-        partial: accept partial logs as well.
-        limits: as in `log_from_columns`.
+    Partial logs are accepted with `partial`; `limits` is as in `log_from_columns`.
 
     Returns:
         The flights in the order of `paths`, and the warnings of all files.

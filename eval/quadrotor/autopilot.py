@@ -64,10 +64,8 @@ def start_autopilot(
 ) -> AutopilotState:
     """Return the state of N vehicles that hovered until now, with headings along their x axes.
 
-    Args:
-        autopilot: from `make_autopilot`.
-        motion: (N, ...) rigid-body state at the start.
-        noise: (N, 3) normal random numbers for the wind at the start, or None.
+    `motion` (N, ...) is the rigid-body state; `noise` (N, 3) are normal random numbers for the
+    wind.
     """
     xp = motion.pos_w.__array_namespace__()
     n = motion.pos_w.shape[0]

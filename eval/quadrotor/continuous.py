@@ -131,14 +131,9 @@ def fly(
 
 
 def update_loop(plant: Plant, carry: Carry, span: Steps, command: Command, rate_b: Array) -> Carry:
-    """Return `carry` after an update of the rate loop, where `span.updates` is true.
+    """Return `carry` after an update of the rate loop, where the step `span` begins with one.
 
-    Args:
-        plant: the plant.
-        carry: the state before.
-        span: the step that begins.
-        command: (...) thrust and body rates.
-        rate_b: (..., 3) current body rates [rad/s].
+    `command` (...) is thrust and body rates, `rate_b` (..., 3) the current body rates [rad/s].
     """
     xp = rate_b.__array_namespace__()
     predicted_b = rate_b + span.lead_s[..., None] * carry.turn_b

@@ -46,14 +46,8 @@ def wind_and_flow(
 ) -> tuple[dict[str, Array], Flow]:
     """Return the random winds of this step, and the inputs of the effects' hooks.
 
-    Args:
-        plant: the plant.
-        wind: random winds of the previous step, by effect.
-        motion: rigid-body state.
-        rotors: the rotors' step.
-        time_s: (...,) time since the start of the flight [s].
-        noise: (..., 3) normal random numbers for random wind, or None.
-        voltage_drop: (...,) battery voltage at the start of the flight minus now [V], or None.
+    `wind` are those of the previous step, by effect. `noise` (..., 3) are normal random numbers.
+    The flight has lasted `time_s` [s], and the battery lost `voltage_drop` [V] in it, (...,) both.
     """
     winds, air_vel_w = winds_on(plant, wind, motion, noise)
     return winds, Flow(
@@ -74,11 +68,7 @@ def winds_on(
 ) -> tuple[dict[str, Array], Array]:
     """Return the random winds of this step and the velocity through the air.
 
-    Args:
-        plant: the plant.
-        wind: random winds of the previous step, by effect.
-        motion: rigid-body state.
-        noise: (..., 3) normal random numbers, or None.
+    `wind` are those of the previous step, by effect; `noise` (..., 3) are normal random numbers.
 
     Returns:
         The winds by effect, and the velocity of the centre of mass relative to the air (..., 3) in
@@ -122,11 +112,7 @@ def wrench_on(
 ) -> Wrench:
     """Return the force and torque of rotors and effects.
 
-    Args:
-        plant: the plant.
-        rotors: the rotors' step.
-        flow: inputs of the effects' hooks.
-        carried: states of effects by name, as `eval.quadrotor.stepper.PlantState.carried`.
+    `carried` are the states of effects by name, as `eval.quadrotor.stepper.PlantState.carried`.
 
     Raises:
         ValueError: where the state of an effect is missing in `carried`.

@@ -34,11 +34,8 @@ def add_quadrotor(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
     """Add `vehicle` to the world body of `spec`, with its effects on mass, inertia and gravity.
 
     The body's origin is the true centre of mass. The model's gravity is set, since the effect
-    `frame_tilt` changes it. `compile_quadrotor` compiles the result.
-
-    Args:
-        spec: the model; its integrator must stay Euler for parity with the quadrotor in JAX.
-        vehicle: the vehicle.
+    `frame_tilt` changes it. `compile_quadrotor` compiles the result. The integrator of `spec` must
+    stay Euler for parity with the quadrotor in JAX.
 
     Raises:
         ValueError: where the effects make the mass zero or negative.

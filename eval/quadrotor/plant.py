@@ -129,11 +129,9 @@ def make_plant(
 def fit_plant(vehicle: Vehicle, effects: Mapping[str, Any], dt: float | None = None) -> Plant:
     """Return a plant with all effects of the catalogue at once, to fit any of them.
 
-    Args:
-        vehicle: the vehicle file, with nominal values and effects; effects that it does not list
-            are neutral (without influence).
-        effects: values by name that replace those; they may be traced JAX arrays.
-        dt: length of a step [s]; 1 / controller.frequency if not given.
+    Effects that neither `vehicle` nor `effects` list are neutral (without influence). `effects`
+    replace those of the file and may be traced JAX arrays. A step of `dt` [s] is 1 /
+    controller.frequency if not given.
     """
     values = {**all_values(vehicle), **effects}
     return make_plant(vehicle, dt or 1.0 / vehicle.controller.frequency, values, MAX_DELAY)

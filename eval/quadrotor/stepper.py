@@ -86,12 +86,8 @@ def hover_state(
 ) -> PlantState:
     """Return the state of plants that hovered until now.
 
-    Args:
-        plant: the plant.
-        batch_shape: leading shape of the states.
-        xp: numpy or jax.numpy.
-        noise: (*batch_shape, 3) normal random numbers for the random wind at the start; None: no
-            wind.
+    Without `noise` (*batch_shape, 3), normal random numbers, there is no wind at the start. `xp` is
+    numpy or jax.numpy.
     """
     zeros = xp.zeros((*batch_shape, 3))
     hover = Command(xp.full(batch_shape, GRAVITY), zeros)
@@ -124,12 +120,8 @@ def _carried_in_hover(plant: Plant, rotor_speed: Array, zeros: Array) -> dict[st
 def wanted_speed(plant: Plant, command: Command, rate_b: Array) -> Array:
     """Return the rotor speeds (..., 4) [rad/s] that rate loop and mixer command.
 
-    For a firmware's loop, which has a state, they are those of its first update.
-
-    Args:
-        plant: the plant.
-        command: (...) thrust and body rates.
-        rate_b: (..., 3) current body rates [rad/s].
+    For a firmware's loop, which has a state, they are those of its first update. `command` (...) is
+    thrust and body rates, `rate_b` (..., 3) the current body rates [rad/s].
     """
     xp = rate_b.__array_namespace__()
     memory = loops.start(plant.loop, rate_b.shape[:-1], xp)
@@ -178,12 +170,8 @@ def rotor_command(
 ) -> tuple[PlantState, Array]:
     """Return the state after an update of the rate loop, and the commanded rotor speeds (..., 4).
 
-    Args:
-        plant: the plant.
-        state: before the step.
-        command: (...) thrust and body rates; unused with `speed_cmd`.
-        rate_b: (..., 3) current body rates [rad/s].
-        speed_cmd: (..., 4) commanded rotor speeds that bypass the rate loop [rad/s], or None.
+    `command` (...) is thrust and body rates; commanded speeds `speed_cmd` (..., 4) [rad/s] bypass
+    the rate loop. `rate_b` (..., 3) are current body rates [rad/s].
     """
     if plant.delay_weight.shape[-1] > 0:
         newest = command.packed if speed_cmd is None else speed_cmd

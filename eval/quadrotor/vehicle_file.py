@@ -46,9 +46,7 @@ def shipped_vehicles() -> list[str]:
 def load_vehicle(source: str | os.PathLike[str]) -> Vehicle:
     """Return the vehicle of a file, or a shipped one by its name.
 
-    Args:
-        source: a path, or a shipped name. A text counts as a path if it ends in .toml, has a folder
-            or is an existing file.
+    A text counts as a path if it ends in .toml, has a folder or is an existing file.
 
     Raises:
         VehicleFileError: for a file that cannot be used.
@@ -88,10 +86,8 @@ def parse_vehicle(table: Mapping[str, Any]) -> Vehicle:
 def save_vehicle(vehicle: Vehicle, path: str | os.PathLike[str], comment: str = "") -> None:
     """Write `vehicle` as a file, from which `load_vehicle` reads an equal vehicle.
 
-    Args:
-        vehicle: the vehicle; it is checked first, as when a file is read.
-        path: path of the file.
-        comment: lines for the beginning of the file.
+    The vehicle is checked first, as when a file is read. The file begins with the lines of
+    `comment`.
 
     Raises:
         ValueError: for a vehicle that the check refuses.

@@ -89,11 +89,8 @@ def view_models(models: Models) -> dict[str, Any]:
 def scale_model(name: str, values: Any, magnitude: Any) -> Any:
     """Return a model's values with their errors scaled by `magnitude`, within the bounds.
 
-    Args:
-        name: name of the model.
-        values: the model's parameters, a NamedTuple of numbers.
-        magnitude: factor of the errors, a number or an array (N,) for N drones. 0: no errors;
-            1: the given values.
+    The values are a NamedTuple of numbers. The `magnitude` is a number or an array (N,) for N
+    drones. 0: no errors; 1: the given values.
     """
     sensor, changed = SENSORS.find(name), {}
     for parameter in sensor.parameters:
@@ -119,12 +116,8 @@ def start(
 ) -> dict[str, Any]:
     """Return the state of each model at the first observation, by name.
 
-    Args:
-        models: models that change a view; see `view_models`.
-        truth: the true views of N drones.
-        draws: the random numbers of the trials, by model.
-        dt_s: time between observations [s].
-        camera: the policy's camera.
+    The models are `view_models`, the true views those of N drones, and observations `dt_s` apart
+    [s].
     """
     return {
         name: begin(values, Moment(truth, draws[name], dt_s, camera))
@@ -144,13 +137,8 @@ def sense(
 ) -> tuple[View, dict[str, Any]]:
     """Apply all models to the true view.
 
-    Args:
-        models: models that change a view; see `view_models`.
-        memory: state of each model, from `start` or from the previous observation.
-        truth: the true views of N drones.
-        draws: the random numbers of this observation, by model.
-        dt_s: time between observations [s].
-        camera: the policy's camera.
+    The models are `view_models`, and `memory` is from `start` or from the previous observation,
+    `dt_s` before [s].
 
     Returns:
         The view with all errors, and the states of the models.

@@ -110,11 +110,8 @@ def spreads(values: GateDetection, range_m: Array, camera: Camera) -> tuple[Arra
     """Return standard deviations across the view [m], along it [m] and of the tilt [rad], (..., 2).
 
     The tilt combines the measured one with `known_tilt`, as gates stand upright in the map.
-
-    Args:
-        values: parameters of the model.
-        range_m: (..., 2) distances of the two gates [m].
-        camera: the policy's camera, whose horizontal field of view `ACROSS` pixels cover.
+    `range_m` (..., 2) are the distances of the two gates [m]. `ACROSS` pixels cover the camera's
+    horizontal field of view.
     """
     xp = range_m.__array_namespace__()
     focal_px = ACROSS / 2 / math.tan(math.radians(camera.fov_deg[0]) / 2)

@@ -178,8 +178,7 @@ def markov_step(on: Array, chance: Array, share: Array, length_s: Array, dt_s: A
 def noise_factor(decay: Array) -> Array:
     """Return the factor of the white noise that keeps a first-order process at unit variance.
 
-    Args:
-        decay: factor exp(-dt / tau) of the process's value over a step.
+    The process's value decays by the factor exp(-dt / tau) in a step.
     """
     xp = decay.__array_namespace__()
     return xp.sqrt(xp.maximum(1.0 - decay**2, 0.0))
@@ -195,11 +194,7 @@ def rotation_since(rot_w: Array, before_w: Array) -> Array:
     """Return the rotation of a body since `before_w`, as a vector in its axes (..., 3) [rad].
 
     The vector is the axis times the sine of the angle. Below 0.25 rad it is within 1 % of the
-    rotation vector.
-
-    Args:
-        rot_w: (..., 3, 3) attitude now, body to world.
-        before_w: (..., 3, 3) attitude before, body to world.
+    rotation vector. Both attitudes (..., 3, 3) are body to world.
     """
     xp = rot_w.__array_namespace__()
     relative = (before_w[..., :, :, None] * rot_w[..., :, None, :]).sum(-3)

@@ -86,10 +86,6 @@ PERFECT = SensorSet()
 def sensor_set(models: Mapping[str, Mapping[str, float]], name: str = "custom") -> SensorSet:
     """Return a checked set of models from the parameters that differ from neutral.
 
-    Args:
-        models: name of a model -> its parameters.
-        name: name of the set in tables of results.
-
     Raises:
         ValueError: as in `parse_sensors`.
     """
@@ -112,9 +108,7 @@ def shipped_sensors() -> list[str]:
 def load_sensors(source: str | os.PathLike[str]) -> SensorSet:
     """Return the sensors of a file, or shipped ones by their name.
 
-    Args:
-        source: a path, or a shipped name. A text counts as a path if it ends in .toml, has a folder
-            or is an existing file.
+    A text counts as a path if it ends in .toml, has a folder or is an existing file.
 
     Raises:
         SensorsFileError: for an unusable file.
@@ -173,10 +167,7 @@ def _table(name: str, models: Mapping[str, Mapping[str, float]]) -> dict[str, An
 def save_sensors(sensors: SensorSet, path: str | os.PathLike[str], comment: str = "") -> None:
     """Write `sensors` as a file that `load_sensors` reads back equal; after an error, no file.
 
-    Args:
-        sensors: the set to write; it is checked like a file.
-        path: path of the file.
-        comment: lines for the head of the file.
+    The sensors are checked like a file. The file begins with the lines of `comment`.
 
     Raises:
         ValueError: for sensors that `load_sensors` would reject.

@@ -122,10 +122,7 @@ def with_effects(nominal: Vehicle, effects: Mapping[str, Any]) -> Vehicle:
 def motor_thrust(motors: MotorMap, command: Any, voltage: Any = None) -> Any:
     """Return the thrusts (..., 4) [N] of motor commands.
 
-    Args:
-        motors: thrust of the vehicle's motor commands.
-        command: (..., 4) motor commands from 0 to 1.
-        voltage: (...,) battery voltage [V]; None: the nominal one.
+    Commands (..., 4) are from 0 to 1. Without a battery voltage (...,) [V] it is the nominal one.
     """
     applied = command
     if voltage is not None and motors.voltage_exponent:
@@ -137,9 +134,7 @@ def motor_thrust(motors: MotorMap, command: Any, voltage: Any = None) -> Any:
 def command_of_thrust(curve: tuple[Any, Any], thrust: Any) -> Any:
     """Return the applied command u of `T = t1 u + t2 u^2` for thrusts (...) >= 0 [N].
 
-    Args:
-        curve: t1, t2 [N] of an increasing curve.
-        thrust: (...) thrusts [N].
+    `curve` is t1, t2 [N] of an increasing curve.
     """
     first, second = curve
     xp = thrust.__array_namespace__()
@@ -151,10 +146,7 @@ def command_of_thrust(curve: tuple[Any, Any], thrust: Any) -> Any:
 def motor_speed(vehicle: Vehicle, command: Any, voltage: Any = None) -> Any:
     """Return the commanded rotor speeds (..., 4) [rad/s] for motor commands.
 
-    Args:
-        vehicle: a vehicle with `[motors]`, the thrust of its motor commands.
-        command: (..., 4) motor commands from 0 to 1.
-        voltage: (...,) battery voltage [V]; None: the nominal one.
+    Commands (..., 4) are from 0 to 1. Without a battery voltage (...,) [V] it is the nominal one.
 
     Raises:
         ValueError: where the vehicle has no `[motors]`.

@@ -67,12 +67,8 @@ def draw_drone(
 ) -> Image.Image:
     """Return a picture of a drone on a track, without the triangles between camera and drone.
 
-    Args:
-        scenery: triangles of the track.
-        drone: the drone; its number of passed gates determines the gates' colours.
-        eye_to_w: the camera's position and its target, (3,) each [m].
-        size: width and height [pixels].
-        lines: additional lines.
+    The drone's number of passed gates determines the gates' colours. `eye_to_w` are the camera's
+    position and its target, (3,) each [m]; `size` is width and height [pixels].
     """
     eye, target = eye_to_w
     body = _drone_faces(drone.pos_w, drone.rot_w)
@@ -99,11 +95,7 @@ def chase_image(
 ) -> np.ndarray:
     """Return a picture (height, width, 3) uint8 from behind a drone.
 
-    Args:
-        scenery: triangles of the track.
-        drone: the drone.
-        vel_w: (3,) velocity of the drone [m/s], along which the camera looks.
-        size: width and height [pixels].
+    The camera looks along the velocity `vel_w` (3,) [m/s]. `size` is width and height [pixels].
     """
     # The heading is added, so that the direction is defined for a drone at rest too.
     camera = camera_behind(drone.pos_w, vel_w[:2] + 0.5 * drone.rot_w[:2, 0])
@@ -113,11 +105,8 @@ def chase_image(
 def inset(picture: np.ndarray, depth_m: np.ndarray, range_m: float, share: int) -> np.ndarray:
     """Return a picture (H, W, 3) with a depth image (h, w) [m] in its lower right corner.
 
-    Args:
-        picture: (H, W, 3) uint8.
-        depth_m: (h, w) depth image [m]; it is enlarged without interpolation.
-        range_m: depth at the end of the colour scale [m].
-        share: width of the picture divided by the width of the depth image in it.
+    The picture is uint8. The depth image is enlarged without interpolation, to one `share`-th of
+    the width; `range_m` is the end of its colour scale [m].
     """
     width = picture.shape[1] // share
     height = min(picture.shape[0], max(1, width * depth_m.shape[0] // depth_m.shape[1]))

@@ -77,10 +77,7 @@ def write_comparison(
 ) -> Path:
     """Write flights and their simulations as a rerun recording (.rrd) with a layout.
 
-    Args:
-        path: file to write, ending in `.rrd`.
-        flights: the flights; each gets a tab.
-        half_size: half extents of the drone's box [m].
+    Each flight gets a tab. `half_size` are half extents of the drone's box [m].
 
     Raises:
         ValueError: where `flights` is empty.

@@ -53,12 +53,8 @@ def write_picture(
 ) -> Path:
     """Draw a trial, or a track without a flight, from above and from the side.
 
-    Args:
-        path: file to write; its ending sets the format.
-        track: track of the trial.
-        flight: log of the trial; its path is coloured by speed.
-        result: outcome of the trial, for the title and the mark at the end.
-        dpi: dots per inch; the picture is up to 9.5 inches wide and 9.2 high.
+    The file's ending sets the format. The path is coloured by speed; title and mark at the end show
+    the result. The picture is up to 9.5 inches wide and 9.2 high.
 
     Raises:
         OSError: where the file cannot be written; nothing is left under its name.
@@ -91,11 +87,7 @@ def write_picture(
 def write_grid(path: str | Path, trials: Sequence[Shown], columns: int = 3, dpi: int = 110) -> Path:
     """Draw several trials from above, each in a panel, with one colour bar.
 
-    Args:
-        path: file to write; its ending sets the format.
-        trials: tracks, with optional flights and outcomes.
-        columns: number of panels in a row.
-        dpi: dots per inch.
+    The file's ending sets the format. `columns` panels are in a row.
 
     Raises:
         ValueError: where `trials` is empty.
@@ -209,12 +201,7 @@ def _draw_path(
 
 
 def _draw_gate_number(
-    axes: Axes,
-    number: int,
-    center: np.ndarray,
-    direction: np.ndarray,
-    colour: str,
-    small: bool,
+    axes: Axes, number: int, center: np.ndarray, direction: np.ndarray, colour: str, small: bool
 ) -> None:
     """Draw a gate's number, from 0 as in `TrialResult.collided_with`, and its flight direction.
 

@@ -67,10 +67,7 @@ def write_recording(
 ) -> Path:
     """Write trials as a rerun recording (.rrd) with a layout; needs no viewer and no network.
 
-    Args:
-        path: file to write, ending in `.rrd`.
-        rollouts: the trials; each gets a tab.
-        drone: shape and camera; None: the defaults of `Drone`.
+    Each trial gets a tab. Without a drone, shape and camera are the defaults of `Drone`.
 
     Raises:
         ValueError: where `rollouts` is empty.

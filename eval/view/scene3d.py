@@ -93,11 +93,8 @@ def look_at(
 ) -> Viewpoint:
     """Return a camera without roll that looks from one point to another.
 
-    Args:
-        eye_w: (3,) position of the camera [m].
-        target_w: (3,) point in the middle of the picture [m].
-        fov_deg: horizontal field of view [deg].
-        size: width and height [pixels].
+    `eye_w` (3,) is the position, `target_w` (3,) the point in the middle of the picture [m]. The
+    horizontal field of view is in degrees; `size` is width and height [pixels].
     """
     forward = (target_w - eye_w) / np.linalg.norm(target_w - eye_w)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -129,7 +126,9 @@ def paint(view: Viewpoint, faces: Faces, lines: Lines) -> Image.Image:
     ends = to_camera(view, lines.ends_w)
     shapes = [*corners, *ends]
     distance = np.concatenate([_distance(corners), _distance(ends)])
-    colour = _fade(np.concatenate([colour, lines.colour]), distance)
+    fog = FOG_SHARE * np.clip(distance / FOG_M, 0, 1)[:, None]
+    colour = (1 - fog) * np.concatenate([colour, lines.colour]) + fog * np.array(SKY)
+    colour = np.clip(colour, 0, 255)
     nearest = np.concatenate([corners[..., 2].min(axis=1), ends[..., 2].min(axis=1)])
     farthest = np.concatenate([corners[..., 2].max(axis=1), ends[..., 2].max(axis=1)])
     for k in np.argsort(-distance):
@@ -149,12 +148,6 @@ def paint(view: Viewpoint, faces: Faces, lines: Lines) -> Image.Image:
 def _distance(shapes_c: np.ndarray) -> np.ndarray:
     """Return the distances of the shapes' centres from the camera [m]."""
     return np.linalg.norm(shapes_c.mean(axis=1), axis=-1)
-
-
-def _fade(colour: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """Return colours that change to the sky's with distance."""
-    share = FOG_SHARE * np.clip(distance / FOG_M, 0, 1)[:, None]
-    return np.clip((1 - share) * colour + share * np.array(SKY), 0, 255)
 
 
 def _paint_ground(draw: ImageDraw.ImageDraw, view: Viewpoint) -> None:

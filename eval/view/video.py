@@ -70,14 +70,8 @@ def write_video(
 ) -> Path:
     """Write a video of a trial as MP4 (H.264) or GIF, by the ending of `path`.
 
-    Args:
-        path: file to write, ending in `.mp4` or `.gif`.
-        track: track of the trial.
-        flight: log of the trial, with or without depth images.
-        result: outcome of the trial.
-        options: size, speed and camera; None: the defaults of `VideoOptions`.
-        on_frame: called after each frame with the number of finished frames; there are
-            `len(frame_times(...))` in all.
+    The log may lack depth images. `on_frame` is called after each frame with the number of finished
+    frames, of `len(frame_times(...))` in all.
 
     Raises:
         ValueError: for another ending, an odd size, or a flight with fewer than two rows.

@@ -25,12 +25,8 @@ def write_mp4(
 ) -> None:
     """Write frames as H.264 in MP4, through a pipe to ffmpeg.
 
-    Args:
-        path: file to write, ending in `.mp4`.
-        frames: the frames in order; only one is in memory at a time.
-        size: width and height, even numbers [pixels].
-        fps: frames per second.
-        on_frame: called after each frame with the number of finished frames.
+    Only one frame is in memory at a time. `size` is width and height, even numbers [pixels].
+    `on_frame` is called after each frame with the number of finished frames.
 
     Raises:
         OSError: where ffmpeg fails, with its message.
@@ -70,13 +66,8 @@ def write_gif(
 ) -> None:
     """Write frames as a GIF that loops, all with one palette.
 
-    Args:
-        path: file to write, ending in `.gif`.
-        frames: the frames in order.
-        fps: frames per second.
-        swatches: (n, 3) colours, 0-255, that the palette needs in addition to those of the first
-            frame.
-        on_frame: called after each frame with the number of finished frames.
+    The palette has the colours `swatches` (n, 3), 0-255, in addition to those of the first frame.
+    `on_frame` is called after each frame with the number of finished frames.
     """
     indexed: list[Image.Image] = []
     for number, frame in enumerate(frames, start=1):

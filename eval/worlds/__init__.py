@@ -137,10 +137,6 @@ def world_class(name: str) -> Any:
 def action_argument(name: str, action: ActionSpec) -> dict[str, ActionSpec]:
     """Return the argument `action` of the world's class; {} for an acceleration, the default.
 
-    Args:
-        name: the simulator.
-        action: the policy's action.
-
     Raises:
         ValueError: where the simulator does not support this kind of action.
     """

@@ -120,10 +120,8 @@ def _separation(
 ) -> Array:
     """Return the largest separation of the box and a convex solid over a set of axes.
 
-    Args:
-        axes: directions, (..., 3) each, of any length; axes of length zero are ignored.
-        low_high: function that returns the two ends of the solid's extent along an axis.
-        half_size: (3,) half extents of the box.
+    Directions are (..., 3) of any length; those of length zero are ignored. `low_high` returns the
+    two ends of the solid's extent along an axis. The box has half extents `half_size` (3,).
     """
     gaps = []
     for axis in axes:

@@ -22,11 +22,7 @@ NO_AUTORESET = mujoco.mjtDisableBit.mjDSBL_AUTORESET
 def compile_model(track: Track, vehicle: Vehicle, dt: float, padded: Counts) -> mujoco.MjModel:
     """Return the model of a vehicle on a track, padded so that all trials share one layout.
 
-    Args:
-        track: the track with its scene.
-        vehicle: the vehicle that flies.
-        dt: length of a physics step [s].
-        padded: number of solids of each kind, padding included.
+    A physics step is `dt` long [s]. `padded` are numbers of solids of each kind, padding included.
     """
     spec = mujoco.MjSpec()
     spec.option.disableflags |= NO_AUTORESET
@@ -52,14 +48,9 @@ class DepthCamera:
     ) -> np.ndarray:
         """Return the planar depth image (H, W) [m], without the quadrotor itself.
 
-        A pixel whose ray hits nothing gets the camera's range.
-
-        Args:
-            model: the model of the scene.
-            data: its data, with computed positions of the solids.
-            pos_w: (3,) position of the camera [m].
-            rot_w: (3, 3) attitude, body to world.
-            group: only geoms (MuJoCo's solids) of this group are visible; None: all.
+        A pixel whose ray hits nothing gets the camera's range. The camera is at `pos_w` (3,) [m]
+        with attitude `rot_w` (3, 3), body to world. `data` has computed positions of the solids.
+        With `group`, only geoms (MuJoCo's solids) of it are visible.
         """
         # Rays have a component of 1 along the optical axis, so the ray parameter is planar depth.
         groups = None
@@ -103,11 +94,6 @@ def contact_name(model: mujoco.MjModel, data: mujoco.MjData) -> str:
 
 def refuse_start_contact(name: str, track: Track, vehicle: Vehicle) -> None:
     """Raise an error for a track on which `vehicle` is in contact at the start.
-
-    Args:
-        name: name of the track, for the message.
-        track: the track.
-        vehicle: the vehicle that flies.
 
     Raises:
         ValueError: naming the track, the start and the touched solid.

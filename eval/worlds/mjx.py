@@ -189,12 +189,8 @@ class MjxWorld:
     ) -> SlotStates:
         """Apply the rules to the `selected` slots (N,) bool; diverged slots are reset to rest.
 
-        Args:
-            state: states of all slots after the step.
-            selected: (N,) bool, slots to which the rules apply.
-            invalid: (N,) bool, slots in which no step was possible.
-            course: the gates of each slot's track.
-            near: the solids nearest to each drone.
+        In `invalid` slots (N,) bool no step was possible. `near` are the solids nearest to each
+        drone.
         """
         motion = _motion(state.qpos, state.qvel)
         diverged = invalid | has_diverged(self._rules, motion)

@@ -41,16 +41,9 @@ def fly_trial(
 ) -> TrialResult:
     """Fly one trial as a plain loop, the slow and simple check of the other simulators.
 
-    Args:
-        policy: the policy.
-        trial: family, level and seed of the trial.
-        track: track of the trial.
-        vehicle: the vehicle that flies.
-        rules: rules for the end of a trial; None: the defaults.
-        limits: limits of actions; None: the defaults.
-        rows: number of rows of the policy's inputs; all rows but the first are zero. It should be
-            that of the batched simulators, because the output of some policies depends on it.
-        sensor_set: errors of the policy's observations.
+    Rules and limits have defaults. The policy's inputs have `rows` rows, all zero but the first. It
+    should be the number of the batched simulators, because the output of some policies depends on
+    it.
 
     Returns:
         The outcome of the trial.

@@ -70,14 +70,8 @@ class SceneSlots(ABC):
     ) -> None:
         """Make the world.
 
-        Args:
-            vehicle: the vehicle that flies.
-            camera: the policy's camera.
-            layout: sizes of padded scenes, which fit every track.
-            rules: rules for the end and the score of a trial.
-            slots: number of trials that fly at the same time.
-            threads: number of threads for physics; results do not depend on it.
-            action: the policy's action; None: an acceleration.
+        Every track fits the padded sizes of `layout`. Results do not depend on the threads for
+        physics. The policy's action is by default an acceleration.
         """
         self.slots = slots
         self._vehicles, self._layout, self._rules = [vehicle] * slots, layout, rules
@@ -111,16 +105,12 @@ class SceneSlots(ABC):
         self._xmat = self._batch.bind("xmat")
 
     def load(
-        self,
-        entries: list[tuple[int, Track, TrialSpec]],
-        vehicles: Sequence[Vehicle] | None = None,
+        self, entries: list[tuple[int, Track, TrialSpec]], vehicles: Sequence[Vehicle] | None = None
     ) -> None:
         """Start trials from (slot, track, trial).
 
-        Args:
-            entries: the trials to fly.
-            vehicles: one vehicle for each entry. They have the effects of the world's vehicle, with
-                other values. If one call has vehicles, all calls must have them.
+        There is one vehicle for each entry. They have the effects of the world's vehicle, with
+        other values. If one call has vehicles, all calls must have them.
         """
         if vehicles is not None:
             self._set_vehicles([slot for slot, _, _ in entries], vehicles)
@@ -239,12 +229,9 @@ class SceneSlots(ABC):
 
     @abstractmethod
     def _move(self, flying: np.ndarray, motion: Motion, push: Any) -> np.ndarray:
-        """Simulate one physics step in some slots.
+        """Simulate one physics step in the slots `flying` (N,) bool.
 
-        Args:
-            flying: (N,) bool, the slots to simulate.
-            motion: (N, ...) states before the step.
-            push: output of `_control`.
+        `motion` (N, ...) are states before the step, `push` is the output of `_control`.
 
         Returns:
             The slots in which no step is possible, (N,) bool; they keep their state.

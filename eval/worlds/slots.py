@@ -46,10 +46,7 @@ def slot_groups(trials: Sequence[TrialSpec], tracks: Mapping[str, Track]) -> lis
     """Return groups of trials, by their index, that can share slots.
 
     The size of a MuJoCo model depends on its meshes, so a track with meshes has its own group.
-
-    Args:
-        trials: the trials to fly.
-        tracks: name of a track from a file -> track.
+    `tracks` are those from files, by name.
     """
     groups: dict[str, list[int]] = {}
     for number, trial in enumerate(trials):
@@ -92,10 +89,8 @@ IDLE = TrialSpec("", 0, 0)
 def generator_of(trial: TrialSpec, use: int, part: str = "") -> np.random.Generator:
     """Return the random generator of a trial for one use, which these arguments determine.
 
-    Args:
-        trial: the trial; for a track file only its name counts, without the folder.
-        use: one of `GUSTS`, `SENSED`, `STATE_AGES` and `IMAGE_AGES`.
-        part: name of a part of the use, such as a sensor model; each has its own generator.
+    Of a track file only the name counts, without the folder. The use is one of `GUSTS`, `SENSED`,
+    `STATE_AGES` and `IMAGE_AGES`. Each `part` of it, such as a sensor model, has its own generator.
     """
     name = PurePath(trial.track).name
     key = [trial.seed, trial.difficulty, *name.encode(), use, *part.encode()]

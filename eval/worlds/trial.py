@@ -150,10 +150,8 @@ class Progress(NamedTuple):
 def steps_to_next(decision: Array, period: float) -> Array:
     """Return the number of physics steps (N,) from each decision of the policy to the next.
 
-    Args:
-        decision: (N,) number of the decision in its trial, from 0.
-        period: time between decisions in physics steps; one of 16.7 (30 Hz with physics of 500 Hz)
-            gives 17, 16 and 17 steps.
+    Decisions (N,) are numbered from 0 in a trial. A period of 16.7 physics steps (30 Hz with
+    physics of 500 Hz) gives 17, 16 and 17 steps.
     """
     xp = decision.__array_namespace__()
     return (xp.rint((decision + 1) * period) - xp.rint(decision * period)).astype(int)

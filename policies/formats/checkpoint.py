@@ -54,14 +54,9 @@ def save_arrays(
 ) -> Path:
     """Write arrays and their description as a checkpoint, replacing an existing one.
 
-    A kill at any moment leaves the complete old checkpoint or the complete new one.
-
-    Args:
-        folder: the checkpoint's folder.
-        arrays: numpy or JAX arrays by name, of any shape.
-        kind: "policy", "delta" or "training"; loading requires the same kind.
-        seed: the seed of the training or fit that made the arrays, or None.
-        extra: further keys of config.json (see `tracks.common.files.to_json`).
+    A kill at any moment leaves the complete old checkpoint or the complete new one. The kind is
+    "policy", "delta" or "training"; loading requires the same kind. `seed` is that of the training
+    or fit, or None. `extra` are further keys of config.json (see `tracks.common.files.to_json`).
 
     Returns:
         `folder`.
@@ -89,10 +84,6 @@ def save_arrays(
 
 def load_arrays(folder: Path, *, kind: str) -> Stored:
     """Read a checkpoint back.
-
-    Args:
-        folder: the checkpoint's folder.
-        kind: the required kind.
 
     Raises:
         PolicyError: where a file is missing, cut short, changed, of another kind or a newer

@@ -36,13 +36,9 @@ def export_policy(
 ) -> list[Path]:
     """Export one of the suite's policies; `load_policy` reads all formats (.pt2 and C with trust).
 
-    Args:
-        name_or_folder: a shipped policy's name or a checkpoint's folder.
-        out: the folder for the files: NAME.pt2, NAME.onnx; for C policy.h, policy.c and a program
-            that tests them.
-        formats: names in `FORMATS`.
-        dtype: type of the weights in C, "float32" or "int8".
-        observed: observations of flights, from which the scales of int8 activations are computed.
+    The files are NAME.pt2 and NAME.onnx; for C policy.h, policy.c and a program that tests them.
+    Weights in C are "float32" or "int8", whose scales of activations follow from `observed` in
+    flights.
 
     Returns:
         The files' paths.

@@ -72,11 +72,9 @@ class ModelProcess:
     def __init__(self, model: bytes, where: str, kind: str, labels: Sequence[str] = ()) -> None:
         """Start the process and load the model there.
 
-        Args:
-            model: bytes of a model file, or the path of a C library.
-            where: the file from which the model was read, for messages.
-            kind: one of `model_server.KINDS`.
-            labels: names of the texts in a torch file; for a C library one name, for its JSON.
+        The model is the bytes of a file, or the path of a C library; its kind is in
+        `model_server.KINDS`. `labels` are names of the texts in a torch file; for a C library one
+        name, for its JSON.
 
         Raises:
             PolicyError: where the engine refuses it, or exceeds its limits.

@@ -14,12 +14,7 @@ import onnx.inliner
 
 from policies.block_policy import BlockPolicy
 from policies.formats.model_process import ModelProcess
-from policies.formats.program_inputs import (
-    INPUTS,
-    check_inputs,
-    check_memory,
-    program_policy,
-)
+from policies.formats.program_inputs import INPUTS, check_inputs, check_memory, program_policy
 from policies.formats.spec_json import extract
 from policies.spec import PolicyError
 from tracks.input.reading import MODEL_BYTES, InputError, read_bytes, reason

@@ -29,10 +29,7 @@ def onnx_model(
 ) -> onnx.ModelProto:
     """Return the network from (state, image, hidden) to (action, hidden_next), for any batch size.
 
-    Args:
-        params: the network's parameters.
-        spec: the specification for which the parameters were trained.
-        metadata: texts for the file, by key.
+    `metadata` are texts for the file, by key.
     """
     camera, width = spec.camera, spec.hidden_size
     inputs = [

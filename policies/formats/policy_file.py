@@ -56,12 +56,8 @@ def save_policy(
 ) -> Path:
     """Write a policy as a checkpoint; a kill at any moment leaves the old one or the new one.
 
-    Args:
-        folder: the checkpoint's folder.
-        params: the network's parameters.
-        spec: the rate, camera and scaling that the policy expects.
-        seed: the training's seed.
-        training: the resolved training configuration.
+    `spec` has the rate, camera and scaling that the policy expects, `training` is the resolved
+    configuration.
 
     Returns:
         `folder`.

@@ -30,10 +30,7 @@ def check_inputs(
 ) -> tuple[int, tuple[int, ...]]:
     """Return the number of rows of a block, and the shape of a row's hidden state, of a program.
 
-    Args:
-        shapes: shapes of the program's inputs by name, in order; a size that is not an int is free.
-        spec: the file's specification.
-        where: the file, for messages.
+    Shapes are by name, in order; a size that is not an int is free.
 
     Raises:
         PolicyError: where names, ranks or sizes are not those of an observation.

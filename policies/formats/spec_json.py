@@ -29,10 +29,6 @@ def spec_to_json(spec: PolicySpec) -> dict[str, Any]:
 def spec_from_json(data: Any, where: str) -> PolicySpec:
     """Return the spec that `data` describes; missing keys take their defaults.
 
-    Args:
-        data: the result of `spec_to_json`, read from JSON.
-        where: its file and key, for messages.
-
     Raises:
         PolicyError: for an unknown key, a wrong type or a value out of range.
     """
@@ -83,9 +79,7 @@ def embed(spec: PolicySpec, name: str, seed: int | None) -> str:
 def extract(texts: Mapping[str, str | bytes | None], where: str) -> PolicyMetadata:
     """Return the metadata of a policy file.
 
-    Args:
-        texts: the file's texts under `KEY` and `contract.KEY`, if present.
-        where: the file, for messages.
+    The texts are under `KEY` and `contract.KEY`, if present.
 
     Raises:
         PolicyError: where a text is not JSON, has another schema or is not a spec, or where two

@@ -25,10 +25,7 @@ def tree_to_arrays(tree: Any) -> dict[str, np.ndarray]:
 def tree_from_arrays(template: Any, arrays: Mapping[str, np.ndarray], where: str) -> Any:
     """Return a tree with the structure of `template` from the result of `tree_to_arrays`.
 
-    Args:
-        template: a tree of the same structure, shapes and types; its values are not used.
-        arrays: leaves by path.
-        where: the file of the arrays, for messages.
+    Structure, shapes and types of `template` are required; its values are not used.
 
     Raises:
         PolicyError: where the names, a shape or a type differ from the template's.

@@ -64,10 +64,8 @@ class Case:
 def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:
     """Return the cases of a set by name (`case_001`, ...).
 
-    Args:
-        seed: seed of the set.
-        count: approximate number of cases, with the same share of every kind and at least one of
-            each; None: all.
+    The `count` of cases is approximate, with the same share of every kind and at least one of each;
+    None: all.
 
     Raises:
         ValueError: for a count below 1.

@@ -45,14 +45,9 @@ def fly_continuous(
 ) -> Flown:
     """Fly N trajectories in parallel.
 
-    Args:
-        nominal: vehicle whose constants the tracking controller uses.
-        truth: vehicle that flies; its rate loop gets the frequency of `conditions`.
-        trajectories: the trajectories; each is one flight.
-        conditions: rates and jitter of the time stamps.
-        rng: random generator of time stamps and gusts.
-        extra: additional physics; None: none.
-        step_s: longest step [s].
+    The tracking controller uses the constants of the `nominal` vehicle; the `truth` flies, with a
+    rate loop at the frequency of `conditions`. `rng` draws time stamps and gusts. Steps are at most
+    `step_s` long [s].
 
     Raises:
         FlightFailed: if a flight tips over, touches the ground or leaves its trajectory.

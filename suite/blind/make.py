@@ -53,13 +53,8 @@ def make_set(
 ) -> Manifest:
     """Make the missing cases in `out`, and return the manifest of the set.
 
-    Args:
-        out: folder of the set.
-        seed: seed of the set.
-        count: approximate number of cases; None: all.
-        console: shows the progress.
-        simulator: a key of `DRAWERS`. Sets of other simulators than `mujoco` are smaller.
-        workers: processes that make cases in parallel; None: this process.
+    The `count` of cases is approximate; None: all. The simulator is a key of `DRAWERS`; sets of
+    others than `mujoco` are smaller. Without workers, this process makes all cases.
 
     Raises:
         ValueError: if `out` has a set of another seed, count, simulator or table of strengths, a

@@ -203,12 +203,8 @@ def draw_change(
 ) -> tuple[np.ndarray, float]:
     """Draw a change of an effect's parameters in a random direction.
 
-    Args:
-        rng: random generator of the direction.
-        nominal: the vehicle file for the diagnosis.
-        sensors: name of the logged channels and their noise, a key of `SENSORS`.
-        effect: name of the effect.
-        multiple: strength, as a multiple of the just detectable one; physical bounds may reduce it.
+    The strength is a `multiple` of the just detectable one, which physical bounds may reduce.
+    `sensors` is a key of `SENSORS`.
 
     Returns:
         The change of each of the P parameter components that the table of strengths has (P,), and
@@ -247,12 +243,8 @@ def changed_values(
 ) -> Any:
     """Return the values of an effect: those in the nominal vehicle, plus a change.
 
-    Args:
-        nominal: the vehicle file for the diagnosis.
-        sensors: name of the logged channels and their noise.
-        effect: name of the effect.
-        change: (P,) change of each column in the table of strengths.
-        rng: random generator of components that are not identifiable.
+    `change` (P,) is that of each column in the table of strengths. `rng` draws the components that
+    are not identifiable.
     """
     nominal_values = all_values(nominal)[effect]
     fields = {k: np.array(value, dtype=float) for k, value in nominal_values._asdict().items()}

@@ -55,11 +55,8 @@ def fly_rotorpy(
 ) -> list[Recording]:
     """Fly `trajectories` in parallel in RotorPy.
 
-    Args:
-        nominal: vehicle whose constants the tracking controller, the rate loop and the mixer use.
-        truth: vehicle that flies.
-        trajectories: the trajectories; each is one flight.
-        rate_hz: rows of the records per second [Hz].
+    The tracking controller, the rate loop and the mixer use the constants of the `nominal` vehicle;
+    the `truth` flies. The records have `rate_hz` rows per second [Hz].
 
     Returns:
         The records of the flights.
@@ -116,9 +113,7 @@ class _RotorpyBodies:
 def hub_damping(effects: Sequence[Mapping[str, Any]], vehicle: Vehicle) -> np.ndarray:
     """Return the angular damping (3,) about body axes that moving hubs cause in hover [1/s].
 
-    Args:
-        effects: the true effects of a case, from its answer.
-        vehicle: the vehicle file for the diagnosis.
+    The true effects are those of a case's answer, the vehicle is that for the diagnosis.
     """
     drags = {
         effect["name"]: EFFECTS[effect["name"]].values(effect["parameters"]["coefficient"])

@@ -27,22 +27,12 @@ LONGEST_ERROR = 500
 """Largest number of characters of a stored reason."""
 
 
-def run_set(
-    out: Path,
-    diagnose: Diagnose,
-    console: Console,
-    workers: Workers | None = None,
-) -> int:
+def run_set(out: Path, diagnose: Diagnose, console: Console, workers: Workers | None = None) -> int:
     """Diagnose every case without a result, and return how many cases have a result then.
 
     The result of a case is the folder OUT/results/CASE with `diagnosis.json` and `seconds.json`. If
-    a diagnosis fails, the folder has `error.json`, and the next run tries the case again.
-
-    Args:
-        out: folder of the set.
-        diagnose: the diagnosis to run.
-        console: shows the progress.
-        workers: processes that diagnose cases in parallel; None: this process.
+    a diagnosis fails, the folder has `error.json`, and the next run tries the case again. Without
+    workers, this process diagnoses all cases.
     """
     results, names = out / RESULTS, list(load_manifest(out).cases)
     jobs = [

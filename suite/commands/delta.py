@@ -54,10 +54,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from tracks.common.grid import markdown
 
     fitting = replace(
-        FitConfig(),
-        held_out=config.held_out,
-        iterations=config.iterations,
-        seed=config.seed,
+        FitConfig(), held_out=config.held_out, iterations=config.iterations, seed=config.seed
     )
     recipe = with_model(named_recipe(config.recipe), config.model, config.vehicle)
     dynamics = recipe.quadrotor or recipe.physics

@@ -17,13 +17,7 @@ from suite.common.running.hosts import ProcessOptions, connect, read_member
 from suite.common.startup import use_device
 from suite.train.config import TrainConfig
 from suite.train.overrides import check_phases, phase_configs, with_changes
-from suite.train.recipes import (
-    finetune,
-    named_recipe,
-    with_iterations,
-    with_model,
-    with_sensors,
-)
+from suite.train.recipes import finetune, named_recipe, with_iterations, with_model, with_sensors
 from tracks.common.files import check_no_input, plain
 from tracks.input.ranges import Iterations, Range, Seed
 

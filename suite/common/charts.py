@@ -61,13 +61,9 @@ def curves_chart(
 ) -> bytes:
     """Return a PNG of gates, collisions and speed over gradient steps, a panel each.
 
-    Thick lines are running means, thin lines are single steps.
-
-    Args:
-        curves: label -> rows of the curve (metrics.jsonl); a curve without rows is left out.
-        colours: a colour for each curve.
-        follow: whether the curves after the first begin where the first one ends, as a fine-tuning
-            follows a training.
+    Thick lines are running means, thin lines are single steps. A curve has the rows of
+    metrics.jsonl; one without rows is left out. With `follow`, the curves after the first begin
+    where the first one ends, as a fine-tuning follows a training.
     """
     figure = Figure(figsize=(10.4, 3.1), layout="constrained")
     panels = figure.subplots(1, len(DRAWN))

@@ -56,12 +56,9 @@ class Console:
     ) -> Iterator[Update]:
         """Show the progress of a long piece of work; yields the function that reports it.
 
-        Args:
-            label: a short description of the work.
-            total: the value of `done` at the end of the work, in any unit.
-            clock: returns the time [s].
-            begun: the value of `done` at the beginning of the work, such as what an earlier call
-                has finished. It does not count for the estimate of the remaining time.
+        The reported `done` is `total` at the end, in any unit, and `begun` at the beginning. What
+        was done before, such as by an earlier call, does not count for the estimate of the
+        remaining time. `clock` returns the time [s].
         """
         if sys.stderr.isatty():
             with _bar(label, total, begun) as update:

@@ -113,12 +113,8 @@ def _bare(kind: Any) -> Any:
 def options(command: type, default: Any = None, advanced: bool = False) -> Iterator[Option]:
     """Yield the options of a command's configuration and of the dataclasses in its fields.
 
-    Inherited options come last.
-
-    Args:
-        command: class of the configuration, a dataclass.
-        default: an instance whose values are the defaults, in place of those of `command`.
-        advanced: whether all options of `command` are rare.
+    Inherited options come last. The values of `default` replace those of `command`, a dataclass.
+    With `advanced` all options are rare.
     """
     hints, texts = get_type_hints(command, include_extras=True), all_field_texts(command)
     not_inherited = command.__dict__.get("__annotations__", {})
@@ -138,12 +134,8 @@ def read_options(
 ) -> tuple[Any, list[str]]:
     """Return the configuration from `args`, and the words that belong to no option.
 
-    Args:
-        kind: class of the configuration.
-        prog: name of the program in the help.
-        about: beginning of the help.
-        args: the words of the command line.
-        all_known: if a word belongs to no option, exit with a list of similar options.
+    The help begins with `prog` and `about`. With `all_known`, a word that belongs to no option ends
+    the program with a list of similar options.
 
     Raises:
         SystemExit: after --help (code 0), and for invalid options (code 2).

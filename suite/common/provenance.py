@@ -100,9 +100,7 @@ def _sources(module: str) -> list[Path]:
 def run_record(config: Any, seed: int | None) -> dict[str, Any]:
     """Return everything that is needed to repeat a run: stamp, versions, machine and `config`.
 
-    Args:
-        config: the configuration with all defaults filled in, a dataclass.
-        seed: seed of the run; None if it has none.
+    The dataclass `config` has all defaults filled in. The seed is None if the run has none.
     """
     return {
         **stamp(schema=1, seed=seed),
@@ -144,12 +142,8 @@ def write_run_record(
 ) -> None:
     """Write `run_record` to `folder`/run.json.
 
-    Args:
-        folder: folder of the run.
-        config: the configuration with all defaults filled in, a dataclass.
-        seed: seed of the run; None if it has none.
-        resumed: whether an interrupted run in this folder continues. The git commits in its record
-            are then kept as `earlier_commits`, since their code made a part of the run.
+    With `resumed`, an interrupted run in this folder continues. The git commits in its record are
+    kept as `earlier_commits`, since their code made a part of the run.
 
     Raises:
         ValueError: if the existing record cannot be read.

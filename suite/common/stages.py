@@ -49,10 +49,8 @@ def claim(out: Path, config: Any, seed: int) -> None:
 def differences(stored: Any, new: Any, name: str = "") -> list[str]:
     """Return the differences of two plain values (as in JSON), as "name is X there, Y here".
 
-    Args:
-        stored: the value of an earlier run ("there").
-        new: the value of this run ("here").
-        name: name of the compared values; the names of nested ones are appended to it.
+    `stored` is of an earlier run ("there"), `new` of this one ("here"). The names of nested values
+    are appended to `name`.
     """
     if isinstance(stored, Mapping) and isinstance(new, Mapping):
         changes = []
@@ -90,11 +88,7 @@ def run_stages(
 ) -> dict[str, float]:
     """Do the unfinished stages one after the other, each in its folder.
 
-    Args:
-        out: folder of the run.
-        stages: all stages of the run, in order.
-        console: shows the estimate of the remaining work, and each stage.
-        title: short description of the run.
+    The console shows the estimate of the remaining work, and each stage.
 
     Returns:
         The time that each stage took, by its name [s].

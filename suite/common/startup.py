@@ -132,10 +132,8 @@ def clean_jax_environment(environment: MutableMapping[str, str] | None = None) -
     """Remove environment variables of JAX that could change results or end the command.
 
     JAX has about a hundred variables, so the harmless ones are listed here (KEPT_PREFIXES and
-    DEBUG_SWITCHES). FULL_PRECISION is set.
-
-    Args:
-        environment: changed in place; by default that of this process.
+    DEBUG_SWITCHES). FULL_PRECISION is set. The environment (by default that of this process) is
+    changed in place.
 
     Returns:
         The names of the removed variables.
@@ -162,11 +160,9 @@ def keep_compiled(environment: MutableMapping[str, str] | None = None) -> None:
     """Make JAX keep compiled programs in the user's cache, unless another folder is set.
 
     XLA, the compiler of JAX, needs 15 s for the model of a diagnosis and longer for a training. A
-    second call of the same command reads the compiled programs.
-
-    Args:
-        environment: changed in place; by default that of this process. An existing
-            JAX_COMPILATION_CACHE_DIR, also an empty one, is not changed.
+    second call of the same command reads the compiled programs. The environment (by default that of
+    this process) is changed in place. An existing JAX_COMPILATION_CACHE_DIR, also an empty one, is
+    not changed.
     """
     values = os.environ if environment is None else environment
     if "JAX_COMPILATION_CACHE_DIR" not in values:

@@ -53,10 +53,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "suite eval --track ellipse --difficulty 9 --trials 50",
         "suite eval --policy race --policy mine.onnx --difficulty 0,3 --trials 100",
     ),
-    "compare": (
-        "suite compare runs/a runs/b",
-        "suite compare runs/mine --against runs/race",
-    ),
+    "compare": ("suite compare runs/a runs/b", "suite compare runs/mine --against runs/race"),
     "view": (
         "suite view runs/eval --pick failed --video",
         "suite view race --track zigzag --difficulty 9 --seed 3 --gif",
@@ -89,10 +86,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "suite import flight.ulg --out flight.parquet",
         "suite import flight.csv --map mine.toml --out flight.parquet",
     ),
-    "check": (
-        "suite check flight.parquet --vehicle mine.toml",
-        "suite check --policy mine.onnx",
-    ),
+    "check": ("suite check flight.parquet --vehicle mine.toml", "suite check --policy mine.onnx"),
     "identify": (
         "suite identify flight.parquet --vehicle racer5 --out mine.toml",
         "suite identify logs/*.parquet --vehicle mine.toml --out better.toml",
@@ -106,10 +100,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "tracks": ("suite tracks", "suite tracks ellipse --difficulty 9 --seed 3"),
     "effects": ("suite effects", "suite effects linear_drag"),
     "reproduce": ("suite reproduce status", "suite reproduce table2 --out docs/results"),
-    "blind": (
-        "suite blind make --out runs/blind",
-        "suite blind run --out runs/blind",
-    ),
+    "blind": ("suite blind make --out runs/blind", "suite blind run --out runs/blind"),
     "bench": ("suite bench", "suite bench train"),
     "completion": ("suite completion bash", "suite completion zsh"),
     "info": ("suite info", "suite info --json"),
@@ -152,9 +143,7 @@ def first_paragraph(text: str | None) -> str:
 def description(name: str, about: str) -> str:
     """Return the beginning of a command's help: its purpose, its examples, then further notes.
 
-    Args:
-        name: name of the command.
-        about: docstring of its options; the first paragraph is the purpose, the others are notes.
+    The first paragraph of `about` is the purpose, the others are notes.
     """
     purpose, *paragraphs = [" ".join(part.split()) for part in about.split("\n\n")]
     # A line that begins with a space keeps its break; others are joined, and not wrapped.

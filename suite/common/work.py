@@ -53,10 +53,8 @@ class Forwarding(Silent):
 def read_workers_option(text: str | None, whole_cores: bool = False) -> Workers | None:
     """Return the workers of the option `--workers`; None without it.
 
-    Args:
-        text: value of the option.
-        whole_cores: refuse more processes than this machine has cores, because each of them keeps
-            a core busy.
+    With `whole_cores`, more processes than this machine has cores are refused, because each of them
+    keeps a core busy.
 
     Raises:
         ValueError: with the option and what is allowed.

@@ -132,13 +132,8 @@ def _descend(
 ) -> Any:
     """Return the variables that minimise `loss` on batches of `windows`, by Adam.
 
-    Args:
-        config: batch size, learning rate and seed.
-        loss: (variables, batch of windows) -> the loss.
-        start: the initial variables.
-        windows: the windows of the fit.
-        iterations: number of gradient steps.
-        after_step: called with (iteration, variables) after every step.
+    `loss` maps the variables and a batch of windows to the loss. `after_step` is called with the
+    iteration and the variables after every gradient step.
     """
     optimizer = optax.adam(optax.cosine_decay_schedule(config.rate, iterations))
 
@@ -192,12 +187,7 @@ def fit_network(
 ) -> DeltaFit:
     """Fit a network by gradients through `replay` to `fit_windows`; evaluate it on `held_out`.
 
-    Args:
-        config: the fit.
-        replay: simulates windows; differentiable.
-        fit_windows: windows of the flights of the fit.
-        held_out: windows of held-out flights.
-        show: called with (iteration, text) during the fit.
+    The `replay` is differentiable. `show` is called with the iteration and a text.
     """
     errors = jax.jit(partial(window_errors, replay))
     # Division that rounds up: at most CURVE_WINDOWS windows are selected.
@@ -251,12 +241,8 @@ def fit_point_mass(
 ) -> DeltaFit:
     """Fit the Delta Action Model of the point mass, and a point mass for comparison.
 
-    Args:
-        config: the fit.
-        physics: the trainer's point mass. The network corrects the middle of its ranges.
-        fit_windows: windows of the flights of the fit.
-        held_out: windows of held-out flights.
-        show: called with (iteration, text) during the fit.
+    The network corrects the middle of the ranges of `physics`, the trainer's point mass. `show` is
+    called with the iteration and a text.
     """
     nominal = partial(replay_point_mass, nominal_model(physics))
     network = fit_network(config, nominal, fit_windows, held_out, show)

@@ -91,14 +91,9 @@ def cut_quadrotor_windows(
 ) -> tuple[QuadrotorWindows, Substeps]:
     """Return windows of all flights, and the physics steps of one row.
 
-    A window is left out if a value is missing or a row is not `row_s` long (within 20 %).
-
-    Args:
-        logs: the flights.
-        config: the vehicle and its physics rate.
-        duration_s: length of a window [s].
-        stride_s: approximate time between the starts of windows [s].
-        row_s: time between rows [s]; by default `row_period` of these logs.
+    A window is left out if a value is missing or a row is not `row_s` long (within 20 %). Windows
+    are `duration_s` long, and start about `stride_s` apart [s]. The default of `row_s` [s] is
+    `row_period` of these logs.
 
     Raises:
         ValueError: if a log has no actions, or all flights are shorter than a window.
@@ -191,13 +186,8 @@ def replay_quadrotor(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return pos_w [m] and vel_w [m/s] after every row, and the corrections of the actions [m/s^2].
 
-    Each is (N, T, 3).
-
-    Args:
-        config: the vehicle; its randomisation is not used.
-        substeps: physics steps of one row.
-        windows: the recorded flights.
-        delta: parameters of the Delta Action network; None for no correction.
+    Each is (N, T, 3). The vehicle's randomisation is not used. Without `delta`, the parameters of
+    the Delta Action network, there is no correction.
     """
     plant = plant_of(config, {}, substeps.dt, varies=False)
     count = windows.pos_w.shape[0]

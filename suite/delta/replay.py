@@ -50,14 +50,10 @@ def replay_point_mass(
     """Simulate the windows; return positions and velocities after every decision, and corrections.
 
     They are pos_w [m], vel_w [m/s] and the corrections in body axes [m/s^2], (N, T, 3) each. A
-    window is a short part of a measured flight. The measured state is used only at its start
-    (Su et al. 2026, Eq. delta_action_loss). Only the heading, which the point mass does not
-    determine, is the measured one in all steps.
-
-    Args:
-        model: parameters of the point mass.
-        windows: the recorded flights, N windows of T decisions.
-        delta: parameters of the Delta Action network; None for no correction.
+    window is a short part of a measured flight. The measured state is used only at its start (Su et
+    al. 2026, Eq. delta_action_loss). Only the heading, which the point mass does not determine, is
+    the measured one in all steps. Without `delta`, the parameters of the Delta Action network,
+    there is no correction.
     """
     count = windows.action_b.shape[0]
     rot_w = jnp.asarray(windows.rot_w)
@@ -132,13 +128,9 @@ def check_corrects(
 ) -> None:
     """Refuse a Delta Action Model of other dynamics than the training's.
 
-    Args:
-        fit: the description in the checkpoint. Without the key `model` it counts as that of a point
-            mass. Without `rate_hz` the network is valid for any rate.
-        dynamics: the dynamics of the training.
-        rate_hz: rate of the trained policy's decisions [Hz]; the network makes one step per
-            decision.
-        checkpoint: the model's folder, for the message.
+    `fit` is the description in the checkpoint (a folder, for the message). Without the key `model`
+    it counts as that of a point mass. Without `rate_hz` the network is valid for any rate of
+    decisions [Hz]; it makes one step per decision.
 
     Raises:
         ValueError: if model, rate or parameters differ.

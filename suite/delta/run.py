@@ -110,14 +110,10 @@ def fit_delta(
     out: Path,
     console: Console,
 ) -> DeltaFit:
-    """Fit the Delta Action Model to flight logs; write the checkpoint, the curve and the table.
+    """Fit the Delta Action Model to flight logs; write delta/, delta.json and table.md into `out`.
 
-    Args:
-        config: the fit.
-        dynamics: the corrected point mass or quadrotor of the trainer.
-        paths: flight logs, and folders of them.
-        out: folder for delta/, delta.json and table.md.
-        console: shows the progress.
+    It corrects the trainer's point mass or quadrotor, `dynamics`. Paths are logs and folders of
+    them.
 
     Raises:
         ValueError: for invalid logs.

@@ -20,15 +20,15 @@ from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.examine import examine, one_cause, without_names
 from suite.diagnose.sources.rollout_source import pose_delays, rollouts_of
 from suite.diagnose.sources.rollouts import by_rollouts
-from suite.diagnose.sources.source import DiagnosisInput, Finding, Source, SourceSet
+from suite.diagnose.sources.source import DiagnosisInput, Finding, SourceSet
 from suite.diagnose.sources.views import by_views
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.actuators import TestedEffect, integrator_of
 
-SourceMaker = Callable[[DiagnosisInput, Sequence[Source]], SourceSet | None]
-"""Function that makes sources from the input and the sources made before; None if it makes none."""
+SourceMaker = Callable[[DiagnosisInput], SourceSet | None]
+"""Function that makes sources from the input; None if it makes none."""
 SOURCES: dict[str, SourceMaker] = {"rollouts": by_rollouts, "views": by_views}
-"""Functions that make the sources of evidence, by name, in the order in which they are called."""
+"""Functions that make the sources of evidence, by name; the first that makes any counts."""
 
 
 def diagnose(
@@ -87,11 +87,7 @@ def diagnose(
 
 def _diagnose(given: DiagnosisInput, makers: Sequence[SourceMaker], seed: int) -> Diagnosis:
     """Return the diagnosis by the sources that `makers` make."""
-    # Make the sources.
-    flights = SourceSet((), (), "")
-    for make in makers:
-        made = make(given, flights.sources)
-        flights = flights if made is None else flights.joined(made)
+    flights = next(made for make in makers if (made := make(given)) is not None)
     # Search and test with each source; `findings` holds those of the sources before it.
     findings, warnings = list[Finding](), list(flights.warnings)
     for source in flights.sources:

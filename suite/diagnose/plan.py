@@ -55,11 +55,7 @@ def trajectories_for(result: Mapping[str, Any]) -> tuple[list[Trajectory], list[
 
 SCHEMA = 1
 """Version of plan.json."""
-COLUMNS = (
-    "time",
-    *(f"{stem}_{axis}" for stem in ("pos", "vel", "acc") for axis in "xyz"),
-    "yaw",
-)
+COLUMNS = ("time", *(f"{stem}_{axis}" for stem in ("pos", "vel", "acc") for axis in "xyz"), "yaw")
 """Columns of a CSV: time [s]; position [m], velocity [m/s] and acceleration [m/s^2] in the world
 frame; yaw [rad]."""
 NAME = "plan.json"
@@ -84,10 +80,7 @@ def remove_plan(folder: Path) -> None:
 def write_plan(folder: Path, ways: Sequence[Trajectory], words: Sequence[str]) -> dict[str, Any]:
     """Write plan.json and the set points of each flight into `folder`; without flights, nothing.
 
-    Args:
-        folder: folder for the files. An earlier plan in it is removed.
-        ways: one trajectory for each flight.
-        words: advice for people, which the plan contains.
+    An earlier plan in it is removed. `words` are advice for people, which the plan contains.
 
     Returns:
         The content of plan.json.

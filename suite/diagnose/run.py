@@ -71,10 +71,7 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     # Some options need rollouts. `flown` has them, and is None if only force and torque were used.
     flown, files = rollouts_of(diagnosis.main), {"vehicle.toml", "diagnosis.json"}
     if flown is None:
-        wanted = {
-            "--drive": config.drive != "auto",
-            "--integrator": config.integrator != "auto",
-        }
+        wanted = {"--drive": config.drive != "auto", "--integrator": config.integrator != "auto"}
         unused = [flag for flag, is_given in wanted.items() if is_given]
         warnings += [f"{flag} needs rollouts, which these flights do not allow" for flag in unused]
     result["warnings"] = [*warnings, *result["warnings"]]

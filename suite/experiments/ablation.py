@@ -141,12 +141,9 @@ def weight(row: Summary) -> float:
 
 
 def pooled(row: Summary, name: str, trials: int) -> Interval:
-    """Return the Wilson interval of a rate over the trials of all training seeds together.
+    """Return the Wilson interval of a rate (one of `RATES`) over all training seeds together.
 
-    Args:
-        row: the setting.
-        name: measure of `RATES`.
-        trials: number of trials of each seed.
+    Each seed has the given number of trials.
     """
     return wilson(sum(round(trials * x) for x in row.values(name)), trials * len(row.trainings))
 

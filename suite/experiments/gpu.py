@@ -297,12 +297,8 @@ def short_training(
 ) -> dict[str, Any]:
     """Train by the recipe gpu for about `config.seconds`, and judge the policy.
 
-    Args:
-        config: options of the experiment.
-        vehicle: vehicle of the judged trials.
-        step_s: time of a gradient step of the last phase [s]; it determines the number of steps.
-        workspace: cache; an earlier run is removed, since the time of the training is a result.
-        console: shows progress.
+    The time `step_s` of a gradient step of the last phase [s] determines the number of steps. An
+    earlier run is removed from the cache, since the time of the training is a result.
     """
     base = recipe(config, config.train_worlds)
     # Phases differ in the decisions of a gradient step, and its time is proportional to them. With

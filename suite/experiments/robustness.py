@@ -77,12 +77,7 @@ def condition_grid(
     """Return a table of the success rates under each of `entries`, and their changes from `base`.
 
     Every entry has a row. With several policies, further columns compare the others with the first.
-
-    Args:
-        entries: results under the conditions.
-        base: results under the undisturbed condition.
-        first: headers of the first columns: the size, or the name and the size.
-        title: title of the table.
+    The headers `first` are those of the size, or of the name and the size.
     """
     headers, names = list(first), list(base.results)
     for name in names:

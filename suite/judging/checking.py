@@ -26,11 +26,7 @@ def check_policy(
 ) -> tuple[Policy, dict[str, Any]]:
     """Return the policy, and the command's answer: its contract and the findings about it.
 
-    Args:
-        name: a shipped name, a checkpoint's folder or a policy file.
-        trust: whether files that can run code may be loaded.
-        trials: number of short flights that show the policy's actions; may be 0.
-        console: shows every finding.
+    The policy shows its actions in short flights, `trials` of them, perhaps none.
 
     Raises:
         ValueError: if the policy is refused.
@@ -48,13 +44,8 @@ def check_flight_files(
 ) -> dict[str, Any]:
     """Return the command's answer about flights and a vehicle file: the findings about them.
 
-    Args:
-        flights: logs, or folders of them.
-        vehicle: a file or a shipped name; "" for none.
-        policy: a policy whose rate and camera are compared with those of the flights; None: no
-            comparison.
-        out: folder for the corrected flights; None writes nothing.
-        console: shows every finding.
+    The rate and camera of a `policy` are compared with those of the flights. `out` is a folder for
+    the corrected flights; None writes nothing. `vehicle` may be "" for none.
 
     Raises:
         ValueError: for invalid files.
@@ -139,10 +130,7 @@ def _check_outputs(files: Sequence[Path], out: Path) -> None:
 def policy_findings(policy: Policy, trials: int, console: Console) -> list[dict[str, Any]]:
     """Return the findings about a policy's interface, as records of `suite check`.
 
-    Args:
-        policy: the loaded policy.
-        trials: number of short flights that show the policy's actions; may be 0.
-        console: shows the contract and the share of limited actions.
+    The policy shows its actions in short flights, `trials` of them, perhaps none.
     """
     from eval.judging.outputs import probable_faults
 

@@ -24,13 +24,7 @@ from suite.judging.flying import (
     workers_for,
 )
 from suite.judging.requests import Collection
-from suite.judging.trials import (
-    TrialSet,
-    log_name,
-    read_trial_set,
-    refuse_equal_names,
-    show_notes,
-)
+from suite.judging.trials import TrialSet, log_name, read_trial_set, refuse_equal_names, show_notes
 from tracks.common.files import write_json
 from tracks.common.provenance import git_commit, stamp
 from tracks.common.work import Workers

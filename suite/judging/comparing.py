@@ -150,11 +150,9 @@ def paired_sentence(name_a: str, name_b: str, a: np.ndarray, b: np.ndarray) -> s
 def compare_seeds(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, Any]:
     """Return the success rate of a method, or the difference of two methods, over training seeds.
 
-    It has the mean, its interval over seeds and trials, and the standard deviation over seeds.
-
-    Args:
-        runs: a run for each training seed of the method, all on the same trials.
-        others: the same for a second method, whose rate is subtracted; may be empty.
+    It has the mean, its interval over seeds and trials, and the standard deviation over seeds. A
+    method has a run for each training seed, all on the same trials. The rate of `others`, if there
+    are any, is subtracted.
 
     Raises:
         ValueError: if conditions or trials differ, or a method has only one seed, or several

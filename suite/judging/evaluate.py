@@ -117,11 +117,7 @@ def evaluate(
         "flown_otherwise": trial_set.differences,
     }
     write_results(
-        out,
-        results,
-        table_markdown=markdown_table(summary),
-        summary=summary,
-        seed=evaluation.seed,
+        out, results, table_markdown=markdown_table(summary), summary=summary, seed=evaluation.seed
     )
     write_run_record(out, evaluation, evaluation.seed)
     # A journal stays if it has trials that this command does not request.

@@ -121,10 +121,7 @@ def policy_labels(
 ) -> list[str]:
     """Return each policy's label: its name, or its source if several policies have that name.
 
-    Args:
-        sources: the names or paths that the user gave.
-        names: the names of the loaded policies, in the same order.
-        option: the option with which the user gave the sources, for the message.
+    The user gave the `sources` with `option`; `names` are those of the loaded policies.
 
     Raises:
         ValueError: if a source is given twice.
@@ -176,13 +173,6 @@ def policy_for_workers(
     """Return the loaded policy, or for several processes a function that loads it.
 
     Processes of this machine read the policy's files; those of a cluster get the files' content.
-
-    Args:
-        policy: the loaded policy, in its manner.
-        name_or_path: name or path from which it was loaded.
-        trust: whether files that can run code may be loaded.
-        workers: the processes or cluster that fly the trials.
-        manner: speed and monitor of the flights.
     """
     if workers == 1:
         return policy

@@ -94,11 +94,8 @@ def fly_again(
 ) -> Replay:
     """Fly `trials` as they were judged, and return their flights.
 
-    Args:
-        evaluation: settings of the trials.
-        trials: the trials to fly.
-        policy: one of the evaluation's policies; None: the first one.
-        judged: expected SHA-256 of the inputs, from `read_digests`; None: no comparison.
+    The policy is one of the evaluation's; None: the first one. `judged` has the expected SHA-256 of
+    the inputs, from `read_digests`; None: no comparison.
 
     Raises:
         ValueError: if the policy, vehicle, sensors or a track has changed.
@@ -131,14 +128,7 @@ def fly_again(
             flights[result.trial] = flight
 
     results = fly(
-        loaded,
-        trials,
-        vehicle,
-        evaluation.simulator,
-        options,
-        keep,
-        Record(depth=True),
-        tracks,
+        loaded, trials, vehicle, evaluation.simulator, options, keep, Record(depth=True), tracks
     )
     rollouts = [
         (track_of(tracks, trial), flights[trial], result)

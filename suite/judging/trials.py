@@ -137,13 +137,8 @@ def read_trial_set(
 ) -> TrialSet:
     """Return the trials that a command's options describe.
 
-    A track from a file is flown only once if all its flights would be equal.
-
-    Args:
-        options: the options of the command.
-        real_time: whether flights are in real time. Then no two flights are equal.
-        track: a track that is flown instead of those that `options` name.
-        vehicle: a vehicle that flies instead of the one that `options` name.
+    A track from a file is flown only once if all its flights would be equal. In real time no two
+    flights are equal. `track` and `vehicle` fly instead of those that `options` name.
 
     Raises:
         ValueError: for an unknown simulator or track, too few trials, or an invalid file.

@@ -59,9 +59,8 @@ def policy_results(
 ) -> list[PolicyResult]:
     """Return the results of every policy, in the order of `results`.
 
-    Args:
-        results: results of each policy, on the same trials in the same order.
-        references: names of the policies with which the others are compared.
+    All policies have the same trials in the same order. The others are compared with the
+    `references`.
 
     Raises:
         ValueError: if the trials differ.

@@ -130,11 +130,6 @@ def loop_by_content(config: LoopConfig) -> LoopConfig:
     return replace(config, policy=policy, vehicle=vehicle, sensors=sensors, hidden_vehicle=hidden)
 
 
-def default_recipe(policy: str | None) -> str:
-    """Return the recipe for fine-tuning a policy: the recipe of its name, else `race`."""
-    return policy if policy in RECIPES else "race"
-
-
 def resolve(
     *,
     recipe: str | None = None,
@@ -175,7 +170,8 @@ def resolve(
     hidden = hidden_vehicle is not None or simulator != EXACT_SIMULATORS[0]
     if hidden and policy is None:
         policy = default_policy()
-    recipe = default_recipe(policy) if recipe is None else recipe
+    if recipe is None:
+        recipe = policy if policy in RECIPES else "race"
     training = replace(named_recipe(recipe), seed=seed)
     sizes = HIDDEN_SIZES if hidden else SIZES
     size = sizes.get(recipe, sizes[""])

@@ -36,11 +36,8 @@ def run_loop(
 ) -> dict[str, Any]:
     """Run the loop, or its remaining stages, and print its results.
 
-    Args:
-        config: all settings of the loop.
-        out: the folder of the loop; an unfinished loop with the same settings in it continues.
-        console: shows progress and results.
-        workers: number of processes that fly and fine-tune; it may change between calls.
+    An unfinished loop with the same settings in `out` continues, perhaps with another number of
+    workers.
 
     Returns:
         The contents of loop.json, and `out`.

@@ -28,11 +28,7 @@ def overall_grid(
 ) -> Grid:
     """Return the table over all trials, a row per policy: success, differences, gates and speed.
 
-    Args:
-        results: results of the policies.
-        references: names of the policies with which the others are compared, two columns each.
-        labels: label of each policy in the table.
-        trials: number of trials of each policy.
+    Each of the `references` has two columns, in which the others are compared with it.
     """
     headers = ["policy", "success [%]"]
     for reference in references:

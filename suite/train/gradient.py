@@ -57,11 +57,7 @@ def encoder_gradient(
 
 
 def sampled_encoder_gradient(
-    params: network.Params,
-    images: jax.Array,
-    cotangents: jax.Array,
-    stride: int,
-    key: jax.Array,
+    params: network.Params, images: jax.Array, cotangents: jax.Array, stride: int, key: jax.Array
 ) -> network.Params:
     """Return the encoder's gradient from the images of every `stride`-th step, times `stride`.
 

@@ -111,10 +111,8 @@ def _check_model(config: object, keys: list[str], change: str) -> None:
 def check_owned(changes: Iterable[str], owned: Mapping[str, str], option: str = "--set") -> None:
     """Refuse changes of settings that the command sets itself.
 
-    Args:
-        changes: the user's changes, each PATH=VALUE.
-        owned: path of a setting, or of a part with all its settings -> advice for the message.
-        option: the option with the changes, for the message.
+    Changes are PATH=VALUE, given with `option`. `owned` maps the path of a setting, or of a part
+    with all its settings, to advice for the message.
 
     Raises:
         ValueError: naming the setting and what to do instead.
@@ -243,11 +241,9 @@ def _common_settings(config: TrainConfig, run: TrainConfig) -> dict[str, object]
 def with_changes(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
     """Return `config` with a user's changes, which hold in every phase or from one phase on.
 
-    Args:
-        config: settings of the run.
-        changes: PATH=VALUE, such as "loss.progress=0.4", for every phase; "phases.2.PATH=VALUE"
-            holds from the second phase until a later phase changes that setting. A change of
-            spec.rate_hz without one of episode.steps keeps the length of rollouts [s].
+    A change PATH=VALUE, such as "loss.progress=0.4", holds for every phase. "phases.2.PATH=VALUE"
+    holds from the second phase until a later phase changes that setting. A change of spec.rate_hz
+    without one of episode.steps keeps the length of rollouts [s].
 
     Raises:
         ValueError: naming the setting, what is wrong with it and what is allowed.

@@ -166,10 +166,7 @@ def finetune(config: TrainConfig, share: float = 0.25) -> TrainConfig:
     """Return the settings of fine-tuning a policy that was trained with `config`.
 
     They are those of the last phase, with fewer steps, a lower learning rate and other tracks.
-
-    Args:
-        config: the settings of the policy's training.
-        share: number of gradient steps, as a share of those of the last phase.
+    `share` is the number of gradient steps, as a share of those of the last phase.
     """
     last = phase_configs(config)[-1]
     optimizer = last.optimizer
@@ -284,11 +281,8 @@ def _inertia(vehicle: Vehicle) -> float:
 def with_model(config: TrainConfig, model: str | None, vehicle: str | None) -> TrainConfig:
     """Return `config` with the dynamics that the options --model and --vehicle choose.
 
-    Args:
-        config: a recipe.
-        model: "point" or "quad"; None: that of the recipe.
-        vehicle: a vehicle file or a shipped name, if the model is a quadrotor; None: that of the
-            recipe, if it has one.
+    The model is "point" or "quad", and the vehicle of a quadrotor a file or a shipped name. None
+    keeps that of the recipe.
 
     Raises:
         ValueError: for a point mass with a vehicle, "quad" without one, or an invalid vehicle.
@@ -337,11 +331,8 @@ def race_settings(recipe: str, vehicle: str = "racer5") -> dict[str, Any]:
     """Return arguments of the environments in `eval.envs`, to train another learner like a recipe.
 
     They are `spec`, the policy's observation, and `vehicle`, a function that draws vehicles with
-    the recipe's randomisation. A recipe through a point mass gets the default randomisation.
-
-    Args:
-        recipe: a name of `suite train`.
-        vehicle: a file or a shipped name; the centre of the randomisation.
+    the recipe's randomisation. A recipe through a point mass gets the default randomisation. The
+    centre of the randomisation is `vehicle`, a file or a shipped name.
 
     Raises:
         ValueError: for an unknown recipe or vehicle.

@@ -53,12 +53,9 @@ def estimate(
 ) -> Estimate:
     """Return the approximate time and memory of a run on this machine's devices.
 
-    Args:
-        config: the run.
-        steps_per_core_s: environment steps of one processor core, gradient included [1/s].
-        compile_s: time to compile a phase [s].
-        passes: number of passes over the steps of an iteration.
-        images: number of copies of an iteration's images in memory.
+    A processor core makes `steps_per_core_s` environment steps with gradient [1/s], and a phase
+    compiles in `compile_s` [s]. An iteration makes `passes` over its steps, and needs memory for
+    `images` copies of its images.
     """
     pixels = config.spec.camera.height * config.spec.camera.width
     # An accelerator counts as 50 cores, a rough value.
@@ -74,11 +71,7 @@ def estimate(
 
 
 def load_start_params(policy: str, spec: PolicySpec) -> network.Params:
-    """Return the parameters of `policy`, converted for a policy with `spec`.
-
-    Args:
-        policy: a shipped policy's name or a checkpoint's folder.
-        spec: inputs and network of the policy to train.
+    """Return the parameters of a policy (name or checkpoint's folder), converted to `spec`.
 
     Raises:
         ValueError: if the policy does not exist, or has an input that `spec` lacks.
@@ -99,17 +92,12 @@ def train(
     watch: Watch | None = None,
     mirror: Mirror | None = None,
 ) -> Outcome:
-    """Train for the configured iterations; the same call again resumes.
+    """Train for the configured iterations; the same call again resumes the run in `folder`.
 
-    Args:
-        config: the whole run.
-        folder: where the run's files go; a run of the same configuration in it is resumed.
-        console: shows progress.
-        params: initial parameters instead of random ones.
-        delta: parameters of a Delta Action network, which corrects every action so that simulated
-            flights match measured ones; they are not trained.
-        watch: measures the policy during the training; only in a single process.
-        mirror: a function that also receives the rows of the learning curve.
+    `params` replace random initial parameters. `delta` are parameters of a Delta Action network,
+    which are not trained. It corrects every action so that simulated flights match measured ones.
+    `watch` measures the policy during the training, in a single process only. `mirror` also
+    receives the rows of the learning curve.
 
     Raises:
         ValueError: for invalid settings, if the folder has a run of another configuration, start or

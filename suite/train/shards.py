@@ -107,12 +107,8 @@ def make_shards(
     """Return shards(params, hidden, iteration, worlds) -> all shards of a batch, in order.
 
     `worlds` is the whole batch; `hidden` (B, hidden) are recurrent states from the last rollout.
-    Every process computes its part of the shards and receives those of the others.
-
-    Args:
-        config: the run.
-        delta: parameters of a Delta Action network, which corrects every action so that simulated
-            flights match measured ones; they are not trained.
+    Every process computes its part of the shards and receives those of the others. `delta` is as
+    for `suite.train.run.train`.
     """
     gradient_of, seed = make_gradient(config), jax.random.key(np.uint32(config.seed))
     shards, size = config.episode.shards, config.episode.batch // config.episode.shards

@@ -76,12 +76,8 @@ def norm(vector: jax.Array) -> jax.Array:
 def target_gate(gates: Gates, target: jax.Array, ahead: int = 0) -> tuple[Gates, jax.Array]:
     """Return the next gate (B, ...) of each world and the point to fly to (B, 3) [m].
 
-    As in the judge, the last gate is returned where there is no later one.
-
-    Args:
-        gates: the tracks' gates.
-        target: (B,) number of passed gates.
-        ahead: number of gates to skip: 1 returns the gate after the next one.
+    As in the judge, the last gate is returned where there is no later one. `target` (B,) is the
+    number of passed gates. `ahead` gates are skipped: 1 returns the gate after the next one.
     """
     count = gates.center_w.shape[1]
     index = jnp.minimum(target + ahead, count - 1)
@@ -94,11 +90,8 @@ def approach_shift(config: LossConfig, place_g: jax.Array) -> jax.Array:
     """Return by how much the goal is moved to a point before the gate, on its axis, (B,) [m].
 
     The further the drone is off the axis or beyond the gate's plane, the larger the distance. The
-    straight line to the gate's centre would hit the frame.
-
-    Args:
-        config: the largest shift, `approach_m`.
-        place_g: (B, 3) positions in the gates' frames [m].
+    straight line to the gate's centre would hit the frame. `place_g` (B, 3) are positions in the
+    gates' frames [m]. The largest shift is `approach_m`.
     """
     place_g = jax.lax.stop_gradient(place_g)
     distance_off = norm(place_g[:, 1:]) + jnp.maximum(place_g[:, 0], 0.0)
@@ -134,13 +127,6 @@ def make_step(
     """Return the step from `before` to `after` of worlds that have passed `target` (B,) gates.
 
     Gates and obstacles are evaluated without gradient.
-
-    Args:
-        config: settings of the progress term's goal, and the safety radius.
-        worlds: have the gates and obstacles.
-        before: state at the step's beginning.
-        after: state at its end.
-        target: (B,) number of passed gates.
     """
     gates = worlds.scene.gates
     gate, _ = target_gate(gates, target)

@@ -40,10 +40,8 @@ class TrainState(NamedTuple):
 def make_optimizer(config: OptimizerConfig, begin: int = 0) -> optax.GradientTransformation:
     """Return AdamW with warm-up, cosine decay and optional clipping by global norm.
 
-    Args:
-        config: the optimiser's settings in the run, or in one of its phases.
-        begin: gradient steps of the run before that phase. The schedule starts again at them, while
-            AdamW's moments and its count of steps are kept.
+    A phase begins after `begin` gradient steps of the run. The schedule starts again there, while
+    AdamW's moments and its count of steps are kept.
     """
     rate = optax.warmup_cosine_decay_schedule(
         0.0,
@@ -77,13 +75,8 @@ def make_update(
 ) -> Callable[[TrainState, Worlds], tuple[TrainState, dict[str, jax.Array]]]:
     """Return update(state, worlds) -> (state', the curve's row), which makes one gradient step.
 
-    It is compiled on the first call.
-
-    Args:
-        config: settings of the run, or of one of its phases.
-        delta: parameters of a Delta Action network, which corrects every action so that simulated
-            flights match measured ones; they are not trained.
-        begin: gradient steps of the run before that phase.
+    It is compiled on the first call. A phase begins after `begin` gradient steps of the run.
+    `delta` is as for `suite.train.run.train`.
     """
     optimizer, shards_of = make_optimizer(config.optimizer, begin), make_shards(config, delta)
 

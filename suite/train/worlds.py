@@ -98,12 +98,8 @@ def _draw_free_point(
     """Return a start point (3,) away from obstacles [m], and the index of its next gate.
 
     Up to `START_DRAWS` gates and points are drawn. The first point with a clearance of
-    `START_CLEARANCE_M` is taken, or the one with the largest clearance.
-
-    Args:
-        track: the scene.
-        rng: draws the gate.
-        draw_point: (index of the next gate) -> a random point (3,) [m].
+    `START_CLEARANCE_M` is taken, or the one with the largest clearance. `draw_point` maps the index
+    of the next gate to a random point (3,) [m].
     """
     # Clearance, point and next gate of the best point so far.
     best = (-np.inf, track.start_pos_w, 0)
@@ -288,10 +284,7 @@ class WorldsAhead:
     ) -> Iterator[tuple[int, Worlds]]:
         """Yield (iteration, its worlds) for the iterations from `first` to `end` - 1.
 
-        Args:
-            sample: (iteration) -> its worlds; must be picklable, to run in a process.
-            first: the first iteration.
-            end: the iteration after the last one.
+        `sample` maps the iteration to its worlds; it must be picklable, to run in a process.
         """
         numbers = iter(range(first, end))
         pending = deque(self._pool.submit(sample, k) for k in islice(numbers, self._depth))

@@ -37,9 +37,6 @@ def user_cache(environment: Mapping[str, str] | None = None) -> Path:
     """Return the suite's folder in the user's cache directory, and make it if it is missing.
 
     Without a writable home directory (as in some containers) it is a private temporary folder.
-
-    Args:
-        environment: environment variables; None: those of this process.
     """
     variables = os.environ if environment is None else environment
     try:
@@ -183,10 +180,7 @@ def check_no_input(
 ) -> None:
     """Refuse to overwrite an input file.
 
-    Args:
-        path: path of the output.
-        inputs: paths of the inputs; names that are not files are ignored.
-        option: the command line option that sets `path`.
+    Inputs that are not files are ignored. `option` sets the output `path`.
 
     Raises:
         ValueError: naming the file, and the option to change.

@@ -63,11 +63,8 @@ def table_of(
 ) -> Grid:
     """Return a table with a line for each of `rows`.
 
-    Args:
-        rows: objects of any kind.
-        columns: (header, function of a row that returns the cell) of each column.
-        title: text above the table.
-        note: text below the table.
+    A column is a header and a function of a row that returns the cell. Title and note are above and
+    below the table.
     """
     lines = [[cell_of(row) for _, cell_of in columns] for row in rows]
     return table([header for header, _ in columns], lines, title, note)

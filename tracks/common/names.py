@@ -81,13 +81,10 @@ class Registry(Mapping[str, T]):
     ) -> None:
         """Make the registry.
 
-        Args:
-            kind: name of the kind of entry, for messages.
-            group: entry point group, such as `diffracing_suite.effects`.
-            own: the suite's entries in order. Each is a value, or a text `module` or
-                `module:attribute` from which the value is imported.
-            check: function (name, value) that returns what is wrong with an added entry; None if it
-                is valid.
+        The kind of entry is for messages. `group` is an entry point group, such as
+        `diffracing_suite.effects`. The suite's `own` entries are values, or texts `module` or
+        `module:attribute` from which they are imported. `check` (name, value) returns what is wrong
+        with an added entry; None if it is valid.
         """
         self._kind, self._group, self._check = kind, group, check
         self._entries: dict[str, Any] = {

@@ -45,9 +45,4 @@ def _git(root: Path, *arguments: str) -> bytes:
 
 def stamp(schema: int, seed: int | None) -> dict[str, Any]:
     """Return the keys `schema`, `suite_version`, `git_commit` and `seed` for a file's header."""
-    return {
-        "schema": schema,
-        "suite_version": VERSION,
-        "git_commit": git_commit(),
-        "seed": seed,
-    }
+    return {"schema": schema, "suite_version": VERSION, "git_commit": git_commit(), "seed": seed}

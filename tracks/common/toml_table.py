@@ -88,12 +88,10 @@ class Table:
     """One table of a TOML file; it records which keys are read, so that it can refuse others."""
 
     def __init__(self, source: str, place: str, values: Mapping[str, Any]) -> None:
-        """Make a reader of a table.
+        """Make a reader of the table `values` in the file `source`.
 
-        Args:
-            source: path of the file, with which messages begin; "" for messages without a path.
-            place: dotted name of the table in the file; "" for the whole file.
-            values: the table.
+        Messages begin with `source`; "" for none. `place` is the table's dotted name in the file;
+        "" for the whole file.
         """
         self._source, self._place, self.values = source, place, values
         self._known: list[str] = []
@@ -110,11 +108,8 @@ class Table:
     def read(self, cls: type[T], also: Iterable[str] = (), **fixed: Any) -> T:
         """Return a dataclass from this table's keys; missing fields take their defaults.
 
-        Args:
-            cls: class of the result; its fields are numbers, texts, truth values, tuples of these,
-                or dataclasses.
-            also: further allowed keys.
-            fixed: values of fields that are not in the table.
+        Fields are numbers, texts, truth values, tuples of these, or dataclasses. `also` are further
+        allowed keys; `fixed` has the values of fields that are not in the table.
         """
         fields = {field.name: field for field in dataclasses.fields(cls) if field.name not in fixed}  # pyrefly: ignore[bad-argument-type]
         self.expect([*fields, *also])

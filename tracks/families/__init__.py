@@ -50,10 +50,7 @@ over the kinds."""
 def make_track(family: str, level: int, seed: int) -> Track:
     """Return the track of (family, level, seed), which determine it completely.
 
-    Args:
-        family: a name in `FAMILIES`.
-        level: 0 (easy) to 9 (hard); the difficulty is (level + U(0, 1)) / 10.
-        seed: 0 or more.
+    The level is 0 (easy) to 9 (hard); the difficulty is (level + U(0, 1)) / 10.
 
     Raises:
         ValueError: where the family is unknown or does not return a Layout, the level is out of
@@ -83,10 +80,7 @@ def random_track(
 ) -> Track:
     """Return a new track of the training distribution; its `seed` is 0.
 
-    Args:
-        difficulty: difficulty d in [0, 1].
-        rng: random generator.
-        mix: probabilities of sharp turns and of obstacles.
+    The difficulty is in [0, 1]; `mix` has probabilities of sharp turns and of obstacles.
 
     Raises:
         ValueError: where the difficulty is outside [0, 1].

@@ -73,12 +73,8 @@ def flight_order(gates: Gates, first: int) -> Gates:
 def pick_first_gate(rng: np.random.Generator, center_w: np.ndarray, min_length_m: float) -> int:
     """Return the number of a random gate, before which the stretch is long enough for a start.
 
-    If no stretch is long enough, return the gate after the longest one.
-
-    Args:
-        rng: random generator.
-        center_w: (G, 3) gate centres of a closed track in flight order [m].
-        min_length_m: least length of a stretch for a start [m].
+    If no stretch is long enough, return the gate after the longest one. `center_w` (G, 3) are gate
+    centres of a closed track in flight order [m]. A start needs a stretch of `min_length_m` [m].
     """
     length = np.linalg.norm(center_w - np.roll(center_w, 1, axis=0), axis=-1)
     fits = np.flatnonzero(length >= min_length_m)
@@ -90,13 +86,9 @@ def counts_per_stretch(
 ) -> PerStretch:
     """Return the baseline's numbers of obstacles for each stretch.
 
-    The numbers are equal on all stretches, except those of ground objects, which are random.
-
-    Args:
-        rng: random generator.
-        d: difficulty in [0, 1).
-        stretches: number of stretches with obstacles.
-        scale: factor on the counts before truncation (radius / 8 on the circle).
+    The numbers are equal on all stretches, except those of ground objects, which are random. The
+    difficulty d is in [0, 1). The `scale` multiplies the counts before truncation (radius / 8 on
+    the circle).
     """
 
     def same(easy: float, hard: float) -> np.ndarray:
@@ -135,12 +127,8 @@ def furnish(
 ) -> Layout:
     """Place random obstacles at a distance from gates and start, and return the layout.
 
-    Args:
-        rng: random generator.
-        gates: G gates in flight order.
-        start_pos_w: (3,) the drone's centre at time 0 [m].
-        per_stretch: numbers of obstacles on each stretch.
-        site: draws horizontal positions of obstacles on given stretches.
+    G gates are in flight order. `start_pos_w` (3,) is the drone's centre at time 0 [m]. `site`
+    draws horizontal positions on given stretches.
     """
     obstacles = scatter(rng, per_stretch, site, keep_clear(gates, start_pos_w))
     return build(gates, start_pos_w, obstacles)

@@ -31,9 +31,8 @@ def rectangle(width: np.ndarray | float, height: np.ndarray | float) -> np.ndarr
 def regular_polygon(corners: int, radius: float) -> np.ndarray:
     """Return a regular polygon around the origin, counter-clockwise, (corners, 2) [m].
 
-    Args:
-        corners: number of corners, at least 3; the first side is level and at the bottom.
-        radius: radius of the inscribed circle, that is, the clear width of a round gate [m].
+    The first side is level and at the bottom. The inscribed circle has the `radius`, the clear
+    width of a round gate [m]. There are at least 3 corners.
     """
     angle = 2 * np.pi * (np.arange(corners) - 0.5) / corners - np.pi / 2
     circumradius = radius / np.cos(np.pi / corners)

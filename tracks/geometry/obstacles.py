@@ -75,9 +75,7 @@ class Obstacles(NamedTuple):
 def keep_clear(gates: Gates, start_pos_w: np.ndarray) -> KeepClear:
     """Return the lines to keep free: each gate's axis, and the line from the start to gate 0.
 
-    Args:
-        gates: G gates.
-        start_pos_w: (3,) position of the start [m].
+    `start_pos_w` (3,) is the position of the start [m].
     """
     center = gates.center_w[:, :2]
     reach = CORRIDOR_HALF_LENGTH_M * gates.rot_w[:, :2, 0]
@@ -108,10 +106,8 @@ def segment_distance(point: np.ndarray, begin: np.ndarray, end: np.ndarray) -> n
 def straight_sites(gates: Gates, first: np.ndarray, offset_m: float) -> Site:
     """Return a `Site` that draws positions within `offset_m` of the lines between gates.
 
-    Args:
-        gates: the gates in flight order; the last is followed by gate 0.
-        first: (S,) number of the gate at which each stretch begins.
-        offset_m: largest horizontal distance from the line [m].
+    Gates are in flight order; the last is followed by gate 0. Stretches begin at the gates `first`
+    (S,). `offset_m` is horizontal [m].
     """
     begin = gates.center_w[first, :2]
     along = gates.center_w[(first + 1) % len(gates.center_w), :2] - begin
@@ -131,12 +127,6 @@ def scatter(
     """Return random obstacles that keep the lines of `clear` free.
 
     An obstacle for which no free position is found is left out.
-
-    Args:
-        rng: random generator.
-        per_stretch: numbers of obstacles on each stretch.
-        site: function that draws the obstacles' positions.
-        clear: lines to keep free.
     """
     numbers = [int(n.sum()) for n in per_stretch]
     plates, small, pillars, ground = numbers

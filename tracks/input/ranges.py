@@ -60,11 +60,8 @@ Trials = Annotated[int, Range(1, 100_000)]
 def check_ranges(config: Any, where: str = "", options: bool = False) -> None:
     """Refuse numbers outside their fields' ranges.
 
-    Args:
-        config: a dataclass; nested dataclasses are checked as well.
-        where: prefix of the fields' paths in messages.
-        options: whether messages name fields as command line options (`--deadline-s` for
-            `deadline_s`).
+    Nested dataclasses are checked as well. `where` is the prefix of fields in messages; with
+    `options` they are command line options (`--deadline-s` for `deadline_s`).
 
     Raises:
         ValueError: naming the field, its value and what is allowed.

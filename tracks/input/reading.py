@@ -85,9 +85,7 @@ def read_bytes(path: str | os.PathLike[str], most_bytes: int = TEXT_BYTES) -> by
 def read_json(path: str | os.PathLike[str], **keys: type) -> dict[str, Any]:
     """Return the object of a JSON file.
 
-    Args:
-        path: path of the file.
-        keys: required keys, with the types of their values.
+    `keys` are required, with the types of their values.
 
     Raises:
         InputError: if it is not a regular file, is too large, is not JSON, or lacks a required key.

@@ -24,9 +24,6 @@ def airborne(recording: Recording) -> tuple[tuple[float, float], list[Finding]]:
     """Return the first and the last time in flight [s], and a finding.
 
     A time is infinite where the log starts or ends in flight, or has no signal of the motors.
-
-    Args:
-        recording: signals of the log, with their times in seconds.
     """
     no_limits = (-np.inf, np.inf)
     effort = _motor_effort(recording)

@@ -18,10 +18,8 @@ OF_POSE = ("pos", "quat", "vel")
 def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Finding]]:
     """Return the recording with the pose shifted to the gyro's clock, and the findings.
 
-    Args:
-        recording: signals with times in s, rates in rad/s and a flight log's frames; it must have
-            quat and rate.
-        fix: shift the pose; otherwise only report the delay.
+    The recording has times in s, rates in rad/s and a flight log's frames; it must have quat and
+    rate. Without `fix` the delay is only reported.
     """
     quat, rate = recording.signals["quat"], recording.signals["rate"]
     fit = delay_of(quat.time_s, quat.value, rate.time_s, rate.value)

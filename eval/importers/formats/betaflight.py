@@ -102,9 +102,8 @@ class Blackbox:
     def values(self, names: list[str], factor: Mapping[str, float]) -> np.ndarray:
         """Return columns (N, C) in the suite's unit.
 
-        Args:
-            names: names of the columns, without units.
-            factor: unit in the file -> factor to the suite's unit.
+        The columns are named without units. `factor` maps the unit in the file to the factor to the
+        suite's unit.
 
         Raises:
             FlightLogError: for a column that is missing, has an unknown unit, or is not numeric.

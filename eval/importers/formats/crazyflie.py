@@ -99,10 +99,6 @@ def read(path: Path, options: ImportOptions) -> Recording:
 def decode(data: bytes, name: str) -> tuple[dict[str, dict[str, np.ndarray]], list[Finding]]:
     """Decode the bytes of a log.
 
-    Args:
-        data: the bytes of the file.
-        name: name of the file, for messages.
-
     Returns:
         Event name -> variable -> values (N,), with the times [s] under `timestamp`; findings.
 
@@ -165,10 +161,7 @@ def unpack_quaternion(packed: np.ndarray) -> np.ndarray:
 
     The two highest bits are the index of the largest component of x, y, z, w. It is positive and
     not stored, because the norm is 1. The other three follow in order, each as a sign bit and nine
-    bits of magnitude in units of 1 / (511 sqrt(2)).
-
-    Args:
-        packed: (N,) 32-bit integers.
+    bits of magnitude in units of 1 / (511 sqrt(2)). `packed` are (N,) 32-bit integers.
     """
     bits = packed.astype(np.uint64)
     largest = (bits >> np.uint64(30)).astype(np.int64)

@@ -93,12 +93,7 @@ def _time(
 
 
 def numbers(columns: Mapping[str, np.ndarray], column: str, name: str) -> np.ndarray:
-    """Return a column as numbers (N,), NaN where a cell is empty.
-
-    Args:
-        columns: the table.
-        column: name of the column.
-        name: name of the file, for messages.
+    """Return a column of the file `name` as numbers (N,), NaN where a cell is empty.
 
     Raises:
         FlightLogError: where the column is missing or holds anything but numbers.

@@ -108,13 +108,9 @@ def run_checks(
 ) -> tuple[list[Finding], Readings, dict[str, np.ndarray]]:
     """Return the findings, the readings that correct certain faults, and the corrected rows.
 
-    Args:
-        rows: name of a signal -> samples (T, C), and `time` -> (T,); NaN where unknown.
-        checks: checks in their order; each gets the rows after the corrections of earlier checks.
-        against: the references.
-        fix: report corrections as made; otherwise as doubts. Later checks get corrected rows in
-            both cases.
-        before: findings of earlier checks on the same rows.
+    Rows are samples (T, C) by name, NaN where unknown, and `time` (T,). Each check gets the rows
+    after the corrections of earlier ones; with `fix` these are reported as made, otherwise as
+    doubts. `before` are findings of earlier checks on the same rows.
     """
     findings, readings, rows = [], (), dict(rows)
     if len(rows["time"]) < LEAST_ROWS:
@@ -168,7 +164,8 @@ def check_log(
     """
     checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
     findings, readings, _ = run_checks(rows_of(log), checks, against, fix)
-    measured = {"time": log.time_s, **_action_rows(log), **_measured(log)}
+    action = {} if log.action_b is None else {"action": log.action_b}
+    measured = {"time": log.time_s, **action, **_measured(log)}
     findings += check_controller_rate(measured, against.policy_hz, "the policy")
     again = {finding.fault for finding in findings if finding.fault}
     stored = [f for f in findings_of(log.about) if f.status in ("doubt", "corrected")]
@@ -205,10 +202,7 @@ def check_before_diagnosis(
 ) -> list[dict[str, Any]]:
     """Return the findings of logs and files as records, before a diagnosis or identification.
 
-    Args:
-        logs: flights.
-        against: the references.
-        accept: names of known faults to ignore.
+    Known faults that are named in `accept` are ignored.
 
     Raises:
         ValueError: for a fault that a diagnosis would attribute to a wrong effect, or two copies of
@@ -318,8 +312,3 @@ def _measured(log: FlightLog) -> dict[str, np.ndarray]:
         for group, names in GROUPS.items()
         if group != "time" and all(name in columns for name in names)
     }
-
-
-def _action_rows(log: FlightLog) -> Mapping[str, np.ndarray]:
-    """Return the policy's action as a signal `action`, where the log has one."""
-    return {} if log.action_b is None else {"action": log.action_b}

@@ -72,9 +72,8 @@ class Late(NamedTuple):
 def check_time(rows: Rows, fastest: float | None = None) -> list[Finding]:
     """Return a finding where the time between rows is impossible in seconds.
 
-    Args:
-        rows: `time` (T,), of the slowest signal.
-        fastest: time between samples of the fastest signal, in the same unit; None: of the rows.
+    `time` (T,) is that of the slowest signal. `fastest` is the time between samples of the fastest,
+    in the same unit; None: of the rows.
     """
     step = float(np.median(np.diff(rows["time"])))
     fastest, (low, high) = step if fastest is None else fastest, STEPS_S

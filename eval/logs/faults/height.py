@@ -98,13 +98,8 @@ def _forces(rows: Rows) -> Iterator[tuple[str, np.ndarray]]:
 def _slope(source: str, time_s: np.ndarray, acc: np.ndarray, force: np.ndarray) -> Slope | None:
     """Return the slope of the path's vertical acceleration, None where too little is known.
 
-    Over a flight the mean force balances gravity. This gives the force's unit and sign.
-
-    Args:
-        source: the force in words.
-        time_s: (T,) time [s].
-        acc: (T,) vertical acceleration of the path [m/s^2].
-        force: (T,) vertical force, in any unit.
+    Over a flight the mean force balances gravity. This gives the force's unit and sign. The force
+    (T,) is in any unit; `acc` (T,) is in m/s^2, `time_s` (T,) in s.
     """
     count = min(int((time_s[-1] - time_s[0]) / BLOCK_S), BLOCKS)
     acc, force = (smooth(time_s, value[:, None], WIDTH_S)[:, 0] for value in (acc, force))

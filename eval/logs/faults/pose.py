@@ -116,11 +116,13 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
             break
         base = "+".join(step for step in steps.split("+") if step not in ("ned", "frd"))
         frames = {"ned", "frd"} & set(steps.split("+"))
-        read, frd = _as(quat, steps), "frd" in frames
+        read, frd = read_as("quat", quat, steps) if steps else quat, "frd" in frames
         if gyro is not None and base not in turned:  # frames change no size of a rotation
-            turned[base] = _turns(time_s, read)[::every]
+            turned[base] = smooth(time_s, turns_of(time_s, read), WIDTH_S)[::every]
         if gyro is not None and (base, frd) not in seen_as:
-            seen_as[base, frd] = _gyro_match(turned[base], gyro, frd)
+            seen_as[base, frd] = match(
+                turned[base] * [1.0, -1.0, -1.0] if frd else turned[base], gyro
+            )
         seen = seen_as.get((base, frd))
         turns = None if seen is None else _misfit_of(seen)
         forces: dict[tuple[str, float], tuple[float, float]] = {}
@@ -275,10 +277,6 @@ def _attitudes() -> Iterator[str]:
     yield from _ANGLES
 
 
-def _as(quat: np.ndarray, steps: str) -> np.ndarray:
-    return read_as("quat", quat, steps) if steps else quat
-
-
 def _unit(quat: np.ndarray) -> np.ndarray:
     norm = np.linalg.norm(quat, axis=1, keepdims=True)
     return np.where(norm > 0.0, quat / np.where(norm > 0.0, norm, 1.0), np.nan)
@@ -294,14 +292,6 @@ def turns_of(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
         no_row_missing = step < 1.5 * (2 * count) * float(np.median(np.diff(time_s)))
         rates[count:-count] = np.where(no_row_missing, rotation_vector(relative) / step, np.nan)
     return rates
-
-
-def _turns(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
-    return smooth(time_s, turns_of(time_s, quat), WIDTH_S)
-
-
-def _gyro_match(turns: np.ndarray, gyro: np.ndarray, frd: bool) -> Match:
-    return match(turns * [1.0, -1.0, -1.0] if frd else turns, gyro)
 
 
 def _misfit_of(seen: Match) -> float:
@@ -331,11 +321,9 @@ def _force_misfits(
     """Return the misfit of the force and its level for each reading (step, unit) of a position.
 
     The misfit is the share of the force that is not along body z, without drag. The level is what
-    it is relative to: the larger of horizontal acceleration and tilt times gravity [m/s^2].
-
-    Args:
-        axes: (N, 3, 3) body axes in the world.
-        path: velocity and acceleration (N, 3) in the given reading.
+    it is relative to: the larger of horizontal acceleration and tilt times gravity [m/s^2]. `axes`
+    (N, 3, 3) are body axes in the world, `path` velocity and acceleration (N, 3) in the given
+    reading.
     """
     good = np.isfinite(axes).all(axis=(1, 2)) & np.isfinite(path[1]).all(axis=1)
     if good.sum() < 20:

@@ -93,12 +93,8 @@ def read_as(
 ) -> np.ndarray:
     """Return samples (N, C) of a signal after the steps of a reading.
 
-    Args:
-        signal: name of the signal.
-        value: (N, C) samples of the signal.
-        steps: the steps, see the table in this module's docstring.
-        quat: function that returns the attitude (N, 4) wxyz at the same times; needed by
-            `from-body`, `from-world` and `plus-gravity`.
+    The table in this module's docstring has the steps. `quat` returns the attitude (N, 4) wxyz at
+    the same times, for `from-body`, `from-world` and `plus-gravity`.
     """
     for step in _split(steps):
         if step in BY_ATTITUDE:

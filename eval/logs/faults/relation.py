@@ -65,11 +65,6 @@ class Match(NamedTuple):
         worse = self.seen & (self.alike - self.as_given > UNLIKE) & (self.alike > ALIKE)
         return bool(worse.any() and "".join(self.axes.split(",")).replace("-", "") == "xyz")
 
-    @property
-    def fits(self) -> bool:
-        """Whether all identifiable axes fit as given."""
-        return bool(self.seen.any() and (self.as_given[self.seen] > SEEN).all())
-
 
 def match(wanted: np.ndarray, given: np.ndarray) -> Match:
     """Return the relation of `given` (N, 3) to `wanted` (N, 3); rows with a NaN are not used."""

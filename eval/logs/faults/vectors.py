@@ -244,12 +244,8 @@ def check_accelerometer(rows: Rows, body_is_frd: bool = False) -> list[Finding]:
     """Return the findings on the accelerometer, by the path's acceleration.
 
     Without a path only its unit and direction are checked: in flight it measures about one g,
-    upwards.
-
-    Args:
-        rows: see `check.run_checks`.
-        body_is_frd: the attitude or the gyro was found in forward-right-down axes, so these axes
-            are the first choice. A flight with little drag does not show the sign along x.
+    upwards. If attitude or gyro were found in forward-right-down axes (`body_is_frd`), these are
+    the first choice: a flight with little drag does not show the sign along x.
     """
     if "acc" in rows and not {"pos", "quat"} <= rows.keys():
         return _unit_alone(rows)
@@ -285,7 +281,7 @@ def check_accelerometer(rows: Rows, body_is_frd: bool = False) -> list[Finding]:
     first = "x,-y,-z" if body_is_frd else ""
     best = min(residual, key=lambda name: residual[name] + SIMPLER * (name[0] not in ("", first)))
     figures = f"it is off the path's acceleration less gravity by {100 * given:.0f} %"
-    lateral = _sideways(readings["", 1.0], force)
+    lateral = f" ({rms((readings['', 1.0] - force)[:, :2]):.2g} m/s^2 sideways)"
     if best[0] and best[1] == 1.0 and residual[best] > 0.6 * given and given < OK:
         best = ("", 1.0)
     if best == ("", 1.0) or residual[best] * TIMES_BETTER > given or residual[best] > GOOD:
@@ -378,12 +374,6 @@ def upwards(acc: np.ndarray) -> tuple[np.ndarray, float]:
     known = acc[np.isfinite(acc).all(axis=1)]
     mean = np.median(known, axis=0) if len(known) else np.array([0.0, 0.0, 1.0])
     return mean, float(mean[2]) / max(float(np.linalg.norm(mean)), 1e-9)
-
-
-def _sideways(acc: np.ndarray, force: np.ndarray) -> str:
-    """Return the accelerometer's error along body x and y as text."""
-    off = rms((acc - force)[:, :2])
-    return f" ({off:.2g} m/s^2 sideways)"
 
 
 def _left(found: Match) -> float:

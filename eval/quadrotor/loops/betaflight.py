@@ -221,10 +221,8 @@ def update(
 def mixed(gain: Gains, throttle: Array, torque: Array) -> tuple[Array, Array]:
     """Return the largest difference between motors (...,), and the motor commands (..., 4).
 
-    Args:
-        gain: constants of the loop, of which the layout and the idle command are used.
-        throttle: (...,) from 0 (idle) to 1.
-        torque: (..., 3) roll, pitch and yaw sums, relative to a motor's range.
+    `throttle` (...,) is from 0 (idle) to 1; `torque` (..., 3) are roll, pitch and yaw sums,
+    relative to a motor's range.
     """
     xp = torque.__array_namespace__()
     roll, pitch, yaw = gain.layout

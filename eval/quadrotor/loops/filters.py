@@ -29,13 +29,8 @@ class Pair(NamedTuple):
 def pt1(before: Array, value: Array, cutoff_hz: Array, dt: Array) -> Array:
     """Return the next output of a first-order low pass, by the backward Euler step.
 
-    `y += k (x - y)` with `k = dt / (dt + 1 / (2 pi f))`.
-
-    Args:
-        before: y, the filter's last output.
-        value: x, the filter's input.
-        cutoff_hz: f [Hz]; 0: the input is returned.
-        dt: time since the last output [s].
+    `y += k (x - y)` with `k = dt / (dt + 1 / (2 pi f))`. Here y is `before`, x is `value` and f is
+    `cutoff_hz` [Hz], where 0 returns x. The last output is `dt` old [s].
     """
     xp = value.__array_namespace__()
     enabled = cutoff_hz > 0.0
@@ -47,13 +42,8 @@ def butterworth(memory: Pair, value: Array, cutoff_hz: Array, dt: Array) -> tupl
     """Return the state and the output of a second-order Butterworth low pass (bilinear).
 
     `H(s) = 1 / (s^2 + sqrt(2) s + 1)` with the cutoff prewarped to `tan(pi f dt)`. For a cutoff of
-    0, or of half the sampling rate or more, the output is the input.
-
-    Args:
-        memory: state of the filter before this input.
-        value: input of the filter.
-        cutoff_hz: f [Hz].
-        dt: time between inputs [s].
+    0, or of half the sampling rate or more, the output is the input. f is `cutoff_hz` [Hz], and
+    inputs are `dt` apart [s].
     """
     xp = value.__array_namespace__()
     enabled = (cutoff_hz > 0.0) & (cutoff_hz * dt < 0.5)

@@ -180,10 +180,7 @@ def columns(layout: Layout) -> tuple[Array, Array, Array]:
 def allocate(layout: Layout, thrust: Array, torque: Array) -> Array:
     """Return relative motor thrusts (..., 4), within [0, 1] as far as possible.
 
-    Args:
-        layout: contributions of the motors.
-        thrust: (...,) relative collective thrust.
-        torque: (..., 3) normalised torque.
+    `thrust` (...,) is the relative collective thrust, `torque` (..., 3) is normalised.
     """
     xp = torque.__array_namespace__()
     roll, pitch, yaw = columns(layout)

@@ -48,11 +48,8 @@ def c_project(
 ) -> Project:
     """Return a policy as C.
 
-    Args:
-        checkpoint: the policy.
-        name: name of the policy.
-        dtype: type of the weights, "float32" or "int8".
-        observed: the policy's inputs in recorded flights; required for int8.
+    The weights are "float32" or "int8", which requires `observed`, the policy's inputs in recorded
+    flights.
 
     Raises:
         ValueError: for an unknown type.

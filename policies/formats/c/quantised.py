@@ -57,9 +57,7 @@ def quantise(
 def check_sums(name: str, weight: np.ndarray) -> None:
     """Refuse a layer whose integer sums may exceed 32 bits, as for a large image.
 
-    Args:
-        name: name of the layer.
-        weight: (inputs, outputs) int8.
+    The weights are (inputs, outputs) int8.
 
     Raises:
         PolicyError: naming the layer, its inputs and what to do.

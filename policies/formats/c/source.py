@@ -54,11 +54,8 @@ def sources(
 ) -> dict[str, str]:
     """Return the texts of policy.h and policy.c.
 
-    Args:
-        checkpoint: the policy.
-        name: name of the policy.
-        label: JSON with provenance, spec and contract of the policy, from `spec_json.embed`.
-        layers: the quantised large layers; None for float32.
+    `label` is JSON with provenance, spec and contract of the policy, from `spec_json.embed`.
+    `layers` are the quantised large layers; None for float32.
     """
     definitions = _definitions(checkpoint, layers)
     values = _values(checkpoint, name, label, layers, constant_bytes(checkpoint, layers))

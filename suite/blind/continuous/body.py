@@ -65,11 +65,9 @@ class Body:
             self._first_drop = self.drop(time_s, speed)
 
     def drop(self, time_s: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """Return how far the voltage is below that of a full battery in hover (N, 1) [V].
+        """Return how far the voltage is below a full battery's in hover (N, 1) [V].
 
-        Args:
-            time_s: (N, 1) time since the first row [s].
-            speed: (N, 4) rotor speeds [rad/s].
+        `time_s` (N, 1) is since the first row [s], `speed` (N, 4) are rotor speeds [rad/s].
         """
         power = (speed * speed).sum(axis=1, keepdims=True) / self._hover_power
         discharge = self._battery.fall_v_per_s * np.maximum(time_s, 0.0)

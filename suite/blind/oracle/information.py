@@ -105,10 +105,6 @@ def columns_of(has_voltage: bool, names: Sequence[str] | None = None) -> tuple[C
     """Return the identifiable components of the effects `names`, or of all effects.
 
     Effects that are no function of the vehicle's state (random wind) have none here.
-
-    Args:
-        has_voltage: whether the battery's voltage is logged.
-        names: names of the effects; None: all.
     """
     return tuple(
         Column(name, parameter.name, component)
@@ -144,14 +140,9 @@ def linearised(
     """Return the residual and the Jacobian of rollouts along logs, divided by the noise.
 
     The states at the starts of the rollouts are unknown: the part of residual and Jacobian that
-    they could explain is removed (projected out).
-
-    Args:
-        nominal: the nominal vehicle, at which the rollouts are linearised.
-        logs: logs without noise.
-        sensors: noise of the channels. Rows at another rate get the same weight per second.
-        columns: parameter components, the columns of the Jacobian.
-        horizon_s: length of a rollout, and time between the starts of two rollouts [s].
+    they could explain is removed (projected out). The logs have no noise; `sensors` has that of the
+    channels. Rows at another rate get the same weight per second. The rollouts are `horizon_s`
+    long, and start so far apart [s].
     """
     integrator = logs[0].integrator or "continuous"
     # Rollouts with logged commands as input (False: not with measured rotor speeds).
@@ -235,13 +226,9 @@ def remaining_ratio(
 ) -> float:
     """Return the log-likelihood ratio that remains if `other` is fitted instead of `instead_of`.
 
-    Args:
-        info: information of the flights of the case.
-        truth: true effect -> change of its components from the nominal vehicle.
-        instead_of: the true effect that is left out; the other true effects are fitted too.
-        other: the effect that is fitted in its place, within its physical bounds.
-        nominal: the nominal vehicle.
-        column: index of the only component of `other` that is fitted; None: all are fitted.
+    `truth` maps each true effect to the change of its components from the nominal vehicle. The
+    other true effects are fitted, too. `other` is fitted within its physical bounds; with `column`,
+    only this component of it.
     """
     others_true = [row for name in truth if name != instead_of for row in info.rows_of(name)]
     replaced, fitted = info.rows_of(instead_of), info.rows_of(other)

@@ -23,13 +23,7 @@ from eval.flights.simulate import SENSORS, fly, log_of
 from eval.flights.trajectory import long_flights, ordinary_flights
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
-from suite.blind.oracle.information import (
-    THRESHOLD,
-    Column,
-    detectable,
-    gust_strength,
-    information,
-)
+from suite.blind.oracle.information import THRESHOLD, Column, detectable, gust_strength, information
 from suite.common.console import Console
 from tracks.common.files import write_json
 from tracks.common.provenance import stamp
@@ -76,12 +70,8 @@ def strengths(vehicle: str, sensors: str, names: Sequence[str]) -> dict[str, Any
 
     An entry has `columns` (names and indices of the parameter components), and `matrix`, the
     information about them. A random effect has `detectable` instead of `matrix`, the just
-    detectable size of its first parameter.
-
-    Args:
-        vehicle: name of the nominal vehicle.
-        sensors: name of the logged channels and their noise, a key of `SENSORS`.
-        names: names of the effects.
+    detectable size of its first parameter. `sensors` names the logged channels and their noise, a
+    key of `SENSORS`.
     """
     nominal, entries, channels = nominal_vehicle(vehicle), {}, SENSORS[sensors]
     rng = np.random.default_rng(FLIGHTS_SEED)
@@ -110,11 +100,7 @@ def columns_in_table(vehicle: str, sensors: str, effect: str) -> list[Column]:
 def detectable_along(vehicle: str, sensors: str, effect: str, direction: np.ndarray) -> float:
     """Return the multiple of a direction that is just detectable; infinite if none is.
 
-    Args:
-        vehicle: name of the nominal vehicle.
-        sensors: name of the logged channels and their noise, a key of `SENSORS`.
-        effect: name of the effect.
-        direction: (P,) change of each of `columns_in_table`.
+    The direction (P,) is a change of each of `columns_in_table`; `sensors` is a key of `SENSORS`.
     """
     entry = _entry(vehicle, sensors, effect)
     if "matrix" in entry:

@@ -135,7 +135,7 @@ def _fitted(flights: Sequence[Sequence[_Piece]]) -> np.ndarray:
             piece.numbers = piece.numbers + to_own[:, 0] - to_own[:, 1:] @ change
         drag = drag + change
         # New estimates of the noise and of the tilt's random walk.
-        residuals = np.concatenate([piece.off(drag) for piece in pieces])
+        residuals = np.concatenate([piece.off(drag, *piece.flown()) for piece in pieces])
         old_noise, noise = noise, max(float(np.sqrt((residuals**2).mean())), LEAST_NOISE)
         changes = np.concatenate([piece.numbers[12:] for piece in pieces])
         if len(changes):
@@ -241,12 +241,11 @@ class _Piece:
         rot_w, vel_w = before.flown()
         self.rot, self.vel = rot_w[-1], vel_w[-1]
 
-    def off(self, drag: np.ndarray) -> np.ndarray:
+    def off(self, drag: np.ndarray, rot_w: np.ndarray, vel_w: np.ndarray) -> np.ndarray:
         """Return the residuals (M, 2) of the mean forces along body x and y for `drag` [m/s^2].
 
-        A residual is the measured mean force minus the force of the drag at the computed velocity.
+        A residual is the measured mean force minus the force of the drag at the pose of `flown`.
         """
-        rot_w, vel_w = self.flown()
         vel_b = (np.swapaxes(rot_w, 1, 2) @ vel_w[..., None])[:, :2, 0]
         drag_xy = drag[:2] + drag[2] * np.linalg.norm(vel_w, axis=1)[:, None]
         return self.means(self.acc_b[:, :2] - self.numbers[9:11] + drag_xy * vel_b)
@@ -269,8 +268,7 @@ class _Piece:
         columns[:, [0, 1], [count, count + 1]] = -vel_b
         columns[..., -1] = -speed * vel_b
         design = self.means(columns).reshape(-1, count + 3) / noise
-        off = self.means(self.acc_b[:, :2] - self.numbers[9:11] + drag_xy * vel_b)
-        residual = off.reshape(-1) / noise
+        residual = self.off(drag, rot_w, vel_w).reshape(-1) / noise
         prior = np.eye(count, count + 3) / self.prior[:, None]
         return np.concatenate([design, prior]), np.append(residual, -self.numbers / self.prior)
 

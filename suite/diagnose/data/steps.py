@@ -147,11 +147,7 @@ def _step_rows(row_s: np.ndarray, shortest_s: float) -> np.ndarray:
 
 
 def rotors_at(
-    at_s: np.ndarray,
-    time_s: np.ndarray,
-    speed: np.ndarray,
-    vehicle: Vehicle,
-    stride: int = 1,
+    at_s: np.ndarray, time_s: np.ndarray, speed: np.ndarray, vehicle: Vehicle, stride: int = 1
 ) -> np.ndarray:
     """Return measured rotor speeds (S, 4) at other times.
 

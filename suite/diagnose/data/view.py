@@ -57,10 +57,7 @@ class FlightRows(NamedTuple):
 
 
 def rows_of(
-    log: FlightLog,
-    vehicle: Vehicle,
-    rotor_speed: np.ndarray,
-    limits: Thresholds = THRESHOLDS,
+    log: FlightLog, vehicle: Vehicle, rotor_speed: np.ndarray, limits: Thresholds = THRESHOLDS
 ) -> FlightRows:
     """Return the rows of `log` with rotor speeds `rotor_speed` (N, 4) [rad/s].
 
@@ -147,15 +144,11 @@ class View:
     """Name in a diagnosis."""
     about: str
     """Description for people: what is compared, and with which measured signals."""
-    unit: str
-    """Unit of the accelerations."""
-    columns: slice
-    """Columns of the view in the model's six accelerations (three linear, three angular)."""
     width_s: float
     """Width of the bumps [s]."""
     in_world: bool
-    """Whether the accelerations are in world axes, as in the force view. Their residuals are then
-    rotated into body axes."""
+    """Whether this is the force view, with linear accelerations in world axes [m/s^2]. Their
+    residuals are rotated into body axes. Else they are angular, in body axes [rad/s^2]."""
     axes: tuple[int, ...] = (0, 1, 2)
     """Body axes along which the accelerations are identifiable."""
 
@@ -165,13 +158,9 @@ class View:
         return 0.5 * self.width_s
 
 
-FORCE = View(
-    "force", "translation under the measured attitude and thrust", "m/s^2", slice(0, 3), 0.2, True
-)
+FORCE = View("force", "translation under the measured attitude and thrust", 0.2, True)
 SPECIFIC = replace(FORCE, about="specific force by the accelerometer under the measured thrust")
-TORQUE = View(
-    "torque", "rotation under the measured rotor speeds", "rad/s^2", slice(3, 6), 0.1, False
-)
+TORQUE = View("torque", "rotation under the measured rotor speeds", 0.1, False)
 
 
 class SmoothedFlight(NamedTuple):

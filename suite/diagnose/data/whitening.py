@@ -64,10 +64,7 @@ class Whitening(NamedTuple):
 
 
 def make_whitening(
-    linear: Linearisation,
-    noise: Noise,
-    windows: FlightWindows,
-    limits: Thresholds = THRESHOLDS,
+    linear: Linearisation, noise: Noise, windows: FlightWindows, limits: Thresholds = THRESHOLDS
 ) -> Whitening:
     """Return the whitening of `windows` by `noise`.
 

@@ -107,12 +107,7 @@ def inactive_at(
     """Return the parameters that act only through others, and so change nothing at `theta` (P,).
 
     None where there are none. If several composites contain them, the first composite counts.
-
-    Args:
-        space: parameters of the vehicle.
-        theta: (P,) values of all parameters.
-        among: the candidates.
-        acts: (P,) bool, whether each parameter changes the model at `theta`.
+    `acts` (P,) bool marks the parameters that change the model at `theta`.
     """
     for composite in COMPOSITES:
         composite_candidate = next((c for c in among if c.name == JOIN.join(composite.parts)), None)

@@ -191,11 +191,8 @@ def with_fitted(
 def candidates(space: ParameterSpace, voltage: bool, has: Collection[str]) -> list[Candidate]:
     """Return the candidates that can be identified from the signals of the logs.
 
-    Args:
-        space: all numbers of the vehicle.
-        voltage: whether the logs have a battery voltage.
-        has: names of the other signals that the logs have and some effects need: `acc_b` for an
-            accelerometer, `command` for commands as the model's input.
+    `has` names the signals other than the `voltage` that some effects need: `acc_b` for an
+    accelerometer, `command` for commands as the model's input.
     """
     chosen = []
     for name, effect in EFFECTS.items():
@@ -223,10 +220,7 @@ def indices_of(chosen: Sequence[Candidate]) -> list[int]:
 
 
 def implausible(
-    space: ParameterSpace,
-    theta: np.ndarray,
-    candidate: Candidate,
-    limits: Thresholds = THRESHOLDS,
+    space: ParameterSpace, theta: np.ndarray, candidate: Candidate, limits: Thresholds = THRESHOLDS
 ) -> list[str]:
     """Return a phrase for each implausible number of `candidate`, with its value in `theta` (P,).
 

@@ -60,15 +60,8 @@ def score_candidates(
 ) -> list[CandidateScore]:
     """Return the scores of candidates, each fitted with the `named` parameters, best first.
 
-    Args:
-        equations: normal equations along all parameters.
-        theta: (P,) parameters at which the equations were computed.
-        space: bounds of the parameters.
-        named: places of the parameters that are always fitted.
-        among: the candidates; those without any effect on the flights get no score.
-        fold: (W,) cross-validation fold of each window.
-        seed: seed of the draws.
-        limits: number of draws.
+    The equations were computed at `theta` (P,). `fold` (W,) is the cross-validation fold of each
+    window. A candidate without any effect on the flights gets no score.
     """
     along = list(equations.numbers)
     scale = space.array("step")[along]

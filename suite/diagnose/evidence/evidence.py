@@ -79,15 +79,9 @@ class Evidence(ABC):
         among: Sequence[Candidate],
         seed: int,
     ) -> list[CandidateScore]:
-        """Return the scores of candidate effects, best first.
+        """Return the scores of candidates, each fitted with the `named` parameters, best first.
 
-        Args:
-            block: block with slopes along all parameters.
-            equations: normal equations of `block`.
-            theta: (P,) parameters at which `block` was computed.
-            named: places of the parameters that are fitted together with every candidate.
-            among: the candidates.
-            seed: seed of random draws.
+        `block` was computed at `theta` (P,), with slopes along all parameters.
         """
         fold = self.folds(block)
         return score_candidates(equations, theta, self.space, named, among, fold, seed, self.limits)
@@ -108,12 +102,9 @@ class Evidence(ABC):
     ) -> float | None:
         """Return the share of the squared error that a candidate explains; None if rejected.
 
-        Args:
-            before: block without the candidate.
-            at: estimate with the candidate.
-            after: block with the candidate.
-            candidate: the candidate that was fitted.
-            gains: (G,) fall of the squared error of each group, fitted to the other groups.
+        The blocks are those without (`before`) and with the candidate (`after`, at the estimate
+        `at`). `gains` (G,) are the falls of the squared error of each group, fitted to the other
+        groups.
         """
         del at, candidate, gains
         return 1.0 - float((after.residual**2).sum() / max((before.residual**2).sum(), LEAST_ERROR))

@@ -21,13 +21,7 @@ from eval.quadrotor.continuous import Carry, Steps, fly, turn_rotors, update_loo
 from eval.quadrotor.plant import Motion, Plant, Wrench, unpack_command
 from eval.quadrotor.stepper import Inputs, wanted_speed
 from suite.diagnose.data.steps import LONGEST_S
-from suite.diagnose.data.windows import (
-    CHANNELS,
-    KNOTS,
-    LENGTH_S,
-    STATE,
-    FlightWindows,
-)
+from suite.diagnose.data.windows import CHANNELS, KNOTS, LENGTH_S, STATE, FlightWindows
 from tracks.geometry.rotation import exp_rot
 
 

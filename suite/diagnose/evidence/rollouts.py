@@ -29,15 +29,7 @@ from suite.diagnose.data.whitening import (
     make_whitening,
     slow_energy,
 )
-from suite.diagnose.data.windows import (
-    KNOTS,
-    LENGTH_S,
-    SLICES,
-    STATE,
-    FlightWindows,
-    cut,
-    take,
-)
+from suite.diagnose.data.windows import KNOTS, LENGTH_S, SLICES, STATE, FlightWindows, cut, take
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.gauss_newton import fit, gauss_newton_step
 from suite.diagnose.estimate.parameters import (
@@ -192,13 +184,8 @@ def rollout_evidence(
 ) -> tuple[RolloutEvidence, Block]:
     """Return the evidence of `windows`, and its block where it was linearised.
 
-    Args:
-        model: the model that simulates the windows.
-        windows: W windows.
-        linear: their residuals, with slopes along parameters and then along the start numbers.
-        limits: thresholds of all steps.
-        noise: noise of the channels; by default it is estimated from `linear`.
-        along: parameters of the first slopes; all parameters if not given.
+    The slopes of `linear` are along the parameters `along` (default: all), then along the start
+    numbers. If no `noise` is given, it is estimated from `linear`.
     """
     near = trusted(windows, linear.residual, limits)
     noise = noise or measured_noise(linear.residual, linear.start_slope, near, limits)
@@ -321,11 +308,7 @@ def compiled(
     """
 
     def fly(
-        given: VehicleArrays,
-        theta: Any,
-        offset: Any,
-        windows: FlightWindows,
-        push: Any = None,
+        given: VehicleArrays, theta: Any, offset: Any, windows: FlightWindows, push: Any = None
     ) -> tuple[Any, Flown]:
         values = effects_at(layout, given.base, theta)
         plant = assemble(given.nominal, given.constants, values, LONGEST_S, 0.0, given.loop)

@@ -15,12 +15,7 @@ from eval.effects import EFFECTS
 from suite.diagnose.data.view import SmoothedFlight, View
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.composites import carried
-from suite.diagnose.estimate.parameters import (
-    Candidate,
-    ParameterSpace,
-    at_bound,
-    usual_first,
-)
+from suite.diagnose.estimate.parameters import Candidate, ParameterSpace, at_bound, usual_first
 from suite.diagnose.estimate.permutation import folds_of
 from suite.diagnose.evidence.evidence import Evidence, flights_agree
 from suite.diagnose.evidence.moments import (
@@ -104,8 +99,10 @@ class ViewEvidence(Evidence):
             """Return the means (M, ...) of `series` (N, ...) by the bumps of the flight."""
             return (mean @ series.reshape(len(series), -1)).reshape(count, *series.shape[1:])
 
+        # The model has six accelerations: three linear ones, then three angular ones.
+        columns = slice(0, 3) if view.in_world else slice(3, 6)
         value, slope = (
-            _attenuated(means(part[:, view.columns]), flight.reliability) for part in (value, slope)
+            _attenuated(means(part[:, columns]), flight.reliability) for part in (value, slope)
         )
         residual, pose_slope = flight.measured - value, np.zeros((count, 3, 0))
         if view.in_world:

@@ -52,12 +52,9 @@ def force_unknowns(
 ) -> list[Unknown]:
     """Return the numbers that the force fit estimates, with their start in the vehicle file.
 
-    Args:
-        driven: vehicle from which the fit starts, with the drive of its flights.
-        voltage: whether all flights have a battery voltage.
-        leaning: whether no flight has an attitude, so that it follows from how the vehicle must
-            lean to fly its path. Drag is then fitted along body z only.
-        scale: logarithm of the thrust's scale in the vehicle file.
+    With `leaning`, no flight has an attitude, so that it follows from how the vehicle must lean to
+    fly its path. Drag is then fitted along body z only. `scale` is the logarithm of the thrust's
+    scale in the vehicle file.
     """
     method_error = 0.004 if leaning else 0.001
     unknowns = [Unknown("thrust", scale, -2.0, 2.0, 0.25, 1e-3, method_error)]
@@ -78,11 +75,8 @@ def fit_force(
 ) -> Fitted:
     """Fit the numbers of thrust and drag.
 
-    Args:
-        flights: flights with velocities; either all have an attitude, or none has one.
-        driven: vehicle from which the fit starts, with the drive of its flights.
-        unknowns: result of `force_unknowns`.
-        fixed: values of numbers that are not fitted, `lag` and `late` (total delay) among them.
+    All flights have velocities. Either all have an attitude, or none has one. `fixed` has the
+    values of numbers that are not fitted, `lag` and `late` (total delay) among them.
 
     Raises:
         NoWholeWindow: if no window has all signals.
@@ -191,8 +185,6 @@ TO_RATE_S = TORQUE_WIDTH_S / (2.0 * np.pi)
 """Factor from an angular acceleration to the change of rate that is compared in a window. The mean
 over the window is removed: the slow part of the motors' torque only balances trim and blade
 flapping, and does not turn the body [s]."""
-NO_OFFSETS = np.array([False, False, False])
-"""Body axes along which each flight has a free constant: none."""
 NOISE_BIASED = ("inertia_x", "inertia_y", "yaw")
 """For each body axis, the number that noise of the rotor speeds biases."""
 FORCE_NUMBERS = ("thrust", "curve", "battery")
@@ -244,15 +236,9 @@ def fit_torque(
     too small a slope (errors in variables; Fuller 1987, Sec. 1.1). The inertia would seem larger
     and the yaw torque smaller. The modelled torque is therefore multiplied by the share of its
     variance that is not noise (the reliability ratio). Half of this correction counts as its
-    uncertainty. A number that reaches its limit is reset to its start and held.
-
-    Args:
-        flights: flights with body rates.
-        driven: vehicle from which the fit starts, with the drive of its flights.
-        unknowns: result of `torque_unknowns`.
-        fixed: values of numbers that are not in `unknowns`, `lag` and `late` among them.
-        held: names of numbers that keep their start, with their uncertainty.
-        known: names and covariance of those of `fixed` that the force fit has identified.
+    uncertainty. A number that reaches its limit is reset to its start and held. So are the numbers
+    `held`, with their uncertainty. `fixed` has the other numbers, `lag` and `late` among them;
+    `known` are those that the force fit has identified, with their covariance.
 
     Raises:
         NoWholeWindow: if no window has all signals.
@@ -306,7 +292,7 @@ def _torque_windows(flight: FlightGrid, drive: str) -> Windows:
     """Return the windows of `flight` for changes of its rates, where all signals are present."""
     form = flight.form(TORQUE_WIDTH_S, ("rate_b", DRIVES[drive][-1]), slope=True)
     measured = np.asarray(TO_RATE_S * (form.change @ np.nan_to_num(flight.signals["rate_b"])))
-    return Windows(flight, form, measured, NO_OFFSETS)
+    return Windows(flight, form, measured, np.zeros(3, bool))  # without free constants
 
 
 def _turning(
@@ -345,12 +331,9 @@ def _best_correlated_delay(
     residuals: Callable[[np.ndarray], list[Rows]],
     measured: Sequence[np.ndarray],
 ) -> float:
-    """Return the total delay [s] at which modelled and measured roll and pitch correlate best.
+    """Return the delay `late` [s] at which modelled and measured roll and pitch correlate best.
 
-    Args:
-        unknowns: the numbers, `late` among them.
-        residuals: function from the values of the numbers to the residuals of all flights.
-        measured: for each flight, the changes of its body rates (M, 3).
+    `measured` are the changes of each flight's body rates, (M, 3).
     """
     value = np.array([unknown.start for unknown in unknowns])
     late = [unknown.name for unknown in unknowns].index("late")

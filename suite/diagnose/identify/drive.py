@@ -213,10 +213,7 @@ class TrialVehicle:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the linear and the angular acceleration of the vehicle on each row.
 
-        Args:
-            flight: the flight, with the signals that drive it.
-            rows: its state on the grid.
-            powered: whether the rotors turn. Otherwise, and where it is unknown, their speed is 0.
+        If they are not `powered`, and where it is unknown, the rotors' speed is 0.
 
         Returns:
             dv/dt in world axes and dw/dt in body axes, (G, 3) each.
@@ -306,11 +303,8 @@ FITTED = ("linear_drag", "blade_flapping", "command_delay", "thrust_scale")
 def with_merged_effects(vehicle: Vehicle, known_motors: bool) -> Vehicle:
     """Return `vehicle` with its effects that scale a fitted number merged into that number.
 
-    It flies as before. If such an effect stayed, it would scale the fitted number once more.
-
-    Args:
-        vehicle: the start of the fit.
-        known_motors: whether the motors' thrust is fitted; `thrust_scale` is then merged as well.
+    It flies as before. If such an effect stayed, it would scale the fitted number once more. With
+    `known_motors`, the motors' thrust is fitted, so `thrust_scale` is merged as well.
 
     Raises:
         ValueError: if a merged number is not allowed in a vehicle file, such as the thrust of

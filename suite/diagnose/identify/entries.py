@@ -37,12 +37,7 @@ def inertia_from(vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
 
 
 def force_entries(driven: DrivenVehicle, fitted: Fitted) -> list[Number]:
-    """Return the entries that the force fit estimates: motors or rotors, and drag.
-
-    Args:
-        driven: vehicle from which the fit started, with the drive of its flights.
-        fitted: result of the force fit.
-    """
+    """Return the entries that the force fit estimates: motors or rotors, and drag."""
     # For each entry: key, unit, formula, and the number that each value needs.
     rows: list[tuple[str, str, Formula, Sequence[str]]] = []
     if "thrust" in fitted.names and driven.drive == "pwm":
@@ -65,10 +60,7 @@ def force_entries(driven: DrivenVehicle, fitted: Fitted) -> list[Number]:
 def torque_entries(driven: DrivenVehicle, fitted: Fitted, log_thrust: float) -> list[Number]:
     """Return the entries that the torque fit estimates: inertia, yaw torque, lag and delay.
 
-    Args:
-        driven: vehicle from which the fit started, with the drive of its flights.
-        fitted: result of the torque fit.
-        log_thrust: logarithm of the scale of the thrust, from the force fit.
+    `log_thrust` is the logarithm of the scale of the thrust, from the force fit.
     """
     entries, vehicle = list[Number](), driven.start
     if "inertia_x" in fitted.names:

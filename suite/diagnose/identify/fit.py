@@ -221,14 +221,9 @@ def fit(
     """Return the numbers that minimise `residuals`, with intervals.
 
     A number that is not identifiable may be wrong by its `max_half_width`; the intervals of the
-    others include the effect of that.
-
-    Args:
-        residuals: function from the values of the numbers to the residuals of all flights.
-        unknowns: the numbers.
-        held: names of numbers that are not fitted and keep their start.
-        known: those of `unknowns` that another fit has identified; they keep their start, too.
-        noise: (C,) standard deviation of the residuals, by channel; by default it is estimated.
+    others include the effect of that. The numbers `held` and `known` keep their start; another fit
+    has identified the latter. `noise` (C,) is the standard deviation of the residuals by channel;
+    by default it is estimated.
 
     Raises:
         NoWholeWindow: if the residuals have no window.

@@ -40,13 +40,9 @@ def flapping_of(
 ) -> Number | None:
     """Return the flapping coefficient that `logs` show, or None if it is not significant.
 
-    Only complete logs are used. The significance test is that of a diagnosis.
-
-    Args:
-        logs: flights.
-        vehicle: the vehicle with all other identified numbers (parameters).
-        perturbed: vehicles with one error of one standard deviation each, from
-            `perturbed_vehicles`. The change of the coefficient with each error widens the interval.
+    Only complete logs are used. The significance test is that of a diagnosis. Each of the vehicles
+    `perturbed` has one error of one standard deviation (`perturbed_vehicles`). The change of the
+    coefficient with each error widens the interval.
     """
     complete = [log for log in logs if not log.partial]
     try:
@@ -117,12 +113,6 @@ def perturbed_vehicles(
     """Return copies of `vehicle` with one error of one standard deviation each.
 
     The errors are those of motors and inertia.
-
-    Args:
-        vehicle: the vehicle with the identified numbers.
-        driven: vehicle from which the fits started, with the drive of its flights.
-        force: result of the force fit.
-        torque: result of the torque fit.
     """
     vehicles = []
     for fitted in one_sigma_off(force, FORCE_NUMBERS):

@@ -74,9 +74,8 @@ class FlightGrid(NamedTuple):
     def rows(self, attitude_of_path: bool) -> FlightRows:
         """Return the grid as rows of a view, with zeros for rotor speeds and for missing values.
 
-        Args:
-            attitude_of_path: use the attitude that the path requires (`LEANING`) if none was
-                measured. Its yaw is arbitrary.
+        With `attitude_of_path`, an attitude that was not measured is the one that the path requires
+        (`LEANING`). Its yaw is arbitrary.
         """
         attitude = self.signals.get(
             "rot_w", self.signals.get(LEANING) if attitude_of_path else None

@@ -72,13 +72,9 @@ def fit_loop(
 ) -> Fitted:
     """Fit gains, lag and delay; each flight has a free constant rate (bias of the gyro, trim).
 
-    Args:
-        flights: flights with measured and commanded rates.
-        vehicle: vehicle whose gains are the start, with the frequency of its rate loop.
-        unknowns: the numbers of `gain_unknowns`, `coupling_unknowns`, `air_torque_unknowns` and
-            `body.lag_unknowns`, or some of them.
-        fixed: values of those numbers that are not in `unknowns`.
-        known: those of `unknowns` that another fit has identified.
+    `unknowns` are the numbers of `gain_unknowns`, `coupling_unknowns`, `air_torque_unknowns` and
+    `body.lag_unknowns`, or some of them; `fixed` has the values of the others. Another fit has
+    identified those that are `known`.
 
     Raises:
         NoWholeWindow: if no window has all signals.

@@ -60,14 +60,8 @@ def number_from(
 ) -> Number:
     """Return an entry of the file; its intervals follow from the fit's covariance.
 
-    Args:
-        fitted: result of a fit.
-        key: key in the file.
-        unit: unit of the values.
-        formula: function from the fitted numbers to the values.
-        needs: for each value, the name of the fitted number that must be identified.
-        max_half_width: largest half-width of the 95 % interval of an identified value. A value with
-            a wider interval `follows` (see `Number`).
+    `needs` names for each value the fitted number that must be identified. An identified value
+    whose 95 % interval has a half-width above `max_half_width` `follows` (see `Number`).
     """
     values = np.atleast_1d(formula(fitted.values()))
     # Finite differences of the formula turn the covariance of the fit into that of the values.
@@ -141,12 +135,7 @@ NEVER_BOTH = "these logs have no stretch with both"
 
 
 def not_identified(fitted: Mapping[str, Fitted], entries: Mapping[str, Number]) -> list[str]:
-    """Return a line for people for each number that was fitted and that no fit has identified.
-
-    Args:
-        fitted: results of the fits, by the name of the fit.
-        entries: entries of the vehicle file, by key.
-    """
+    """Return a line for people for each number that was fitted and that no fit has identified."""
     fits = list(fitted.values())
     identified = {name for fit in fits for name in fit.names if fit.identifies(name)}
     names = dict.fromkeys(name for fit in fits for name in fit.not_identified)
@@ -171,13 +160,8 @@ def not_attempted(
 ) -> list[str]:
     """Return a line for people for each number that was not fitted, with the missing signal.
 
-    Args:
-        flights: the flights.
-        vehicle: the vehicle before the fits.
-        drive: what drives the model of these flights, one of `DRIVES`.
-        fitted: results of the fits (force, torque, rotors, loop), by the name of the fit.
-        leave: parts that the user chose not to fit.
-        broken: names of fits for which the logs have the columns, but no complete window.
+    The fits of `fitted` are force, torque, rotors and loop. `broken` names fits for which the logs
+    have the columns, but no complete window.
     """
     lines = []
 
@@ -249,11 +233,7 @@ def notes_on(
 ) -> list[str]:
     """Return lines for people on what was done with flights and vehicle beyond the fitted numbers.
 
-    Args:
-        flights: the flights.
-        without_voltage: names of flights without a voltage, if others have one.
-        start: the vehicle before the fits.
-        identified: the vehicle with the identified numbers.
+    `without_voltage` names the flights without a voltage, if others have one.
     """
     lines = [
         f"{flight.name}: no row has all columns of {', '.join(flight.in_turn)}; each column uses "

@@ -38,13 +38,8 @@ def identify_files(
 ) -> dict[str, Any]:
     """Estimate the parameters of a vehicle from log files, and write its file.
 
-    Args:
-        flights: logs or folders of them.
-        vehicle: path or shipped name of the vehicle file to start from.
-        out: the vehicle file to write.
-        leave: those of `PARTS` that are not fitted.
-        console: for progress.
-        accept: names of interface faults (wrong units, signs, clocks) that do not stop the command.
+    The parts `leave` (of `PARTS`) are not fitted. The interface faults `accept` (wrong units,
+    signs, clocks) do not stop the command.
 
     Returns:
         The JSON object that `--json` prints.

@@ -43,10 +43,7 @@ def series_chart(series: Series) -> bytes:
 def write_rollouts(path: Path, flown: RolloutSource, fitted: np.ndarray | None) -> Path:
     """Write held-out flights, measured and simulated in rollouts of 1 s, as a recording (.rrd).
 
-    Args:
-        path: the file to write.
-        flown: the flights and their rollouts.
-        fitted: (P,) parameters with the named effects; None if nothing was named.
+    `fitted` (P,) are the parameters with the named effects; None if nothing was named.
 
     Raises:
         OSError: if the file cannot be written; no partial file remains.

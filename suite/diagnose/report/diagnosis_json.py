@@ -133,7 +133,7 @@ def gap_json(diagnosis: Diagnosis) -> dict[str, Any]:
             for group, channels in one.before.channels.items()
         },
         **main.remaining.gap_details,
-        "held_out": [short_name(name) for name in diagnosis.flights.held_out],
+        "held_out": [short_name(name) for name in dict.fromkeys(diagnosis.flights.held_out)],
     }
 
 
@@ -203,14 +203,8 @@ def parameters_json(
 ) -> dict[str, Any]:
     """Return the parameters of the effect `name` as in diagnosis.json.
 
-    Args:
-        space: the parameters of all effects.
-        name: name of the effect.
-        indices: indices of its fitted parameters, in order.
-        theta: (P,) all parameters.
-        half_width: half-widths of the 95 % intervals, by index.
-        undecided: indices of parameters for other motors that fit as well, for an effect of one
-            motor (see `_undecided`).
+    `theta` (P,) are all parameters; `half_width` has those of the 95 % intervals by index. For an
+    effect of one motor, `undecided` are parameters for other motors that fit as well.
     """
 
     def value_and_interval(index: int) -> tuple[float, list[float]]:

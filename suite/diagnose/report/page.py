@@ -65,13 +65,9 @@ CHANNELS = (
 
 
 def page(diagnosis: Diagnosis, result: Mapping[str, Any], toml: str, files: set[str]) -> Report:
-    """Return the report of a diagnosis.
+    """Return the report of a diagnosis with the diagnosis.json `result` and vehicle file `toml`.
 
-    Args:
-        diagnosis: the diagnosis.
-        result: content of its diagnosis.json, which has the sentences of the report.
-        toml: text of the vehicle file that was written.
-        files: paths of those of `FILES` that exist.
+    `files` are the paths of those of `FILES` that exist.
     """
     gap, flown = result["gap"], rollouts_of(diagnosis.main)
     after = f" → {gap['after']:.3g}" if result["effects"] else ""

@@ -14,13 +14,7 @@ from eval.logs.flight_log import FlightLog
 from suite.common.report import Part, Section
 from suite.diagnose.data.windows import SLICES, UNITS
 from suite.diagnose.diagnose import Diagnosis
-from suite.diagnose.report.summary import (
-    cells,
-    grid,
-    remaining_words,
-    short_name,
-    superscripts,
-)
+from suite.diagnose.report.summary import cells, grid, remaining_words, short_name, superscripts
 from suite.diagnose.sources.rollout_source import of_rollouts
 from tracks.common.grid import Cell, Grid
 

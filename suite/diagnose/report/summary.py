@@ -39,11 +39,7 @@ CHECK = "Run suite check on these logs: a wrong unit, sign, order or clock resem
 
 
 def headline(result: Mapping[str, Any]) -> str:
-    """Return the answer in a few sentences: effects, sizes, verdict, gap, and what remains.
-
-    Args:
-        result: content of diagnosis.json.
-    """
+    """Return the answer of a diagnosis.json: effects, sizes, verdict, gap, and what remains."""
     words, gap = [answer(result)], result["gap"]
     # The unit of rollouts is the noise floor itself.
     floor = "" if gap["noise_floor"] == 1.0 else f" (noise floor {_figure(gap['noise_floor'])})"
@@ -124,11 +120,7 @@ def _effect_words(effect: Mapping[str, Any]) -> str:
 
 
 def next_steps(result: Mapping[str, Any]) -> list[str]:
-    """Return advice on what to do after a verdict, most useful first.
-
-    Args:
-        result: content of diagnosis.json.
-    """
+    """Return advice on what to do after the verdict of a diagnosis.json, most useful first."""
     use, search_for = USE, _search_for(result["unexplained"])
     steps = {
         "no_gap": [

@@ -291,9 +291,7 @@ def within_flights(data: ViewData) -> ViewData:
 def equations_by_flight(inside: ViewData, scatter: np.ndarray) -> NormalEquations:
     """Return the normal equations of each flight alone, along all parameters.
 
-    Args:
-        inside: residuals without the flights' means, from `within_flights`.
-        scatter: (3,) noise along each axis.
+    `inside` is from `within_flights`; `scatter` (3,) is the noise along each axis.
     """
     numbers, place = np.unique(inside.flight, return_inverse=True)
     residual, slope = inside.residual / scatter, inside.slope / scatter[:, None]
@@ -312,13 +310,8 @@ def search_motion_change(
 ) -> SearchResult | None:
     """Return the candidate that has changed since `reference`; None where none is significant.
 
-    The parameters of the result are total values, not changes.
-
-    Args:
-        reference: evidence of the flights before a change, at least two.
-        task: evidence of the flights after it, at least two.
-        among: the candidates.
-        views: number of views that are searched, for Bonferroni's correction.
+    The parameters of the result are total values, not changes. Both sets need at least two flights.
+    Bonferroni's correction counts the number of searched `views`.
     """
     start, limits, space = fit_balance(reference), task.limits, task.space
     sets = [within_flights(one.residuals(start, None)) for one in (reference, task)]

@@ -66,11 +66,6 @@ def evaluated_at(
     A wind acts only through a drag: without a drag the wind's column of slopes is zero. Then a
     second column is added, computed with a drag of usual size (see `estimate/composites.py`).
     Some columns become secants (see `with_secants`).
-
-    Args:
-        linearised: the evidence and its block at the estimate.
-        at: the estimate.
-        among: the candidates.
     """
     evidence, block = linearised
     block = with_secants(evidence, block, at, among)

@@ -62,13 +62,7 @@ def search(
 ) -> SearchResult:
     """Return the candidates of `among` that explain the residual of the evidence at `start`.
 
-    Args:
-        evidence: evidence of the flights.
-        start: the vehicle file's parameters.
-        among: the candidates.
-        say: receives a line for people about each step.
-        seed: seed of the permutation test.
-        known: result of `evidence.estimate_noise(start)`, if it was computed before.
+    `known` is the result of `evidence.estimate_noise(start)`, if it was computed before.
     """
     limits = evidence.limits
     task = SearchTask(among, say, seed)

@@ -123,9 +123,8 @@ def _misfits(
 def _most_probable(cost: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Return the path of least cost: the index of the shift in each block, (M,).
 
-    Args:
-        cost: (M, S) cost of each shift in each block.
-        change: (S, S) cost of the change from one shift to another in the next block.
+    `cost` (M, S) is that of each shift in each block. `change` (S, S) is the cost of another shift
+    in the next block.
     """
     # Forward: the least cost of a path to each shift, and the shift in the block before it.
     total, origins = cost[0], list[np.ndarray]()

@@ -198,13 +198,8 @@ def _noise(
 ) -> _Noise:
     """Fit the noise in addition to a given random walk.
 
-    The fast process is used only if its share is significant.
-
-    Args:
-        flights: the errors.
-        variograms: variograms of all stretches.
-        lag_s: (L,) lags of the variograms [s].
-        walk: variance of the random walk for each metre.
+    The fast process is used only if its share is significant. `lag_s` (L,) are the lags of the
+    variograms [s]; `walk` is the variance of the random walk for each metre.
     """
     duration_s = float(np.mean([flight.duration_s for flight in flights]))
     about_mean = _variograms(flights, None)

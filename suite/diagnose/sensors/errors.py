@@ -59,9 +59,7 @@ class Errors(NamedTuple):
 def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
     """Return the errors of the estimate in `log` relative to the reference.
 
-    Args:
-        log: the flight.
-        late_s: delay of the estimate [s]; it is compared with the reference so much earlier.
+    The estimate is late by `late_s` [s]; it is compared with the reference so much earlier.
 
     Raises:
         FlightLogError: if the log has no estimate, no reference for it, or is too short.

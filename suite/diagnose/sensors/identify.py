@@ -179,10 +179,7 @@ def parameters_of(fitted: Fitted) -> dict[str, tuple[Interval, str]]:
 def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> dict[str, Any]:
     """Fit a sensors model to the estimates in flight logs, and write its file.
 
-    Args:
-        flights: logs or folders of them; a log without an estimate gives a warning.
-        out: the sensors file to write.
-        console: for progress.
+    A log without an estimate gives a warning.
 
     Returns:
         The JSON object that `--json` prints.

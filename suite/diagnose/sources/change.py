@@ -126,14 +126,9 @@ def since_reference(
 ) -> ViewSource:
     """Return the source that searches for a change since the `reference` flights.
 
-    Args:
-        reference: the flights before the change.
-        evidence: the flights to fit.
-        held: the held-out flights.
-        spread: how much the rotors' thrusts vary between the flights of one vehicle.
-        allowed: effects that the search may try.
-        means_only: whether there is no fallback.
-        shared: fields of both sources.
+    `evidence` has the flights to fit, `held` the held-out ones. `spread` is how much the rotors'
+    thrusts vary between the flights of one vehicle. With `means_only` there is no fallback.
+    `shared` are fields of both sources.
     """
     difference, start = change_evidence(reference, evidence.flights, spread)
     weighed = difference.relinearise(start)

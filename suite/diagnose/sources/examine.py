@@ -32,12 +32,7 @@ def examine(
 ) -> tuple[Finding, list[str]]:
     """Search for named effects with one source, and test them.
 
-    Args:
-        source: the source to search.
-        earlier: findings of the sources before this one. Effects that contradict the first of them
-            are left out.
-        say: receives a line for people about each step.
-        seed: seed of all random draws.
+    Effects that contradict the first of the `earlier` findings are left out.
 
     Returns:
         The finding, and warnings for people.

@@ -340,13 +340,9 @@ def structure_where(
 ) -> str | None:
     """Return in words the quantity that a structured residual depends on; None if it is noise.
 
-    Args:
-        slow_errors: energy of slow errors and its expectation, from `RolloutEvidence.slow_errors`.
-        residual: result of the tests for structure.
-        noise_is_uncertain: whether measured rotor speeds are the input, or commands of which the
-            log lacks some. The size of the noise is then less certain, so the thresholds are
-            higher.
-        limits: thresholds above which structure is not noise.
+    The energy of slow errors and its expectation are from `RolloutEvidence.slow_errors`. With
+    measured rotor speeds as the input, or commands of which the log lacks some, the noise is less
+    certain. The thresholds are then higher.
     """
     slow, expected = slow_errors
     shape = residual.shapes[0] if residual.shapes else None

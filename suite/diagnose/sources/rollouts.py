@@ -29,7 +29,7 @@ from suite.diagnose.evidence.rollouts import (
     start_estimate,
 )
 from suite.diagnose.sources.rollout_source import RolloutSource
-from suite.diagnose.sources.source import DiagnosisInput, Source, SourceSet
+from suite.diagnose.sources.source import DiagnosisInput, SourceSet
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.actuators import (
     flown_by_other_controller,
@@ -55,17 +55,11 @@ LACKING = (
 )
 
 
-def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | None:
-    """Make the source of rollouts.
+def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
+    """Make the source of rollouts; None if the logs lack a signal that a rollout needs.
 
-    Args:
-        given: the input of the diagnosis.
-        before: sources that exist already; with any of them, this one is not made.
-
-    Returns:
-        The source, or None if the logs lack a signal that a rollout needs. Unless this source was
-        chosen by name, also None if even all effects of the catalogue together leave the rollouts
-        far from the flights.
+    Unless it was chosen by name, it is also None if even all effects of the catalogue leave the
+    rollouts far from the flights.
 
     Raises:
         ValueError: if no flight can be used, or none with the chosen drive (model input).
@@ -73,7 +67,7 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
     logs, vehicle, limits = given.logs, given.vehicle, given.limits
     if given.chosen and given.references:
         raise ValueError("rollouts cannot find a change since reference flights; views can")
-    if before or given.references or not (given.chosen or can_fly(logs, vehicle)):
+    if given.references or not (given.chosen or can_fly(logs, vehicle)):
         return None
     # Choose the input of the model: commands or measured rotor speeds.
     integrator = integrator_of(logs, given.integrator)

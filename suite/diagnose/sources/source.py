@@ -128,22 +128,11 @@ class Source(ABC):
 
     @abstractmethod
     def gap(self, found: SearchResult, theta: np.ndarray) -> Gap:
-        """Return the gap on the held-out flights.
-
-        Args:
-            found: result of the search, with its estimate of the measurement noise.
-            theta: (P,) parameters of the model.
-        """
+        """Return the gap of a model with the parameters `theta` (P,) on the held-out flights."""
 
     @abstractmethod
     def remaining(self, found: SearchResult, gaps: tuple[Gap, Gap], seed: int) -> Remaining:
-        """Return the error that remains after `found`.
-
-        Args:
-            found: result of the search.
-            gaps: the gap without the named effects and the gap with them.
-            seed: seed of random draws.
-        """
+        """Return the error that remains after `found`, from the gaps without it and with it."""
 
     def search(self, say: Callable[[str], None], seed: int) -> SearchResult:
         """Search for the effects that explain the fitted flights."""
@@ -248,17 +237,6 @@ class SourceSet:
     """Effects that separate tests of the flights have named."""
     compares: tuple[str, ...] = ()
     """For people, if a change is searched for: how flights of the unchanged vehicle differ."""
-
-    def joined(self, more: SourceSet) -> SourceSet:
-        """Return a set with the sources of this one and of `more`."""
-        return SourceSet(
-            (*self.sources, *more.sources),
-            tuple(dict.fromkeys([*self.held_out, *more.held_out])),
-            self.driven_by or more.driven_by,
-            (*self.warnings, *more.warnings),
-            (*self.tested, *more.tested),
-            (*self.compares, *more.compares),
-        )
 
 
 @dataclass(frozen=True)

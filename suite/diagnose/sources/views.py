@@ -7,7 +7,6 @@ the reference flights instead.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -23,7 +22,7 @@ from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.sources.change import references_of, since_reference, spread_words
-from suite.diagnose.sources.source import DiagnosisInput, Source, SourceSet
+from suite.diagnose.sources.source import DiagnosisInput, SourceSet
 from suite.diagnose.sources.view_source import ViewSource
 from suite.diagnose.verdict.actuators import find_rotor_lag
 
@@ -37,21 +36,12 @@ UNTESTED = "a change that depends on the motion, such as a drag, was not tested:
 """Warning if only constant changes since reference flights are tested."""
 
 
-def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | None:
+def by_views(given: DiagnosisInput) -> SourceSet:
     """Make the sources force and torque; flights may lack signals.
-
-    Args:
-        given: the input of the diagnosis.
-        before: sources that exist already.
-
-    Returns:
-        The sources, or None if other sources exist and these were not chosen by name.
 
     Raises:
         ValueError: if flights cannot be used, or there is only one reference flight.
     """
-    if before and not given.chosen:
-        return None
     # Smooth the flights, and set up the model and the effects that the search tries.
     vehicle, limits, references = given.vehicle, given.limits, given.references
     flights = ready(given.logs, vehicle, limits, given.references)
@@ -128,7 +118,7 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
 
 def _descriptions(view: View) -> dict[str, Any]:
     """Return the fields of a source that depend only on its view, by name."""
-    about = {"about": view.about, "unit": view.unit}
+    about = {"about": view.about, "unit": "m/s^2" if view.in_world else "rad/s^2"}
     measure = MEASURE.format(**about, width=view.width_s)
     return {
         **about, "name": view.name, "view": view, "horizon_s": view.width_s, "measure": measure,

@@ -268,11 +268,8 @@ def _rms(values: np.ndarray) -> float:
 def rotors_are_input(logs: Sequence[FlightLog], drive: str, vehicle: Vehicle) -> bool:
     """Return whether measured rotor speeds are the model's input, and not the commands.
 
-    Args:
-        logs: flights.
-        drive: the user's choice of the input: "commands", "motors" or "auto". With "auto" it is the
-            commands where that is possible.
-        vehicle: the vehicle whose rate loop would follow the commands.
+    `drive` is the user's choice of the input: "commands", "motors" or "auto", which is the commands
+    where that is possible.
 
     Raises:
         ValueError: for an unknown `drive`, or one that the logs or the rate loop do not allow.
@@ -351,11 +348,8 @@ def find_rotor_lag(
 ) -> TestedEffect | None:
     """Return the rotors' lag where it differs significantly from that of `vehicle`, else None.
 
-    Args:
-        logs: flights. Flights without commands or rotor speeds are ignored. So are flights whose
-            speeds the nominal rate loop does not explain: a firmware's filters are not a lag.
-        vehicle: the nominal vehicle.
-        limits: significance.
+    Flights without commands or rotor speeds are ignored. So are flights whose speeds the nominal
+    rate loop does not explain: a firmware's filters are not a lag.
     """
     if has_firmware_loop(vehicle):
         return None

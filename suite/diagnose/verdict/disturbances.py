@@ -114,10 +114,7 @@ def find_swing(
 ) -> Swing | None:
     """Return the oscillation in the residual force of `flights`; None where there is none.
 
-    Args:
-        flights: measured accelerations of each flight, in the force view.
-        residual_b: residual force of each flight, (M, 3) body axes [m/s^2].
-        limits: significance and size.
+    `residual_b` is that force of each flight, (M, 3) in body axes [m/s^2].
     """
     pairs = zip(flights, residual_b, strict=True)
     spectra = [s for flight, residual in pairs if (s := _spectrum(flight, residual)) is not None]

@@ -98,12 +98,8 @@ class Gap(NamedTuple):
         """Return whether the energy is significantly larger than that of `before`.
 
         A parameter that was fitted to other flights raises the squared error by about one, even if
-        the model is right. So the rise has to be clearly larger than that.
-
-        Args:
-            before: gap of another model on the same stretches.
-            weight: factor on sums over stretches, so that rows in overlapping ones count once.
-            limits: least significant rise.
+        the model is right. So the rise has to be clearly larger than that. `weight` multiplies sums
+        over stretches, so that rows in overlapping ones count once.
         """
         rise = self.energy - before.energy
         rise_low = np.quantile(self._means(rise, 0, limits), 0.025)
@@ -140,10 +136,7 @@ def from_true_starts(
 
 
 def gap_of(
-    linear: Linearisation,
-    windows: FlightWindows,
-    noise: Noise,
-    limits: Thresholds = THRESHOLDS,
+    linear: Linearisation, windows: FlightWindows, noise: Noise, limits: Thresholds = THRESHOLDS
 ) -> Gap:
     """Return the gap of the residuals in `linear`, which has slopes along the start states only.
 
@@ -244,10 +237,7 @@ def rollout_size(shift: np.ndarray, windows: FlightWindows) -> EffectSize:
     """Return the size of an effect that shifts the simulated values of `windows`.
 
     A fault of the log gets the size of the motion that would change the logged values as much.
-
-    Args:
-        shift: (W, N, 19) change of the simulated values by the effect, by row and channel.
-        windows: W stretches of 1 s.
+    `shift` (W, N, 19) is the change of the simulated values by the effect, by row and channel.
     """
     row_s, valid = np.asarray(windows.row_s), np.asarray(windows.valid)
 

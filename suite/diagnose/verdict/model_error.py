@@ -47,13 +47,8 @@ def with_model_error(
 ) -> Thresholds:
     """Return `limits` with the lower limits of the noise raised to the model's error.
 
-    Args:
-        model: the model that simulates the windows.
-        theta: (P,) parameters at which `linear` was computed.
-        windows: W stretches.
-        linear: residuals and slopes of `windows` along all parameters and start numbers.
-        coarser: the same stretches with longer steps and fewer rotor speeds.
-        limits: thresholds of the diagnosis.
+    `linear` has slopes along all parameters and start numbers at `theta` (P,). `coarser` are the
+    same W stretches with longer steps and fewer rotor speeds.
     """
     noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)
@@ -114,12 +109,9 @@ def beyond_error(change: np.ndarray, error: np.ndarray, width: np.ndarray) -> bo
     """Return whether an effect, or a shape of the residual, is more than the model's own error.
 
     It is if a 95 % interval, widened by the error at both ends, does not contain zero. Where no
-    parameter is significant by itself, one has to change by more than the error.
-
-    Args:
-        change: (K,) fitted parameters minus those of the vehicle file.
-        error: (K,) changes of the parameters that the model's own error may cause.
-        width: (K,) half-widths of the parameters' 95 % intervals.
+    parameter is significant by itself, one has to change by more than the error. All are (K,):
+    `change` is fitted parameters minus those of the vehicle file. The model's own error may change
+    them by `error`. `width` are the half-widths of their 95 % intervals.
     """
     distance = np.abs(change)
     least = width if (distance > width).any() else 0.0

@@ -72,15 +72,7 @@ def disturbance_equations(
     estimate: Estimate,
     limits: Thresholds = THRESHOLDS,
 ) -> DisturbanceEquations:
-    """Return the normal equations of a disturbance that would explain the residual at `estimate`.
-
-    Args:
-        model: the model that simulates the windows.
-        windows: W stretches of 1 s.
-        whitening: scales residuals by the noise of these windows.
-        estimate: parameters and start states.
-        limits: numbers of pieces and cells of the shapes.
-    """
+    """Return the normal equations of a disturbance that may explain the residual at `estimate`."""
     response = model.respond(estimate.theta, estimate.free, windows)
     columns = range(response.slope.shape[-1])
     disturbed = Linearisation(response.residual, response.slope, estimate.free)
@@ -97,11 +89,7 @@ def residual_structure(
 ) -> ResidualStructure:
     """Test the residual for structure, by both tests.
 
-    Args:
-        equations: normal equations of the disturbance.
-        fold: (W,) cross-validation fold of each window; one fold is left out at a time.
-        seed: seed of the permutation test.
-        limits: number of draws, and thresholds.
+    `fold` (W,) is the cross-validation fold of each window; one fold is left out at a time.
     """
     # From forces and torques at the knots to coefficients of the shapes.
     groups = equations.shapes.groups
@@ -135,12 +123,8 @@ def beyond_model_error(
 ) -> ResidualStructure:
     """Return `structure` without the significant shapes that the model's own error may explain.
 
-    Args:
-        structure: result of both tests.
-        equations: normal equations of the disturbance.
-        coarse: the same with fewer rotor speeds or commands as input, which makes the error larger.
-        share: share of the change of a shape's coefficients that counts as the error.
-        limits: threshold of significance.
+    `coarse` has fewer rotor speeds or commands as input, which makes the error larger. The `share`
+    of the change of a shape's coefficients counts as the error.
     """
 
     def is_kept(shape: ShapeScore) -> bool:
@@ -221,12 +205,9 @@ class ShapeLibrary(NamedTuple):
 def shape_library(
     knot: Flown, start_s: np.ndarray, limits: Thresholds = THRESHOLDS
 ) -> ShapeLibrary:
-    """Return all shapes at the knots of W windows.
+    """Return all shapes at the knots (W, KNOTS, ...) of W windows.
 
-    Args:
-        knot: (W, KNOTS, ...) simulated states.
-        start_s: (W,) start of each window, from the start of its flight [s].
-        limits: number of pieces and cells.
+    `start_s` (W,) is the start of each window, from the start of its flight [s].
     """
     pos_w, rot_w, vel_w, rate_b = (np.asarray(field) for field in knot.track)
     axes_b = np.swapaxes(rot_w, -1, -2)

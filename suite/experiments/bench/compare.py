@@ -59,14 +59,9 @@ def in_turn(
 ) -> dict[str, list[float]]:
     """Return the seconds of each call in every round, after one call each to warm up.
 
-    The calls take turns, so that a changing load of the machine affects all of them alike.
-
-    Args:
-        calls: functions to time, by name. Each must finish its work before it returns
-            (`jax.block_until_ready`).
-        rounds: number of rounds; in each of them every call is made once.
-        clock: returns the time [s].
-        most_s: no round begins after this time, except the first [s].
+    The calls take turns, so that a changing load of the machine affects all of them alike. Each
+    call must finish its work before it returns (`jax.block_until_ready`). Except the first, no
+    round begins after `most_s` [s].
     """
     for call in calls.values():
         call()
@@ -89,14 +84,10 @@ def compare_times(
     unit: str,
     details: Mapping[str, Any],
 ) -> Comparison:
-    """Return the comparison of two implementations by the medians of their times.
+    """Return the comparison of two implementations by the medians of their times [s].
 
-    Args:
-        name: name of the benchmark.
-        times_s: times from `in_turn`, those of the suite first [s].
-        work: work of one call. Divided by a time [s] it gives a figure in `unit`.
-        unit: unit of the figures.
-        details: further results.
+    The times are from `in_turn`, those of the suite first. The work of one call, divided by a time
+    [s], gives a figure in `unit`.
     """
     ours, baseline = (
         Figure(work / statistics.median(seconds), unit) for seconds in times_s.values()

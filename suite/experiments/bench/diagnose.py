@@ -29,12 +29,7 @@ ROUNDS = 3
 
 
 def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Comparison:
-    """Time both fits in turn and compare their estimates.
-
-    Args:
-        seed: seed of the true parameters, the flights and their noise.
-        duration_s: length of each of the five flights [s].
-        rounds: number of timed fits of each side, after one call to warm up.
+    """Time both fits in turn on five flights of `duration_s` [s], and compare their estimates.
 
     Raises:
         WorkFailed: if a package of `mujoco.sysid` is missing.

@@ -14,13 +14,7 @@ ENVS, DECISIONS = 64, 20
 
 
 def run(envs: int = ENVS, decisions: int = DECISIONS, repeats: int = 3) -> Comparison:
-    """Time both with the same random actions.
-
-    Args:
-        envs: number of environments.
-        decisions: decisions of each environment in a timed call.
-        repeats: number of timed calls of each side.
-    """
+    """Time `repeats` calls of both with the same random actions."""
     from eval.envs.gymnasium_env import RaceEnv, RaceVectorEnv
 
     vector_env = RaceVectorEnv(envs, track="random")

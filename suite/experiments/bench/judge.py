@@ -53,13 +53,7 @@ class OwnRays(MujocoWorld):
 
 
 def run(policy: str = "", trials: int = TRIALS, time_limit_s: float = 20.0) -> Comparison:
-    """Time both in turn, and count the trials that end in the same way.
-
-    Args:
-        policy: name or folder of a policy; the shipped one by default.
-        trials: number of trials per call.
-        time_limit_s: longest trial [s].
-    """
+    """Time both in turn, and count the trials (of at most `time_limit_s` [s]) that end alike."""
     if BASELINE not in WORLDS:
         WORLDS.register(BASELINE, OwnRays)
     loaded, vehicle = load_policy(policy or default_policy()), load_vehicle("reference")

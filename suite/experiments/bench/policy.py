@@ -27,11 +27,7 @@ ROUNDS = 20
 
 
 def run(policy: str = "", rounds: int = ROUNDS) -> Comparison:
-    """Time single steps of every engine (C export, ONNX Runtime, torch) in turn.
-
-    Args:
-        policy: name or folder of a policy; the shipped one by default.
-        rounds: number of blocks of 100 steps of each engine.
+    """Time blocks of 100 steps of every engine (C export, ONNX Runtime, torch) in turn.
 
     Raises:
         WorkFailed: without a C compiler.

@@ -49,12 +49,7 @@ class Task:
 
 
 def make_task(seed: int, duration_s: float = 10.0) -> Task:
-    """Return windows of five MuJoCo flights of a vehicle with other mass and inertia.
-
-    Args:
-        seed: seed of the true parameters, the flights and the noise.
-        duration_s: length of each flight [s].
-    """
+    """Return windows of five MuJoCo flights of `duration_s` [s], with other mass and inertia."""
     from eval.flights.follow import FlightFailed
     from eval.flights.simulate import SENSORS, fly, log_of
     from eval.flights.trajectory import ordinary_flights

@@ -52,10 +52,8 @@ def is_installed() -> bool:
 def prepare(task: Task, sigma: np.ndarray) -> Problem:
     """Return the task in the form that `mujoco.sysid` reads.
 
-    Args:
-        task: windows and parameters.
-        sigma: (19,) standard deviation of the noise of each channel (the first 12 are position,
-            attitude, velocity and body rates).
+    `sigma` (19,) is the standard deviation of the noise of each channel. The first 12 are position,
+    attitude, velocity and body rates.
     """
     dt = step_s(task.nominal)
     spec = mujoco.MjSpec()

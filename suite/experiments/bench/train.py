@@ -114,13 +114,7 @@ def _baseline(config: TrainConfig, worlds: Worlds) -> Callable[[], Any]:
 
 
 def run(batch: int = BATCH, steps: int = STEPS, rounds: int = ROUNDS) -> Comparison:
-    """Time both sides in turn and return the best of all rounds for each.
-
-    Args:
-        batch: number of worlds.
-        steps: policy periods of a rollout.
-        rounds: number of timed calls of each side, after one call to warm up.
-    """
+    """Time both sides in turn and return the best of all rounds for each."""
     with _two_cores():
         return _compare(batch, steps, rounds)
 

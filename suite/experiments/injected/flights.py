@@ -39,10 +39,7 @@ def flight_signals(
 ) -> dict[str, np.ndarray]:
     """Return a simulated flight as noisy signals, with a battery voltage and a barometer.
 
-    Args:
-        log: the flight.
-        vehicle: its vehicle; its full thrust gives the throttle.
-        rng: draws the noise.
+    The full thrust of the vehicle gives the throttle.
 
     Returns:
         Signal -> (T, C) values at T times in C components, in SI units and the suite's frames.
@@ -74,9 +71,7 @@ def flight_signals(
 def as_log(signals: Mapping[str, np.ndarray], name: str) -> FlightLog:
     """Return signals as a flight log, with extra columns `throttle` and `baro`.
 
-    Args:
-        signals: as from `flight_signals`; a log without pose or rates becomes a partial log.
-        name: name of the log.
+    The signals are as from `flight_signals`. A log without pose or rates becomes a partial log.
 
     Raises:
         FlightLogError: if the signals break a rule of flight logs.

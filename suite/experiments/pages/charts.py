@@ -137,13 +137,9 @@ def bars_chart(
 ) -> bytes:
     """Return a chart of means over training seeds as bars, with the least and most as dots.
 
-    Diamonds are the values of the paper.
-
-    Args:
-        rows: measures of each setting. Its key is its kind and its weight, such as "field 0.4".
-        printed: values of the paper, for some of the keys.
-        kinds: label of each kind, in the order of the colours.
-        sample: number of seeds and trials as text, for the legend.
+    Diamonds are the values of the paper. The key of a row is its kind and its weight, such as
+    "field 0.4". `kinds` has the label of each kind, in the order of the colours. The legend has the
+    `sample`: seeds and trials.
     """
     figure = Figure(figsize=(10.4, 5.2), layout="constrained")
     panels = figure.subplots(1, 3, sharey=True)

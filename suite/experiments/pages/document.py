@@ -54,14 +54,8 @@ def write_document(
 ) -> dict[str, Any]:
     """Write the charts `name`.png, `name`-2.png, ..., `name`.json and `name`.md to `workspace.out`.
 
-    The page is written last, after everything that it shows.
-
-    Args:
-        workspace: has the folder of the files.
-        name: name of the experiment.
-        config: options of the experiment; its `seed` goes into the stamp (version, commit, seed).
-        contents: the results.
-        console: prints the names of the written files.
+    The page is written last, after everything that it shows. The `seed` of `config` goes into the
+    stamp (version, commit, seed).
 
     Returns:
         The contents of `name`.json, and `out`, the page's path.

@@ -20,10 +20,8 @@ Numbers = Mapping[str, Any]
 def trainer_grid(rows: Sequence[Numbers], steps: int, best: float) -> Grid:
     """Return a table of the speed of training, a row per model and number of worlds.
 
-    Args:
-        rows: model, worlds, seconds and operations of a gradient step.
-        steps: decisions of a world in a gradient step.
-        best: operations per second of a matrix product, the device's best speed.
+    A row has model, worlds, seconds and operations of a gradient step, which is `steps` decisions
+    of a world. `best` is the device's best speed in a matrix product [operations/s].
     """
     return table_of(
         rows,

@@ -56,10 +56,8 @@ def digest(value: Any) -> str:
 def code_digest(*folders: str) -> str:
     """Return a digest (16 hex digits) of the code in `folders`, without `NO_RESULT` in them.
 
-    Docstrings, comments and layout do not change it.
-
-    Args:
-        folders: folders of the project, such as "tracks" or "suite/train".
+    Docstrings, comments and layout do not change it. Folders are relative to the project, such as
+    "tracks" or "suite/train".
     """
     sha256 = hashlib.sha256()
     for folder in folders:

@@ -75,12 +75,7 @@ def fly_conditions(
 ) -> list[ConditionResult]:
     """Return the results of every policy under every condition.
 
-    Args:
-        conditions: vehicles, sensors and simulators.
-        policies: label -> name or path of a policy.
-        trials: trials; each policy flies all of them under every condition.
-        workspace: cache of flights, and workers.
-        console: shows progress.
+    `policies` maps labels to names or paths. Each policy flies all trials under every condition.
     """
     requests = {
         (number, name): TrialRequest(

@@ -65,14 +65,8 @@ def fly_trials(
 ) -> dict[Key, list[TrialResult]]:
     """Return the results of every request; trials that are not in the cache are flown first.
 
-    After an interrupt, finished trials stay in the cache.
-
-    Args:
-        requests: trials by any key. Several requests may have the same setup.
-        workspace: folder of the journals, and the workers. Without workers, as many processes of
-            this machine are started as shorten the work.
-        console: shows progress.
-        title: label of the progress.
+    After an interrupt, finished trials stay in the cache. Several requests may have the same setup.
+    Without workers, as many processes of this machine are started as shorten the work.
 
     Raises:
         ValueError: for a policy that cannot be loaded, before the first flight.

@@ -70,10 +70,7 @@ def _equation_operations(equation: Any) -> float:
 
 
 def multiplying_rate(size: int) -> float:
-    """Return the operations per second of a product of float32 matrices in full precision [1/s].
-
-    Args:
-        size: number of rows and columns of the matrices.
+    """Return the operations per second of a product of float32 matrices of `size` rows [1/s].
 
     Returns:
         Approximately the best speed of the device without rounding to fewer bits.

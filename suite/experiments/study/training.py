@@ -100,13 +100,8 @@ class Study:
 def train_all(study: Study, workspace: Workspace, console: Console) -> list[TrainingResult]:
     """Return every training of `study`; missing ones are trained or resumed first.
 
-    If a training diverges, the others continue.
-
-    Args:
-        study: settings and seeds.
-        workspace: cache of trainings, and workers; with at most one worker the trainings run one
-            after the other on all cores.
-        console: shows progress.
+    If a training diverges, the others continue. With at most one worker the trainings run one after
+    the other on all cores.
     """
     from suite.train.ppo.update import estimate as ppo_estimate
     from suite.train.run import estimate
@@ -206,11 +201,7 @@ def read_measurements(folder: Path, frames: int) -> tuple[list[dict[str, float]]
     """Return the measurements of a run, each with its `steps` and `time`, and the compile time [s].
 
     Some iterations compile ("cold": the first one, and the first after a stop). They count with the
-    median time of the others.
-
-    Args:
-        folder: folder of the run.
-        frames: environment steps in an iteration.
+    median time of the others. An iteration has `frames` environment steps.
     """
     rows = curve.read(folder)
     warm = [row["seconds"] for row in rows if not row["cold"]]

@@ -97,9 +97,8 @@ def make_flight(
 ) -> Callable[[network.Params, Worlds], Scores]:
     """Return fly(params, worlds) -> scores, compiled on its first call.
 
-    Args:
-        config: a configuration from `validation_worlds`; its seed determines the image noise.
-        reward: function (worlds, state before, state after, target) -> reward of a step, (B,).
+    The seed of `config` (from `validation_worlds`) determines the image noise. `reward` maps
+    (worlds, state before, state after, target) to the reward of a step, (B,).
     """
     rollout, episode = make_rollout(config, reward), config.episode
 
@@ -140,12 +139,8 @@ def make_validation(
 ) -> Measure:
     """Return measure(params) -> measures of `mean_scores`, on the same worlds at every call.
 
-    Args:
-        config: configuration of the training, whose dynamics are flown.
-        trials: number of worlds.
-        seed: seed of the worlds; no training uses it.
-        seconds: length of a trial, from a standing start [s].
-        reward: function (worlds, state before, state after, target) -> reward of a step, (B,).
+    A trial takes `seconds` from a standing start [s]. No training uses the `seed` of the worlds.
+    `reward` is as in `make_flight`.
     """
     config = validation_worlds(config, trials, seed, seconds)
     fly, worlds = make_flight(config, reward), sample_worlds(config, 0)

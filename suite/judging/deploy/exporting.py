@@ -32,12 +32,7 @@ def export(
 ) -> dict[str, Any]:
     """Export a policy of the suite in `formats`; an export in C gets a card.
 
-    Args:
-        policy: a shipped name or a checkpoint's folder.
-        out: folder of the exported files.
-        formats: such as "onnx" and "c".
-        dtype: type of the weights, float32 or int8.
-        console: shows progress and the parity.
+    Formats are such as "onnx" and "c"; the type of the weights is float32 or int8.
 
     Returns:
         `written`, the paths of the files; for C also `parity`, the result of the comparison.
@@ -122,15 +117,7 @@ _LICENCE = "Apache-2.0, as diffracing-suite; the weights may have another licenc
 def card_text(
     source: str, name: str, checkpoint: PolicyCheckpoint, dtype: str, result: Parity
 ) -> str:
-    """Return the card of an export as Markdown.
-
-    Args:
-        source: the name or path of the policy that the user gave.
-        name: the name of the export.
-        checkpoint: the exported policy.
-        dtype: type of the weights, float32 or int8.
-        result: parity with the checkpoint, and time per step.
-    """
+    """Return the card of an export as Markdown; `source` is the policy as the user gave it."""
     spec = checkpoint.spec
     timing = "not measured"
     if result.timing:

@@ -47,11 +47,10 @@ def time_in_turn(steps: Mapping[str, Step], rounds: int = 20) -> dict[str, Timin
                 started = time.perf_counter()
                 step()
                 times[name].append(time.perf_counter() - started)
-    return {name: _timing(np.array(seconds)) for name, seconds in times.items()}
-
-
-def _timing(seconds: np.ndarray) -> Timing:
-    return Timing(float(np.median(seconds)), float(np.quantile(seconds, 0.99)), seconds.max())
+    return {
+        name: Timing(float(np.median(seconds)), float(np.quantile(seconds, 0.99)), max(seconds))
+        for name, seconds in times.items()
+    }
 
 
 def c_step(policy: CPolicy) -> Step:

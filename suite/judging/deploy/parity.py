@@ -55,12 +55,9 @@ class Parity(NamedTuple):
 
 
 def parity(folder: Path, checkpoint: PolicyCheckpoint, observed: Observed | None) -> Parity:
-    """Compile the export in `folder` and compare it with its checkpoint.
+    """Compile the export in `folder` (policy.c, policy.h) and compare it with its checkpoint.
 
-    Args:
-        folder: has policy.c and policy.h.
-        checkpoint: the exported policy.
-        observed: the inputs of both; None draws them at random.
+    Without `observed`, the inputs of both are drawn at random.
 
     Raises:
         PolicyError: if the export does not compile, or computes numbers that are not finite.

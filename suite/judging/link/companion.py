@@ -13,12 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eval.judging.guard import ActionLimits, first_action, guard_action, limits_of
-from eval.quadrotor.attitude import (
-    action_to_force,
-    attitude_command,
-    blend_heading,
-    level_heading,
-)
+from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading, level_heading
 from eval.quadrotor.autopilot import ATTITUDE_HZ
 from eval.quadrotor.plant import unpack_command
 from eval.vehicles.vehicle import Vehicle
@@ -67,13 +62,8 @@ class Companion:
     ) -> None:
         """Prepare a flight, which begins with the first state and image.
 
-        Args:
-            policy: the policy.
-            track: gates and start, in the frame of the vehicle's states.
-            vehicle: the vehicle, for its mass, thrust and attitude gains.
-            wire: converts messages to datagrams and back.
-            clock: returns monotonic time [s].
-            limits: limits of the watchdog; None: the defaults.
+        The track is in the frame of the vehicle's states. `clock` returns monotonic time [s]. The
+        vehicle gives mass, thrust and attitude gains.
 
         Raises:
             PolicyError: for a policy that commands motors.
@@ -135,10 +125,7 @@ class Companion:
         # Decode the messages, and record how many were left out.
         broken, foreign = self._wire.broken, self._wire.foreign
         messages = self._wire.decode(datagrams)
-        new_counts = {
-            "broken": self._wire.broken - broken,
-            "foreign": self._wire.foreign - foreign,
-        }
+        new_counts = {"broken": self._wire.broken - broken, "foreign": self._wire.foreign - foreign}
         for kind, count in new_counts.items():
             if count:
                 self._record_event(f"{count} {kind} messages left out")

@@ -61,16 +61,7 @@ def warm_up(policy: Policy) -> None:
 def fly_simulated(
     policy: Policy, trial_set: TrialSet, rules: Rules, limits: Limits, out: Path, console: Console
 ) -> Iterator[Flight]:
-    """Fly every trial in real time with a simulated vehicle on this machine, and yield the flights.
-
-    Args:
-        policy: the policy.
-        trial_set: trials, tracks and vehicle.
-        rules: when a trial ends.
-        limits: limits of the companion's watchdog.
-        out: folder of the logs.
-        console: shows progress.
-    """
+    """Fly all trials in real time with a simulated vehicle on this machine; yield the flights."""
     warm_up(policy)
     vehicle, successes = VehicleProcess(), 0
     try:
@@ -206,9 +197,7 @@ def _no_garbage_collection() -> Iterator[None]:
 def delays(rows: list[Row], deadline_s: float) -> dict[str, Any]:
     """Return statistics of the delays of set points [ms].
 
-    Args:
-        rows: states and set points of one flight or several.
-        deadline_s: an answer that takes longer counts as missed [s].
+    An answer that takes longer than `deadline_s` [s] counts as missed.
     """
     if not rows:
         return {}

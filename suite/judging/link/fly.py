@@ -69,14 +69,8 @@ def fly_over_link(
 ) -> dict[str, Any]:
     """Fly, and write logs and fly.json into `out`.
 
-    Args:
-        evaluation: settings of the trials.
-        policy: a name or path; "" flies the default policy.
-        link: address of a real vehicle; "" flies simulated ones.
-        limits: limits of the watchdog.
-        out: folder of the files.
-        console: shows progress and results.
-        key: 32 bytes that sign the messages to a real vehicle; None sends unsigned ones.
+    "" as the policy flies the default one. "" as the link flies simulated vehicles, and an address
+    a real one. The 32 bytes of `key` sign the messages to a real vehicle; None sends unsigned ones.
 
     Returns:
         The contents of fly.json, and `out`.

@@ -143,13 +143,10 @@ class Wire:
     """
 
     def __init__(self, own: int, other: int, key: bytes | None = None) -> None:
-        """Make an end of a link.
+        """Make an end of a link, from its own MAVLink system number and that of the other end.
 
-        Args:
-            own: the MAVLink system number of this end.
-            other: the system number of the other end.
-            key: 32 bytes that sign the messages (MAVLink 2). With a key, received messages that are
-                unsigned or repeated count as broken. None: no signatures.
+        The 32 bytes of `key` sign the messages (MAVLink 2); None: no signatures. With a key,
+        received messages that are unsigned or repeated count as broken.
         """
         self._dialect = dialect()
         self._out = self._dialect.MAVLink(None, srcSystem=own, srcComponent=1)

@@ -58,14 +58,7 @@ class SimulatedVehicle:
     ) -> None:
         """Place the vehicle at the start of `track`.
 
-        Args:
-            track: the track of the trial.
-            trial: the trial; its seed determines the gusts.
-            vehicle: the flown vehicle.
-            camera: size and field of view of the depth images.
-            image_hz: rate of the images [Hz].
-            wire: converts messages to datagrams and back.
-            rules: when the trial ends; None: the defaults.
+        The seed of `trial` determines the gusts. `image_hz` is the rate of the images [Hz].
         """
         self._vehicle, self._wire, self._trial = vehicle, wire, trial
         self._rules = rules or Rules()
@@ -111,9 +104,8 @@ class SimulatedVehicle:
     def step(self, datagrams: list[bytes], clock_s: float | None = None) -> list[bytes]:
         """Make one physics step; return the datagrams of the state and the image at its beginning.
 
-        Args:
-            datagrams: the datagrams that were received since the last step.
-            clock_s: time for the time stamps [s]; None: the time since the start.
+        `datagrams` were received since the last step. `clock_s` is the time for the time stamps
+        [s]; None: the time since the start.
         """
         # Take the newest valid set point, within the vehicle's limits.
         for message in self._wire.decode(datagrams):

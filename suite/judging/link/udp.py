@@ -20,12 +20,9 @@ class UdpLink:
     def __init__(
         self, address: str, is_from_peer: Callable[[bytes], bool] = lambda _: True
     ) -> None:
-        """Open an end.
+        """Open an end at `address`, which is udpin:HOST:PORT or udpout:HOST:PORT.
 
-        Args:
-            address: udpin:HOST:PORT or udpout:HOST:PORT.
-            is_from_peer: returns whether a datagram comes from the other end. A waiting end ignores
-                all datagrams before the first such one.
+        A waiting end ignores all datagrams before the first that `is_from_peer`.
 
         Raises:
             ValueError: for an address of another form, a port in use, or an unknown host.

@@ -108,11 +108,8 @@ class ClockCheck:
 
         The offset of the clocks (arrival minus time stamp) is compared with the smallest one so
         far, which is that of the shortest delay. The smallest one may grow by `DRIFT` only. So a
-        slowly growing delay is found like a jump.
-
-        Args:
-            stamp_s: time of the vehicle's clock in the state [s].
-            now_s: time of the companion's clock at the arrival of the state [s].
+        slowly growing delay is found like a jump. `stamp_s` is the time of the vehicle's clock in
+        the state [s], `now_s` that of the companion's clock at its arrival [s].
         """
         offset_s = now_s - stamp_s
         if self._offset_s is None:

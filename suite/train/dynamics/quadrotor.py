@@ -174,12 +174,9 @@ def plant_of(
 ) -> Plant:
     """Return the plants (rate loop, mixer, rotors and effects) of B worlds for steps of `dt` [s].
 
-    Args:
-        config: the vehicle.
-        effects: values (B, ...) by name; they replace those of the vehicle.
-        dt: length of a physics step [s].
-        varies: whether the delay of commands is among `effects`. Then the plant stores as many past
-            commands as the longest possible delay needs.
+    `effects` are values (B, ...) by name, which replace those of the vehicle. If the delay of
+    commands `varies` among them, the plant stores as many past commands as the longest possible
+    delay needs.
     """
     vehicle_effects: dict[str, Any] = dict(config.vehicle.effects)
     longest = longest_delay(config) if varies else None
@@ -273,10 +270,8 @@ def quadrotor_dynamics(
 ) -> tuple[Callable[..., QuadrotorState], Callable[..., QuadrotorState]]:
     """Return the functions `start` and `step` of `suite.train.dynamics.interface.Dynamics`.
 
-    Args:
-        config: the vehicle and its step rates.
-        period_s: policy period [s].
-        gradient_decay: decay rate of the motion's gradients, back in time [1/s].
+    `period_s` is the policy period [s], `gradient_decay` the decay rate of the motion's gradients,
+    back in time [1/s].
     """
     steps = substeps(config, period_s)
     decay = float(np.exp(-gradient_decay * period_s))

@@ -56,19 +56,15 @@ class RewardTerms(NamedTuple):
         return self.collision + self.avoid + self.smooth + self.passing + self.progress
 
 
-def make_reward(
-    config: TrainConfig,
-) -> Callable[..., tuple[RewardTerms, jax.Array, jax.Array]]:
+def make_reward(config: TrainConfig) -> Callable[..., tuple[RewardTerms, jax.Array, jax.Array]]:
     """Return reward(worlds, before, after, target) -> (terms, clearance, passed), (B,) each.
 
     The step is that from the state `before` to the state `after` of worlds that have passed
     `target` (B,) gates. `terms` are the weighted terms, `clearance` is the smallest signed distance
     to a solid [m], and `passed` is whether a gate was passed. As in the judge, a gate is passed by
     crossing its opening; in the paper it is passed within a distance r_th of its centre. In a step
-    that passes a gate, progress is measured towards the gate after it.
-
-    Args:
-        config: its `loss` has the safety radius r_q.
+    that passes a gate, progress is measured towards the gate after it. The safety radius r_q is
+    that of `config.loss`.
     """
     weights = replace(config.loss, pass_first=True, approach_m=0.0)
 

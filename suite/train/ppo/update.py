@@ -244,13 +244,7 @@ def estimate(config: PpoConfig) -> Estimate:
 def train_ppo(
     config: PpoConfig, folder: Path, console: Console, watch: Watch | None = None
 ) -> Outcome:
-    """Train for the configured iterations; the same call again resumes.
-
-    Args:
-        config: the whole run.
-        folder: where the run's files go; a run of the same configuration in it is resumed.
-        console: shows progress.
-        watch: measures the policy during the training.
+    """Train for the configured iterations; the same call again resumes the run in `folder`.
 
     Raises:
         ValueError: for invalid settings, and if the folder has another run.

@@ -257,8 +257,7 @@ def _poses(span, rate, offset, drift, noise=0.0, turn=None):
 
 
 @pytest.mark.parametrize(
-    ("offset", "drift", "rate"),
-    [(0.0, 0.0, 240.0), (-7.77, -400e-6, 120.0), (1.7e6, 30e-6, 60.0)],
+    ("offset", "drift", "rate"), [(0.0, 0.0, 240.0), (-7.77, -400e-6, 120.0), (1.7e6, 30e-6, 60.0)]
 )
 def test_offset_and_drift_come_back(offset, drift, rate):
     found = align(_poses((5, 45), rate, offset, drift), _gyro((0, 60), bias=0.02), "pose")

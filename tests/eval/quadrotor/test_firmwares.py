@@ -239,8 +239,7 @@ def test_numpy_and_jax_fly_the_same_and_follow_the_rates(kind):
 
 
 @pytest.mark.parametrize(
-    "kind",
-    ["crazyflie", *(pytest.param(k, marks=pytest.mark.slow) for k in ("betaflight", "px4"))],
+    "kind", ["crazyflie", *(pytest.param(k, marks=pytest.mark.slow) for k in ("betaflight", "px4"))]
 )
 def test_a_batch_flies_as_each_alone_and_has_gradients(kind):
     plant = make_plant(vehicle(kind), DT)

@@ -11,13 +11,7 @@ from scipy.integrate import solve_ivp
 
 from eval.quadrotor.mixer import mix, mixer_matrix, unequal_arms
 from eval.quadrotor.plant import nominal_quadrotor
-from eval.quadrotor.rotors import (
-    acceleration,
-    delay_weight,
-    delayed,
-    follow,
-    whole_steps,
-)
+from eval.quadrotor.rotors import acceleration, delay_weight, delayed, follow, whole_steps
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.blind.continuous.quadrotor import allocate_thrust
 from tests.support.vehicles import PLAIN

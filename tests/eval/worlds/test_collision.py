@@ -9,12 +9,7 @@ import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.collision import NEAR, box_distances, near_solids
-from eval.worlds.engine import (
-    BODY,
-    DepthCamera,
-    compile_model,
-    start_state,
-)
+from eval.worlds.engine import BODY, DepthCamera, compile_model, start_state
 from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.scene_slots import TO_CONTACTS
 from eval.worlds.slots import layout_of

@@ -285,9 +285,7 @@ def test_the_noise_counts_as_certain_only_if_no_command_is_lacking(monkeypatch):
     say, limits = lambda line: None, Thresholds()
 
     def source_of(logs):
-        made = by_rollouts(
-            DiagnosisInput(logs, LAGGED, (), "commands", "auto", say, limits, True), ()
-        )
+        made = by_rollouts(DiagnosisInput(logs, LAGGED, (), "commands", "auto", say, limits, True))
         return made.sources[0], LACKING in made.warnings
 
     logs = flights(LAGGED, count=2, duration_s=4.0, noise=0.1)

@@ -152,9 +152,7 @@ def _work_on(packed: bytes | None = None) -> tuple[bytes, bool]:
     """Return the next results (packed), and whether more follow.
 
     Errors are returned as results, since an error that cannot be pickled would end this process.
-
-    Args:
-        packed: the work and a new piece; None: go on with the current piece.
+    `packed` has the work and a new piece; None: go on with the current piece.
     """
     global _results
     try:
@@ -174,9 +172,7 @@ def _work_on(packed: bytes | None = None) -> tuple[bytes, bool]:
 def worker_pool(processes: int, cores: Sequence[int] = ()) -> ProcessPoolExecutor:
     """Return a pool of processes that ignore keyboard interrupts and end with this process.
 
-    Args:
-        processes: number of processes.
-        cores: numbers of the cores that each process may use; empty: all cores.
+    Each process may use the given cores; none given: all.
     """
     register_dict_views()
     # Spawned, as threads of JAX and MuJoCo do not survive a fork.

@@ -21,8 +21,7 @@ LEAST, MOST = 2, 4096
 def set_threads(environment: MutableMapping[str, str] | None = None) -> None:
     """Set XLA's threads to the number of cores, and at least two, unless the variable is set.
 
-    Args:
-        environment: environment variables, changed in place; None: those of this process.
+    The environment (by default that of this process) is changed in place.
 
     Raises:
         ValueError: where the variable is set to an invalid value.
@@ -54,10 +53,8 @@ def one_thread_a_product(environment: MutableMapping[str, str] | None = None) ->
 
     The suite computes many small products. On free cores, threads do not make them faster. On busy
     cores, threads wait for each other ten to a hundred times as long as a product takes. Call this
-    function before numpy is imported, because numpy reads the setting then.
-
-    Args:
-        environment: environment variables, changed in place; None: those of this process.
+    function before numpy is imported, because numpy reads the setting then. The environment is
+    changed in place.
     """
     variables = os.environ if environment is None else environment
     if not {"OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"} & set(variables):

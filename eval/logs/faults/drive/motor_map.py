@@ -100,9 +100,8 @@ class Ratio(NamedTuple):
 def check_motor_map(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
     """Return the findings on `[motors]`, and on a throttle's curve and linearisation.
 
-    Args:
-        rows: see `check.run_checks`.
-        vehicle: the vehicle file; without one (None), only a throttle's curve is checked.
+    Without a vehicle file, only a throttle's curve is checked. For the `rows` see
+    `check.run_checks`.
     """
     return [one for drive in _drives(rows, vehicle) for one in _check(rows, drive, vehicle)]
 

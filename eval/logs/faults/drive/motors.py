@@ -309,11 +309,8 @@ def over_force(rows: Rows, thrust: np.ndarray) -> float:
 def force_without_drag(rows: Rows, thrust: np.ndarray) -> np.ndarray | None:
     """Return the specific force (T,) along body z, averaged over `WIDTH_S`, without drag [m/s^2].
 
-    None where it is unknown.
-
-    Args:
-        rows: see `check.run_checks`.
-        thrust: (T,) thrust in any unit; its factor is fitted together with the drag.
+    None where it is unknown. `thrust` (T,) is in any unit: its factor is fitted together with the
+    drag. For the `rows` see `check.run_checks`.
     """
     if not ({"quat", "pos"} <= rows.keys() or "acc" in rows):
         return None

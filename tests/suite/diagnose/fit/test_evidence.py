@@ -115,7 +115,7 @@ def test_rollouts_find_no_change(log):
 
 def test_what_a_name_explains_is_computed_without_names_that_are_too_small(monkeypatch):
     given = sources(1.0, drag=0.5, alike=0.95, rows=300, kind=SizedSource)
-    monkeypatch.setitem(SOURCES, "air", lambda *_: given)
+    monkeypatch.setitem(SOURCES, "air", lambda _: given)
     (finding,) = diagnose([], PLAIN, by="air").findings
     assert [named.candidate.label for named in finding.names] == ["constant_wind"]
     # Nothing else remains, so without the wind the gap is as it was before.
@@ -124,7 +124,7 @@ def test_what_a_name_explains_is_computed_without_names_that_are_too_small(monke
 
 @pytest.mark.parametrize(("size", "label"), [(0.8, "named"), (0.0, "no_gap")])
 def test_a_new_source_goes_through_the_whole_diagnosis(monkeypatch, size, label):
-    monkeypatch.setitem(SOURCES, "air", lambda given, before: sources(size))
+    monkeypatch.setitem(SOURCES, "air", lambda given: sources(size))
     result = diagnose([], PLAIN, by="air")
     found = plain(diagnosis_json(result))
     assert found["verdict"] == label and found["gap"]["held_out"] == ["flight 4"]
