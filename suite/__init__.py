@@ -6,6 +6,7 @@ Other packages are imported at the first use of a name, so that `import suite` t
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -77,7 +78,7 @@ def evaluate_policy(
             with commas.
         difficulty: a level 0 to 9, "0,3", "0-9" or "all"; ignored for a track of your own.
         trials: number of trials on every track at every level. A track of your own is flown once if
-            nothing in its flights is random.
+            nothing in its flights is random; policy objects may be random.
         seed: seed of the first trial; each further trial adds one.
         vehicle: a vehicle, a shipped name or a vehicle file.
         simulator: a name of `suite list simulators`.
@@ -106,9 +107,12 @@ def evaluate_policy(
     objects = {name: each for name, each in given.items() if name not in sources}
     request: dict[str, Any] = {"difficulty": str(difficulty), "sensors": str(sensors), **sources}
     evaluation = Evaluation(trials=trials, seed=seed, simulator=simulator, **request)
-    trial_set = read_trial_set(evaluation, **objects)
-    flown, processes = loaded, workers or 1
-    if isinstance(policy, str | Path):
+    is_source = isinstance(policy, str | Path)
+    trial_set = read_trial_set(evaluation, repeated=not is_source, **objects)
+    for note in (*trial_set.differences, *trial_set.notes):
+        warnings.warn(note, stacklevel=2)
+    flown, processes = loaded, 1 if workers is None else workers
+    if is_source:
         flown = policy_for_workers(loaded, str(policy), False, processes)
     options = JudgeOptions(workers=processes, sensors=trial_set.sensors)
     return fly(

@@ -32,7 +32,7 @@ from suite.common.errors import UNUSABLE, explain
 from suite.judging.replay import read_evaluation
 from suite.judging.requests import Evaluation
 from suite.train.config import check
-from suite.train.overrides import override
+from suite.train.overrides import with_changes
 from suite.train.recipes import named_recipe, with_quadrotor
 from tests.support import foreign_logs, known_flight, raw_logs
 from tests.support.judged_cells import ROWS
@@ -130,7 +130,7 @@ def drawn_and_used(kind, folder):
     """Return the strategy of a kind of input, and what uses one."""
     if kind == "set":
         recipe = with_quadrotor(named_recipe("race"), load_vehicle("racer5"))
-        return changes(recipe), lambda change: check(override(recipe, [change]))
+        return changes(recipe), lambda change: check(with_changes(recipe, [change]))
     name, ending = "odd", Path(kind).suffix
     if kind in FOREIGN:
         name, valid, read = f"odd.{kind}", a_foreign_file(kind, folder), foreign_reader(kind)

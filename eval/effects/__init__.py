@@ -117,10 +117,9 @@ def all_values(vehicle: Vehicle) -> dict[str, Any]:
 
 
 def without_signal(vehicle: Vehicle) -> list[str]:
-    """Return a sentence for each effect that acts only on a signal that simulated flights lack.
+    """Return a sentence for each effect that does not act on simulated flights and trainings.
 
-    Simulated flights of policies, and trainings, have neither a battery voltage nor an
-    accelerometer.
+    These have neither a battery voltage nor an accelerometer; log faults change recorded logs.
     """
     notes = []
     for name, values in vehicle.effects.items():
@@ -135,4 +134,6 @@ def without_signal(vehicle: Vehicle) -> list[str]:
             notes.append(f"{name}: acts only on logs with a voltage; for flights give {instead}")
         elif changed and not effect.in_flight and "acc_b" in effect.needs:
             notes.append(f"{name}: acts only on logs with an accelerometer; flights here have none")
+        elif changed and not effect.in_flight:
+            notes.append(f"{name}: changes recorded logs only, not flights")
     return notes

@@ -125,7 +125,7 @@ def _choose_trials(
     The SHA-256 is None if RUN is a policy: there is no evaluation to compare the inputs with.
     """
     from suite.judging.flying import default_policy, manners
-    from suite.judging.replay import first_trials, read_evaluation
+    from suite.judging.replay import first_trials, read_digests, read_evaluation
     from suite.judging.requests import Evaluation
 
     folder = Path(config.run)
@@ -186,23 +186,4 @@ def _choose_trials(
         speed=() if manner.speed is None else (manner.speed,),
     )
     trials = [result.trial for result in results if result.policy == label]
-    return evaluation, trials[: config.count], _digests(folder, number), label
-
-
-def _digests(folder: Path, number: int) -> dict[str, str]:
-    """Return the SHA-256 of the inputs of policy `number` in an evaluation, by name of the input.
-
-    Raises:
-        ValueError: if summary.json does not have that of the policy.
-    """
-    from suite.judging.replay import read_digests
-    from tracks.input.reading import read_json
-
-    digests, path = read_digests(folder), folder / "summary.json"
-    try:
-        return {**digests, "policy": str(read_json(path)["policies"][number]["sha256"])}
-    except (KeyError, IndexError, TypeError) as error:
-        raise ValueError(
-            f"{path}: does not have the SHA-256 of policy {number + 1}; run suite eval again with "
-            "another --out, then view that folder"
-        ) from error
+    return evaluation, trials[: config.count], read_digests(folder, number), label

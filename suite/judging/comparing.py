@@ -60,13 +60,14 @@ def read_runs(folder: Path) -> list[Run]:
     if (record := folder / "run.json").is_file():
         versions["mujoco"] = read_json(record, packages=dict)["packages"].get("mujoco")
     names = list(dict.fromkeys(row.policy for row in results))
+    has_manner = bool(judged.get("speed") or judged.get("monitor"))
     return [
         Run(
             f"{folder}" if len(names) == 1 else f"{folder}: {name}",
             {row.trial: row for row in results if row.policy == name},
             conditions,
             versions,
-            name.removeprefix(MANNER.sub("", name)),
+            name.removeprefix(MANNER.sub("", name)) if has_manner else "",
         )
         for name in names
     ]

@@ -59,10 +59,11 @@ def read_evaluation(folder: Path) -> Evaluation:
     return evaluation
 
 
-def read_digests(folder: Path) -> dict[str, str]:
+def read_digests(folder: Path, number: int = 0) -> dict[str, str]:
     """Return the SHA-256 of the inputs of the evaluation in `folder`, by name.
 
-    The inputs are the first policy, vehicle, sensors and tracks; see `evaluate.file_digests`.
+    The inputs are policy `number` (from 0), the vehicle, the sensors and the tracks; see
+    `evaluate.file_digests`.
 
     Raises:
         ValueError: if summary.json in `folder` does not have that of the policy.
@@ -70,9 +71,9 @@ def read_digests(folder: Path) -> dict[str, str]:
     path = folder / "summary.json"
     try:
         summary = read_json(path)
-        first = summary["policies"][0]["sha256"]
+        policy = summary["policies"][number]["sha256"]
         # Earlier versions of the suite wrote only that of policies.
-        return {"policy": str(first), **dict(summary.get("sha256", {}))}
+        return {"policy": str(policy), **dict(summary.get("sha256", {}))}
     except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
         raise ValueError(
             f"{path}: does not say which policy was judged ({error}); run suite eval again with "

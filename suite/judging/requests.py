@@ -48,7 +48,8 @@ class SimulatedFlights(Flights):
     pip install 'diffracing-suite[rotorpy]'), or the simulator of an installed package."""
     sensors: str = "perfect"
     """Errors in what the policy sees: a shipped name (perfect, vio, stereo-depth, ...) or a sensors
-    file (.toml). Recorded logs have the true state."""
+    file (.toml). Recorded logs have the true state, with the log
+    faults of the vehicle file."""
 
 
 @dataclass(frozen=True)

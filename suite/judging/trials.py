@@ -131,14 +131,15 @@ class TrialSet(NamedTuple):
 
 def read_trial_set(
     options: SimulatedFlights,
-    real_time: bool = False,
+    repeated: bool = False,
     track: Track | None = None,
     vehicle: Vehicle | None = None,
 ) -> TrialSet:
     """Return the trials that a command's options describe.
 
-    A track from a file is flown only once if all its flights would be equal. In real time no two
-    flights are equal. `track` and `vehicle` fly instead of those that `options` name.
+    A track from a file is flown only once if all its flights would be equal. No two flights are
+    equal in real time, or with a random policy: then it is `repeated`. `track` and `vehicle` fly
+    instead of those that `options` name.
 
     Raises:
         ValueError: for an unknown simulator or track, too few trials, or an invalid file.
@@ -162,7 +163,7 @@ def read_trial_set(
     notes = without_signal(vehicle)
     # Without random effects every seed would give the same flight on a track from a file.
     is_random = sensors.random or any(EFFECTS[name].random for name in vehicle.effects)
-    once = () if real_time or is_random else tracks.keys()
+    once = () if repeated or is_random else tracks.keys()
     if options.trials > 1:
         notes += [
             f"{name}: flown once, not {options.trials} times: without random effects (gusts, "

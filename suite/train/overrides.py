@@ -49,19 +49,6 @@ PREFIX = "phases."
 """Prefix of a change that begins in a later phase."""
 
 
-def override(config: T, changes: Iterable[str]) -> T:
-    """Return `config` with every change "PATH=VALUE" made; values outside their range are refused.
-
-    Raises:
-        ValueError: naming the setting, what is wrong with it and what is allowed.
-    """
-    changes = list(changes)
-    config = _changed(config, changes)
-    for change in changes:
-        _check_effective([config], _path(change), shown(change))
-    return config
-
-
 def _changed(config: T, changes: Iterable[str]) -> T:
     """Return `config` with the changes made, also those that have no effect."""
     for change in changes:

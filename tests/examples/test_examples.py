@@ -22,7 +22,7 @@ from suite.commands import train as train_command
 from suite.delta.run import flight_files
 from suite.diagnose import run as diagnose_run
 from suite.train import run as train_run
-from suite.train.overrides import override
+from suite.train.overrides import with_changes
 from tests.support.judged_cells import cut_short
 from tests.support.loops import made_update
 from tests.support.policy_files import InProcess
@@ -72,7 +72,7 @@ def test_every_example_is_run_here_and_shown_to_newcomers():
 def as_a_program(tmp_path, monkeypatch):
     """Run in an empty folder, train in few worlds; effects that a program adds go again."""
     few = ("episode.batch=4", "episode.steps=8")
-    monkeypatch.setattr(train_command, "named_recipe", lambda name: override(RECIPE(name), few))
+    monkeypatch.setattr(train_command, "named_recipe", lambda name: with_changes(RECIPE(name), few))
     monkeypatch.chdir(tmp_path)
     for table in ("_entries", "_values"):
         monkeypatch.setattr(EFFECTS, table, dict(getattr(EFFECTS, table)))

@@ -230,15 +230,12 @@ def check_before_diagnosis(
 
 
 def _is_copy(log: FlightLog, other: FlightLog) -> bool:
-    """Return whether two logs have the same times and rates or, without rates, positions."""
-    key = "rate_b" if log.rate_b is not None else "pos_w"
-    pairs = [(log.time_s, other.time_s), (getattr(log, key), getattr(other, key))]
-    return all(
-        a is not None
-        and b is not None
-        and a.shape == b.shape
-        and np.allclose(a, b, rtol=0.0, atol=1e-5, equal_nan=True)  # a CSV has rounded values
-        for a, b in pairs
+    """Return whether two logs have the same rows: equal times and equal values of all signals."""
+    ours, theirs = ({"time": one.time_s, **_measured(one)} for one in (log, other))
+    return ours.keys() == theirs.keys() and all(
+        value.shape == theirs[name].shape
+        and np.allclose(value, theirs[name], rtol=0.0, atol=1e-5, equal_nan=True)  # rounded in CSV
+        for name, value in ours.items()
     )
 
 

@@ -70,7 +70,7 @@ def code_digest(*folders: str) -> str:
 
 
 def page_code(page: str) -> str:
-    """Return the digest of the code that can change the results of a page."""
+    """Return the digest of the code that flies, and of that in `MEASURED`, for a page."""
     return code_digest(*FLIES, *MEASURED.get(page, ()))
 
 

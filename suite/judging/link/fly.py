@@ -80,7 +80,7 @@ def fly_over_link(
         WorkFailed: if pymavlink is missing, or no vehicle answers.
     """
     dialect()
-    trial_set = read_trial_set(evaluation, real_time=True)
+    trial_set = read_trial_set(evaluation, repeated=True)
     refuse_equal_names({trial.track for trial in trial_set.trials})
     name = policy or default_policy()
     # The commanded speed is part of how the policy is loaded; the monitor is added below.
@@ -94,7 +94,9 @@ def fly_over_link(
     settings = LinkFlights(evaluation, policy_record(name, loaded), limits, link or "simulated")
     refuse_other_run(out, settings)
     if (out / FLY).is_file() or any(out.glob("*.parquet")):
-        raise ValueError(f"--out {out} holds earlier flights; give another --out")
+        raise ValueError(
+            f"--out {out} holds earlier flights, which are not continued; give another --out"
+        )
     rules = Rules(time_limit_s=evaluation.time_limit_s)
     # The judge's trials come before the flights, since the judge may refuse the policy.
     judged = [] if link else _judged_successes(loaded, trial_set, rules)

@@ -139,9 +139,12 @@ def test_two_methods_are_compared_over_their_seeds(tmp_path):
         assert found.low == pytest.approx(low) and found.low < found.value - 0.05
 
 
+SPEEDS = Evaluation(speed=(0.5, 1.0), monitor=True)
+
+
 def test_rows_of_other_speeds_or_the_monitor_are_no_training_seeds(tmp_path):
     plain, other, *unlike = (
-        read_runs(run_of(tmp_path / policy, [True, False], policy=policy))[0]
+        read_runs(run_of(tmp_path / policy, [True, False], SPEEDS, policy=policy))[0]
         for policy in ("a@0.5", "b@0.5", "a", "a@1", "a@0.5+monitor")
     )
     assert compare_seeds([plain, other], unlike[:1] * 2)["trials"] == 2

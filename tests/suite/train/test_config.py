@@ -13,7 +13,6 @@ from suite.train.overrides import (
     check_owned,
     check_phases,
     in_every_phase,
-    override,
     phase_configs,
     phase_ends,
     with_changes,
@@ -45,7 +44,7 @@ def test_worlds_that_cannot_be_made_are_refused_before_anything_is_written(
 def test_settings_are_changed_by_name():
     changes = ["loss.progress=1", "episode.batch = 8", "physics.drag=(0, 0.5)", "seed=3"]
     changes += ["loss.crash_depth_m=inf", "spec.camera.width=48"]
-    config, plain = override(TrainConfig(), changes), TrainConfig()
+    config, plain = with_changes(TrainConfig(), changes), TrainConfig()
     assert (config.loss.progress, *config.physics.drag) == (1.0, 0.0, 0.5)
     assert {type(one) for one in (config.loss.progress, *config.physics.drag)} == {float}
     assert (config.episode.batch, config.seed, config.loss.crash_depth_m) == (8, 3, math.inf)
@@ -56,8 +55,8 @@ def test_settings_that_would_do_nothing_or_that_the_command_sets_itself_are_refu
     run = named_recipe("race")
     for change in ("physics.wind_std=(3,3,1)", "physics.action_delay=(0,2)"):
         with pytest.raises(ValueError, match=r"is of the point mass.*set one of quadrotor\."):
-            override(run, [change])
-    assert override(run, ["physics.image_delay=2"]).physics.image_delay == 2
+            with_changes(run, [change])
+    assert with_changes(run, ["physics.image_delay=2"]).physics.image_delay == 2
     run = named_recipe("race-paper")
     for change, need, given in (
         ("loss.projection_decay=1", "loss.projection", "3"),
@@ -65,9 +64,9 @@ def test_settings_that_would_do_nothing_or_that_the_command_sets_itself_are_refu
         ("spec.speed=0.5", "spec.speed_input", "True"),
     ):
         with pytest.raises(ValueError, match=rf"has no effect while {need} is (0|False)"):
-            override(run, [change])
+            with_changes(run, [change])
         both = [change, f"{need}={given}"]
-        assert override(run, both) == override(run, both[::-1])
+        assert with_changes(run, both) == with_changes(run, both[::-1])
     # Only the user's changes must have an effect, and one in a later phase is enough.
     off, own = "spec.speed_input=False", "phases.2.episode.race_share=0.9"
     check_phases(with_changes(named_recipe("race"), [off]))
@@ -95,7 +94,7 @@ def test_settings_that_would_do_nothing_or_that_the_command_sets_itself_are_refu
 )
 def test_wrong_settings_are_refused_by_name(change, words):
     with pytest.raises(ValueError) as error:
-        override(TrainConfig(), [change])
+        with_changes(TrainConfig(), [change])
     assert words in str(error.value) and change in str(error.value)
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.check import CheckContext, check_before_diagnosis, check_log
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.reading import parse_readings, read_rows
@@ -46,6 +47,9 @@ def test_a_copy_of_a_flight_is_refused(tmp_path):
     rounded = replace(log, name="copy", rate_b=np.round(log.rate_b, 6))
     with pytest.raises(ValueError, match=f"{log.name} and copy are the same flight"):
         check_before_diagnosis([log, fly(PLAIN, 1, duration_s=3.0), rounded], CheckContext())
+    unknown = replace(log, rate_b=np.full_like(log.rate_b, np.nan))
+    moved = replace(unknown, pos_w=log.pos_w + [0.0, 0.0, 1.0])
+    check_before_diagnosis([log, unknown, moved], CheckContext(), list(FAULTS))
 
 
 def test_the_rate_of_slow_commands_is_that_of_their_own_rows():
