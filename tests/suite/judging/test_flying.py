@@ -67,7 +67,7 @@ def test_a_track_file_is_flown_once_a_seed_and_once_where_nothing_acts_by_chance
     save_vehicle(with_effects(load_vehicle("reference"), gusts=(1.0, 5.0)), gusts, "for a test")
     for course in (
         read_trial_set(replace(asked, track=YARD, vehicle=str(gusts))),
-        read_trial_set(replace(asked, track=YARD), real_time=True),
+        read_trial_set(replace(asked, track=YARD), repeated=True),
     ):
         assert [trial.seed for trial in course.trials] == [0, 1, 2] and not course.notes
 
@@ -111,13 +111,16 @@ def test_from_python_a_track_file_is_flown_and_a_named_policy_in_several_process
         flown.append((options.workers, trials, list(tracks)))
 
     monkeypatch.setattr(eval.judging.judge, "fly", fly)
-    suite.evaluate_policy("race-paper", track=YARD, trials=10)
-    suite.evaluate_policy("race-paper", track=load_track(YARD), trials=10)
+    for track in (YARD, load_track(YARD)):
+        with pytest.warns(UserWarning, match="flown once, not 10 times"):
+            suite.evaluate_policy("race-paper", track=track, trials=10)
+    # A policy object may be random.
+    suite.evaluate_policy(load_policy("race-paper"), track=YARD, trials=10)
     suite.evaluate_policy(Path("race-paper"), track="zigzag", trials=2, workers=2)
     # Without a number, a program without a main guard must still run.
     suite.evaluate_policy("race-paper", track="zigzag", difficulty=3, trials=300)
     numbers = [(workers, len(trials)) for workers, trials, _ in flown]
-    assert numbers == [(1, 1), (1, 1), (2, 4), (1, 300)]
+    assert numbers == [(1, 1), (1, 1), (1, 10), (2, 4), (1, 300)]
     assert flown[0][1:] == ([TrialSpec(YARD, 0, 0)], [YARD])
 
 
