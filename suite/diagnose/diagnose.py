@@ -101,14 +101,10 @@ def _diagnose(given: DiagnosisInput, makers: Sequence[SourceMaker], seed: int) -
     verdict = verdict_on(unique, bool(tested or names), limits)
     # Effects that leave most of the gap are not the cause: remove them, and decide again.
     if verdict.label == "unknown" and names:
-        wrong = [
-            id(one) for one in deciding(unique) if one.remaining.share > limits.unexplained_share
-        ]
-        labels = ", ".join(
-            named.candidate.label for one in unique if id(one) in wrong for named in one.names
-        )
+        wrong = [one for one in deciding(unique) if one.remaining.share > limits.unexplained_share]
+        labels = ", ".join(named.candidate.label for one in wrong for named in one.names)
         warnings.append(f"nearest in the catalogue, but most of the gap remains: {labels}")
-        unique = tuple(without_names(one, seed) if id(one) in wrong else one for one in unique)
+        unique = tuple(without_names(one, seed) if one in wrong else one for one in unique)
         tested = tested_in(unique, flights)
         if any(one.names for one in unique):
             verdict = verdict._replace(label="partly")

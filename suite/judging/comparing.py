@@ -7,7 +7,6 @@ of one method that differ only in the seed of their training are compared as a g
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,12 +16,11 @@ import numpy as np
 from eval.judging.results import read_trials
 from eval.judging.statistics import Interval, over_seeds, paired_success, wilson
 from eval.worlds.trial import TrialResult, TrialSpec
+from suite.judging.flying import manners
 from tracks.input.reading import read_json
 
 CONDITIONS = ("simulator", "time_limit_s", "deadline_s")
 """Settings that change the result of a trial, besides the trial itself and the input files."""
-MANNER = re.compile(r"(@[\d.e-]+)?(\+monitor)?$")
-"""End of a policy's label: its commanded speed and the safety monitor; see `flying.Manner`."""
 
 
 class Run(NamedTuple):
@@ -37,7 +35,7 @@ class Run(NamedTuple):
     versions: dict[str, Any]
     """Versions of the suite and of MuJoCo, which may change results."""
     manner: str
-    """End of the policy's label: "@0.5" at a commanded speed, "+monitor" inside the monitor."""
+    """End of the policy's label that says how it flew, such as "@0.5+monitor"; see `Manner`."""
 
 
 def read_runs(folder: Path) -> list[Run]:
@@ -60,14 +58,15 @@ def read_runs(folder: Path) -> list[Run]:
     if (record := folder / "run.json").is_file():
         versions["mujoco"] = read_json(record, packages=dict)["packages"].get("mujoco")
     names = list(dict.fromkeys(row.policy for row in results))
-    has_manner = bool(judged.get("speed") or judged.get("monitor"))
+    flown = manners(judged.get("speed") or (), bool(judged.get("monitor")))
+    endings = sorted((manner.label("") for manner in flown), key=len, reverse=True)
     return [
         Run(
             f"{folder}" if len(names) == 1 else f"{folder}: {name}",
             {row.trial: row for row in results if row.policy == name},
             conditions,
             versions,
-            name.removeprefix(MANNER.sub("", name)) if has_manner else "",
+            next((ending for ending in endings if name.endswith(ending)), ""),
         )
         for name in names
     ]

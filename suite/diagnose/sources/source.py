@@ -239,9 +239,9 @@ class SourceSet:
     """For people, if a change is searched for: how flights of the unchanged vehicle differ."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Finding:
-    """Result of the steps of a diagnosis (`examine.py`) for one source."""
+    """Result of the steps of a diagnosis (`examine.py`) for one source; equal only to itself."""
 
     source: Source
     search: SearchResult
