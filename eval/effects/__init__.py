@@ -53,6 +53,7 @@ _BUILT_IN = (
     drag.LINEAR_DRAG,
     drag.QUADRATIC_DRAG,
     drag.ROTOR_DRAG,
+    drag.HUB_DRAG,
     rotor_flow.INFLOW,
     rotor_flow.TRANSLATIONAL_LIFT,
     rotor_flow.BLADE_FLAPPING,

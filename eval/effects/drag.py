@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from eval.effects.interface import Array, Effect, Flow, Parameter, along_z, per_axis
+from tracks.geometry.rotation import cross
 
 
 class LinearDrag(NamedTuple):
@@ -91,6 +92,66 @@ ROTOR_DRAG = Effect(
         Parameter("coefficient", "kg/rad", neutral=0.0, low=0.0, high=1e-3, typical=(1e-5, 1e-4)),
     ),
     force=rotor_drag_force,
+)
+
+
+class HubDrag(NamedTuple):
+    """Values of `hub_drag`."""
+
+    in_plane: Array
+    """(...,) k: drag in the rotor plane, per speed of the hub and rotor speed [kg/rad]."""
+    axial: Array
+    """(...,) c: drag along body z, per speed of the hub and rotor speed [kg/rad]."""
+
+
+def hub_drag_force(values: HubDrag, flow: Flow) -> Array:
+    """Return the sum of the rotors' drags (..., 3) [N]."""
+    return _hub_drags(values, flow).sum(axis=-2)
+
+
+def hub_drag_torque(values: HubDrag, flow: Flow) -> Array:
+    """Return the torque of the rotors' drags, which act at the hubs (..., 3) [N m]."""
+    return cross(flow.constants.rotor_position_b, _hub_drags(values, flow)).sum(axis=-2)
+
+
+def _hub_drags(values: HubDrag, flow: Flow) -> Array:
+    """Return the drag of each rotor, -Omega_i diag(k, k, c) (v_b + w x r_i) (..., 4, 3) [N]."""
+    arm_b, xp = flow.constants.rotor_position_b, flow.rate_b.__array_namespace__()
+    hub_vel_b = flow.air_vel_b[..., None, :] + cross(flow.rate_b[..., None, :], arm_b)
+    per_speed = xp.stack([values.in_plane, values.in_plane, values.axial], axis=-1)
+    return -flow.rotor_speed[..., None] * per_speed[..., None, :] * hub_vel_b
+
+
+HUB_DRAG = Effect(
+    name="hub_drag",
+    summary="Drag of each rotor at its hub; the drag of the simulator RotorPy",
+    equation="F_i = -Omega_i diag(k, k, c) (v_b + w x r_i)\nF_b += sum F_i, tau_b += sum r_i x F_i",
+    source="Svacha, Mohta and Kumar 2017; Folk, Paulos and Kumar 2023",
+    values=HubDrag,
+    # Forces are those of rotor_drag and inflow, so a diagnosis could not tell which one it is.
+    parameters=(
+        Parameter(
+            "in_plane",
+            "kg/rad",
+            neutral=0.0,
+            low=0.0,
+            high=1e-3,
+            typical=(1e-5, 1e-4),
+            fitted=False,
+        ),
+        Parameter(
+            "axial",
+            "kg/rad",
+            neutral=0.0,
+            low=0.0,
+            high=1e-3,
+            typical=(3e-5, 1.2e-4),
+            required=False,
+            fitted=False,
+        ),
+    ),
+    force=hub_drag_force,
+    torque=hub_drag_torque,
 )
 
 

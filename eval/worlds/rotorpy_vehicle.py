@@ -3,7 +3,7 @@
 RotorPy's parameters describe rotors, body and air (Folk, Paulos and Kumar 2023, "RotorPy: A
 Python-based Multirotor Simulator with Aerodynamics"); the autopilot is this suite's. RotorPy's
 blade flapping has the opposite sign of the effect in the suite's catalogue. In RotorPy, the drag
-and lift of a rotor act at the rotor's hub, and depend on the airspeed there.
+of a rotor acts at the rotor's hub, and depends on the airspeed there, as in the effect `hub_drag`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,11 @@ AIR: Mapping[str, Callable[[Any, float], Mapping[str, float]]] = {
 """Effect -> RotorPy's parameters, from the effect's values and the true mass [kg]."""
 CONSTANTS = ("motor_lag", "thrust_scale", "mass_offset", "com_offset", "inertia_scale")
 """Effects that change constants of RotorPy's model."""
-ROTORPY_EFFECTS = (*AIR, *CONSTANTS)
+TO_HUB = ("rotor_drag", "inflow")
+"""Effects of the body's airspeed, for which RotorPy has the airspeed of each hub."""
+AT_HUB = "hub_drag"
+"""Effect with the form of RotorPy's drag of the rotors, `k_d` and `k_z`."""
+ROTORPY_EFFECTS = (*AIR, AT_HUB, *CONSTANTS)
 """Effects that RotorPy's own equations contain."""
 OUTSIDE = ("command_delay", "rate_gain", "constant_wind", "gusts")
 """Effects that are not part of RotorPy's vehicle: the autopilot has them, and wind is an input."""
@@ -72,6 +76,8 @@ def rotorpy_parameters(vehicle: Vehicle) -> dict[str, Any]:
     }
     for name, convert in AIR.items():
         parameters |= convert(values[name], mass)
+    parameters["k_d"] += float(values[AT_HUB].in_plane)
+    parameters["k_z"] += float(values[AT_HUB].axial)
     if AT_HOVER in effects:
         # RotorPy's drag is a coefficient times the sum of the rotor speeds times the airspeed.
         drag = mass * values[AT_HOVER].coefficient / (4.0 * _hover_speed(parameters))
@@ -108,16 +114,13 @@ def as_flown(vehicle: Vehicle) -> Vehicle:
     effects = {
         name: value
         for name, value in vehicle.effects.items()
-        if name in supported or not EFFECTS[name].in_flight
+        if name not in TO_HUB and (name in supported or not EFFECTS[name].in_flight)
     }
     parameters = rotorpy_parameters(vehicle)
     if parameters["tau_m"] < shortest_lag_s(vehicle):
         effects["motor_lag"] = EFFECTS["motor_lag"].values(shortest_lag_s(vehicle))
-    if AT_HOVER in vehicle.effects:
-        for name, key in (("rotor_drag", "k_d"), ("inflow", "k_z")):
-            effects[name] = EFFECTS[name].values(parameters[key])
     if parameters["k_d"] or parameters["k_z"]:
-        effects["angular_damping"] = EFFECTS["angular_damping"].values(damping_at_hover(parameters))
+        effects[AT_HUB] = EFFECTS[AT_HUB].values(parameters["k_d"], parameters["k_z"])
     return replace(vehicle, name=f"{vehicle.name}, as RotorPy flies it", effects=effects)
 
 
@@ -151,7 +154,8 @@ def differences(vehicle: Vehicle) -> list[str]:
             f"rotors.time_constant: {parameters['tau_m']:g} s is shorter than RotorPy's steps can "
             f"follow; flown with {shortest_lag_s(vehicle):g} s"
         )
-    if parameters["k_d"] or parameters["k_z"]:
+    moved = not vehicle.effects.keys().isdisjoint((AT_HOVER, *TO_HUB))
+    if moved and (parameters["k_d"] or parameters["k_z"]):
         deviations.append(
             "the rotors' drag acts at each hub and depends on the hub's airspeed: it damps "
             "rotation, and yaws the body where the rotors have different speeds"

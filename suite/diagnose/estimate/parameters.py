@@ -77,7 +77,7 @@ class ParameterSpace:
 
     entries: tuple[FittedNumber, ...]
     base: Mapping[str, Any]
-    """The vehicle file's values of every effect."""
+    """Values of the vehicle file's effects, and of every effect that may be named."""
 
     def array(self, field: str) -> np.ndarray:
         """Return the values of one `field` of all P entries, (P,)."""
@@ -140,9 +140,11 @@ def make_space(vehicle: Vehicle) -> ParameterSpace:
         ValueError: for a vehicle whose file has an effect with a motion of its own.
     """
     refuse_own_motion(vehicle)
-    base, entries = all_values(vehicle), []
+    present = all_values(vehicle)
+    base = {n: v for n, v in present.items() if n in vehicle.effects or EFFECTS[n].nameable}
+    entries = list[FittedNumber]()
     for name, effect in EFFECTS.items():
-        if not effect.by_state:  # random, or with a state of its own
+        if name not in base or not effect.by_state:  # random, or with a state of its own
             continue
         for parameter in effect.parameters:
             if not parameter.fitted:

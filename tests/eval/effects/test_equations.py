@@ -56,6 +56,10 @@ ADDED = [
     ("quadratic_drag", ((0.01, 0.02, 0.04),), SPEED, [-0.084187291, 0.112249722, -0.112249722],
      NONE),
     ("rotor_drag", (2e-5,), SPEED, [-0.24, 0.16, 0.0], NONE),
+    # Each hub moves by w x r as well, which damps the rotation.
+    ("hub_drag", (2e-5, 1e-4), SPEED, [-0.24, 0.16, -0.4], [-0.004, -0.0045, 0.000625]),
+    ("hub_drag", (2e-5, 1e-4), THIRD, [-0.2705, 0.179625, -0.4625],
+     [-0.01025, -0.0091875, 0.002203125]),
     ("translational_lift", (0.01,), SPEED, [0.0, 0.0, 0.0975], NONE),
     ("inflow", (1e-4,), SPEED, [0.0, 0.0, -0.4], NONE),
     # One rotor faster than the others loses more: rotor 3, rear left.

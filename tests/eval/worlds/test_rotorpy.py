@@ -191,14 +191,29 @@ def test_forces_and_torques_are_ours_where_the_body_does_not_turn(name):
         np.testing.assert_allclose(torque_b, ours.torque_b, rtol=1e-9, atol=1e-9)
 
 
-def test_turning_at_hover_the_vehicle_as_flown_has_rotorpys_damping():
+def test_the_vehicle_as_flown_has_rotorpys_force_and_torque_in_every_motion():
     from rotorpy.vehicles import multirotor
 
-    moved = with_effects(VEHICLE, com_offset=((0.0, 0.0, 0.02),), command_delay=(0.0,))
-    plant, rate_b = make_plant(as_flown(moved), 0.002), np.array([3.0, -2.0, 1.0])
-    speed = np.full(4, np.sqrt(0.75 * 9.81 / (4 * 1.6e-6)))
-    motion = Motion(np.zeros(3), np.eye(3), np.zeros(3), rate_b)
-    _, flow = wind_and_flow(plant, {}, motion, steady(speed), 0.0)
+    rng = np.random.default_rng(4)
+    moved = with_effects(VEHICLE, com_offset=((0.01, 0.0, 0.02),), inflow=(1e-4,))
+    plant = make_plant(as_flown(moved), 0.002)
     theirs = multirotor.Multirotor(rotorpy_parameters(moved))
-    _, torque_b = theirs.compute_body_wrench(rate_b, speed, np.zeros(3))
-    np.testing.assert_allclose(torque_b, wrench_on(plant, steady(speed), flow).torque_b, rtol=1e-9)
+    for _ in range(5):
+        (vel_b, rate_b), speed = rng.normal(0, 6, (2, 3)), rng.uniform(300, 2000, 4)
+        motion = Motion(np.zeros(3), np.eye(3), vel_b, rate_b)
+        _, flow = wind_and_flow(plant, {}, motion, steady(speed), 0.0)
+        ours = wrench_on(plant, steady(speed), flow)
+        force_b, torque_b = theirs.compute_body_wrench(rate_b, speed, vel_b)
+        np.testing.assert_allclose(force_b, ours.force_b, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(torque_b, ours.torque_b, rtol=1e-9, atol=1e-9)
+
+
+def test_a_drag_at_the_hubs_is_flown_as_it_is():
+    vehicle = with_effects(with_lag(PLAIN, 0.03), hub_drag=(2e-5, 1e-4))
+    assert differences(vehicle) == [] and as_flown(vehicle) is vehicle
+    parameters = rotorpy_parameters(vehicle)
+    assert (parameters["k_d"], parameters["k_z"]) == (2e-5, 1e-4)
+    both = as_flown(
+        replace(vehicle, effects={**vehicle.effects, **with_effects(inflow=(1e-5,)).effects})
+    )
+    assert dict(both.effects) == {"hub_drag": (2e-5, pytest.approx(1.1e-4))}

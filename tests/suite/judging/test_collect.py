@@ -94,7 +94,7 @@ def test_a_simulator_that_differs_from_the_vehicle_file_writes_the_file_that_des
         assert listed == ("vehicle_as_flown.toml" if simulator == "rotorpy" else None)
     described = load_vehicle(tmp_path / "rotorpy" / "vehicle_as_flown.toml")
     flown = nearest("rotorpy", load_vehicle("reference"))
-    assert described.effects.keys() == flown.effects.keys() >= {"angular_damping"}
+    assert described.effects.keys() == flown.effects.keys() >= {"hub_drag"}
     for name, values in described.effects.items():
         np.testing.assert_array_equal(np.hstack(values), np.hstack(flown.effects[name]), name)
     beyond = with_effects(flown, rotor_drag=(1.0,))
