@@ -125,10 +125,10 @@ def _hub_drags(values: HubDrag, flow: Flow) -> Array:
 HUB_DRAG = Effect(
     name="hub_drag",
     summary="Drag of each rotor at its hub; the drag of the simulator RotorPy",
-    equation="F_i = -Omega_i diag(k, k, c) (v_b + w x r_i)\nF_b += sum F_i, tau_b += sum r_i x F_i",
+    equation="F_b += sum F_i, tau_b += sum r_i x F_i; F_i = -Omega_i diag(k, k, c) (v_b + w x r_i)",
     source="Svacha, Mohta and Kumar 2017; Folk, Paulos and Kumar 2023",
     values=HubDrag,
-    # Forces are those of rotor_drag and inflow, so a diagnosis could not tell which one it is.
+    # Not fitted: the forces are nearly those of rotor_drag and inflow, which a diagnosis names.
     parameters=(
         Parameter(
             "in_plane",
