@@ -68,15 +68,23 @@ def apply_log_faults(effects: Mapping[str, Values], log: Mapping[str, Array]) ->
 
 
 def time_shifted(time_s: Array, series: Array, offset: Array) -> Array:
-    """Return `series` (T, K) at the times `time_s` (T,) - `offset` [s], linear between rows.
+    """Return `series` (T, K) at the times `time_s` (T,) - `offset` [s].
 
-    Beyond the ends, the line through the first or the last two rows is extended.
+    It is interpolated, and at the ends extrapolated, by the cubic polynomial through the four
+    nearest rows (Lagrange), or through fewer if there are fewer.
     """
     xp = time_s.__array_namespace__()
-    source_s = time_s - offset
-    row = xp.clip(xp.searchsorted(time_s, source_s, side="right") - 1, 0, len(time_s) - 2)
-    fraction = (source_s - time_s[row]) / (time_s[row + 1] - time_s[row])
-    return series[row] + fraction[:, None] * (series[row + 1] - series[row])
+    source_s, count = time_s - offset, min(4, len(time_s))
+    before = xp.searchsorted(time_s, source_s, side="right") - count // 2
+    rows = xp.clip(before, 0, len(time_s) - count)[:, None] + xp.arange(count)
+    at_s, shifted = time_s[rows], 0.0
+    for k in range(count):
+        others = [j for j in range(count) if j != k]
+        weight = 1.0 + 0.0 * source_s
+        for j in others:
+            weight = weight * (source_s - at_s[:, j]) / (at_s[:, k] - at_s[:, j])
+        shifted = shifted + weight[:, None] * series[rows[:, k]]
+    return shifted
 
 
 def _delayed_poses(log: Mapping[str, Array], delay: Array) -> dict[str, Array]:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eval.effects.interface import GRAVITY
+from eval.effects.log_faults import pose_delay
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.sampling import (
@@ -272,10 +273,8 @@ def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, stri
         finite = np.isfinite(logged).all(axis=1)
         if finite.any():
             time_s, command = time_s[finite], logged[finite]
-    used = slice(
-        max(np.searchsorted(time_s, begin_s - BURN_IN_S - HISTORY_S - 1e-9) - 1, 0),
-        np.searchsorted(time_s, begin_s + length_s + 1e-9) + 1,
-    )
+    first_s, last_s = begin_s - BURN_IN_S - HISTORY_S - 1e-9, begin_s + length_s + 1e-9
+    used = slice(max(np.searchsorted(time_s, first_s) - 1, 0), np.searchsorted(time_s, last_s) + 1)
     time_s, command = with_lost_rows(time_s[used] - begin_s, command[used])
     command = command[np.arange(len(command)) // stride * stride]
 
@@ -294,8 +293,7 @@ def _of_one_shape(inputs: Sequence[_Input], like: FlightWindows | None) -> list[
 
     def padded_size(counts: Iterable[int], sizes: Sequence[int]) -> int:
         count = max(counts)
-        large_enough = [size for size in sizes if size >= count]
-        return large_enough[0] if large_enough else -(-count // sizes[0]) * sizes[0]
+        return next((size for size in sizes if size >= count), -(-count // sizes[0]) * sizes[0])
 
     if like is None:
         burn_in = padded_size((len(one.burn_in.sample_s) for one in inputs), BURN_IN_STEPS)
@@ -364,7 +362,10 @@ def _window(
     rotor_valid = valid[5]
     if rotor_input:
         valid[5] = np.zeros_like(rotor_valid)  # the model's input is not compared
-    valid[4][0] = False  # the accelerometer shows the time before its row, here not simulated
+    # Not simulated: the time before the start, of the accelerometer's first row and of late poses.
+    valid[4][0] = False
+    for pose in valid[:3]:
+        pose[time_s[rows] - begin_s < pose_delay(vehicle.effects) - 1e-9] = False
 
     def padded(values: np.ndarray) -> np.ndarray:
         padding = np.zeros((ROWS - len(rows), *values.shape[1:]), values.dtype)

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from eval.effects.log_faults import pose_delay
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import assemble
 from eval.vehicles.vehicle import Vehicle
@@ -123,8 +124,34 @@ class RolloutEvidence(Evidence):
 
 
 def start_estimate(model: RolloutModel, windows: FlightWindows) -> Estimate:
-    """Return the vehicle file's parameters and the measured start states."""
-    return Estimate(model.space.array("start"), np.zeros((len(windows.flight), model.free)))
+    """Return the vehicle file's parameters, and the start states that it gives (`true_starts`)."""
+    theta = model.space.array("start")
+    return Estimate(theta, true_starts(model, theta, windows))
+
+
+ACC_ROW = 9
+"""The acceleration at a window's start is computed from the velocities there and in this row,
+counted among the rows with a velocity."""
+
+
+def true_starts(model: RolloutModel, theta: np.ndarray, windows: FlightWindows) -> np.ndarray:
+    """Return the true start states minus the logged ones, (W, F), given the delay of logged poses.
+
+    The delay is an effect (the clock offset) with its value in `theta` (P,). Over the delay,
+    position and attitude change by velocity and rates, and the velocity by the acceleration.
+    """
+    delay_s = pose_delay(model.space.effects(theta))
+    offset = np.zeros((len(windows.flight), model.free))
+    offset[:, :3] = delay_s * windows.vel_w
+    offset[:, 3:6] = delay_s * windows.rate_b
+    has_vel = np.asarray(windows.valid)[:, :, SLICES["velocity"].start]
+    row_rank = np.minimum(ACC_ROW, has_vel.sum(axis=1))[:, None]
+    row = (has_vel & (np.cumsum(has_vel, axis=1) == row_rank)).argmax(axis=1)
+    window = np.arange(len(row))
+    span_s = np.asarray(windows.row_s)[window, row][:, None]
+    acc_w = (np.asarray(windows.row_vel_w)[window, row] - windows.vel_w) / np.maximum(span_s, 1e-3)
+    offset[:, 6:9] = delay_s * np.where(has_vel.any(axis=1, keepdims=True), acc_w, 0.0)
+    return offset
 
 
 def rollouts_along(

@@ -32,7 +32,12 @@ from suite.diagnose.estimate.gauss_newton import TINY, Z95, gauss_newton_step
 from suite.diagnose.estimate.parameters import Candidate
 from suite.diagnose.estimate.permutation import folds_of
 from suite.diagnose.evidence.moments import ForceModel
-from suite.diagnose.evidence.rollouts import RolloutEvidence, RolloutModel, rollout_evidence
+from suite.diagnose.evidence.rollouts import (
+    RolloutEvidence,
+    RolloutModel,
+    rollout_evidence,
+    true_starts,
+)
 from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.search.evaluation import Evaluation, SearchResult
 from suite.diagnose.sources.source import (
@@ -56,7 +61,6 @@ from suite.diagnose.verdict.gap import (
     overlap,
     remaining_share,
     rollout_size,
-    true_starts,
 )
 from suite.diagnose.verdict.residual_structure import (
     DisturbanceEquations,

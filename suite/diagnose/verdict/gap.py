@@ -23,7 +23,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eval.effects.log_faults import pose_delay
 from suite.diagnose.data.colour import Noise
 from suite.diagnose.data.whitening import (
     Linearisation,
@@ -33,14 +32,11 @@ from suite.diagnose.data.whitening import (
     slow_energy,
 )
 from suite.diagnose.data.windows import LENGTH_S, SLICES, STATE, STATE_GROUPS, FlightWindows
-from suite.diagnose.evidence.rollouts import RolloutModel
+from suite.diagnose.evidence.rollouts import RolloutModel, true_starts
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 HORIZONS_S = (0.1, 0.5, 1.0)
 """Times after the start at which plain errors of rollouts are reported [s]."""
-ACC_ROW = 9
-"""The acceleration at a window's start is computed from the velocities there and in this row,
-counted among the rows with a velocity."""
 
 
 def rms_length(vectors: np.ndarray) -> float:
@@ -171,26 +167,6 @@ def overlap(windows: FlightWindows) -> float:
     """Return the weight of a window in sums, so that rows in several windows count once."""
     step_s = np.diff(windows.start_s)[np.diff(windows.flight) == 0]
     return float(np.minimum(step_s / LENGTH_S, 1.0).mean()) if len(step_s) else 1.0
-
-
-def true_starts(model: RolloutModel, theta: np.ndarray, windows: FlightWindows) -> np.ndarray:
-    """Return the true start states minus the logged ones, (W, F), given the delay of logged poses.
-
-    The delay is an effect (the clock offset) with its value in `theta` (P,). Over the delay,
-    position and attitude change by velocity and rates, and the velocity by the acceleration.
-    """
-    delay_s = pose_delay(model.space.effects(theta))
-    offset = np.zeros((len(windows.flight), model.free))
-    offset[:, :3] = delay_s * windows.vel_w
-    offset[:, 3:6] = delay_s * windows.rate_b
-    has_vel = np.asarray(windows.valid)[:, :, SLICES["velocity"].start]
-    row_rank = np.minimum(ACC_ROW, has_vel.sum(axis=1))[:, None]
-    row = (has_vel & (np.cumsum(has_vel, axis=1) == row_rank)).argmax(axis=1)
-    window = np.arange(len(row))
-    span_s = np.asarray(windows.row_s)[window, row][:, None]
-    acc_w = (np.asarray(windows.row_vel_w)[window, row] - windows.vel_w) / np.maximum(span_s, 1e-3)
-    offset[:, 6:9] = delay_s * np.where(has_vel.any(axis=1, keepdims=True), acc_w, 0.0)
-    return offset
 
 
 def noise_floor(slope: np.ndarray, noise: np.ndarray) -> np.ndarray:

@@ -84,10 +84,17 @@ def test_an_effect_of_another_package_may_have_a_motion_of_its_own(monkeypatch, 
         step(plant, state._replace(carried={}), motion, inputs, 0.0)
 
 
-def test_a_shifted_series_goes_on_beyond_its_ends_as_it_began_and_ended():
-    time_s, series = np.array([0.0, 1.0, 2.0, 4.0]), np.array([[0.0], [1.0], [5.0], [1.0]])
-    for offset, wanted in ((0.5, [-0.5, 0.5, 3.0, 2.0]), (-0.5, [0.5, 3.0, 4.0, 0.0])):
-        np.testing.assert_allclose(time_shifted(time_s, series, np.asarray(offset))[:, 0], wanted)
+def test_a_cubic_series_is_shifted_exactly_also_beyond_its_ends_and_two_rows_along_a_line():
+    time_s = np.array([0.0, 1.0, 2.5, 4.0, 4.5])
+
+    def cubic(at_s):
+        return (0.5 - 2.0 * at_s + at_s**2 - 0.3 * at_s**3)[:, None]
+
+    for offset in (0.5, -0.5, 0.0):
+        shifted = time_shifted(time_s, cubic(time_s), np.asarray(offset))
+        np.testing.assert_allclose(shifted, cubic(time_s - offset), atol=1e-9)
+    line = time_shifted(np.array([0.0, 2.0]), np.array([[1.0], [2.0]]), np.asarray(1.0))
+    np.testing.assert_allclose(line, [[0.5], [1.5]])
 
 
 def test_faults_of_a_log_are_undone_on_a_sample(monkeypatch):

@@ -11,7 +11,7 @@ from suite.diagnose.data.windows import BURN_IN_S, LENGTH_S, SLICES, STEPS, cut,
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tests.support.broken_logs import on_the_ground, rows
 from tests.support.diagnosis_flights import NOISE
-from tests.support.vehicles import PLAIN
+from tests.support.vehicles import PLAIN, with_effects
 
 
 def test_windows_hold_the_rows_and_commands_of_their_time(log):
@@ -32,6 +32,18 @@ def test_windows_hold_the_rows_and_commands_of_their_time(log):
     np.testing.assert_allclose(np.diff(windows.command_sum[1, now : now + 2], axis=0)[0], held)
     chosen = take(windows, windows.start_s > 1.0)
     np.testing.assert_array_equal(chosen.pos_w, windows.pos_w[1:])
+
+
+def test_a_pose_from_before_the_start_is_not_compared(log):
+    """A rollout has no pose from then; the vehicle file says how late the log has poses."""
+    late = with_effects(PLAIN, clock_offset=(0.018,))
+    (in_time, _), (windows, _) = (cut([log], vehicle, False) for vehicle in (PLAIN, late))
+    pose = np.r_[SLICES["position"], SLICES["attitude"], SLICES["velocity"]]
+    is_before = np.asarray(windows.row_s) < 0.018
+    assert is_before.sum(axis=1).min() >= 2 and in_time.valid[is_before][:, pose].all()
+    assert not windows.valid[is_before][:, pose].any()
+    assert windows.valid[is_before][:, SLICES["rates"]].all()
+    np.testing.assert_array_equal(windows.valid[~is_before], in_time.valid[~is_before])
 
 
 def test_few_shapes_hold_rows_of_every_rate(log):

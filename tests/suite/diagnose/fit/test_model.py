@@ -7,8 +7,7 @@ from eval.flights.simulate import SENSORS, fly, log_of
 from eval.flights.trajectory import Trajectory
 from suite.diagnose.data.windows import SLICES, cut
 from suite.diagnose.estimate.parameters import candidates, make_space
-from suite.diagnose.evidence.rollouts import RolloutModel, compiled
-from suite.diagnose.verdict.gap import true_starts
+from suite.diagnose.evidence.rollouts import RolloutModel, compiled, true_starts
 from tests.support.faults import with_imu_fault
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
