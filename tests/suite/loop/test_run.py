@@ -15,6 +15,7 @@ import pytest
 
 from eval.effects.body import ComOffset, TorqueTrim
 from eval.judging.results import read_trials
+from eval.logs.faults.catalogue import FAULTS
 from eval.logs.flight_log import read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import with_effects
@@ -174,6 +175,7 @@ class Stub(Small):
 
     def diagnose(self, config, console):
         vehicle, out = config.vehicle, config.out
+        assert {"motor_poles", "vehicle_mass"} <= set(config.accept) <= set(FAULTS)
         logs, _ = read_flights(config.flights)
         self.diagnosed.append((vehicle, config.drive, [log.name for log in logs]))
         base = load_vehicle(vehicle)
