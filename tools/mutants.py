@@ -34,7 +34,7 @@ IMPORTERS = (
 """Tests of the importers, as in `AREAS`."""
 AREAS = (
     ("suite/train/losses.py", "suite/train/test_losses suite/train/test_config"),
-    ("tracks/geometry/field.py", "tracks/geometry/test_field"),
+    ("tracks/geometry/field.py", "tracks/geometry/test_geometry"),
     ("tracks/geometry/gates.py", "tracks/families tracks/geometry"),
     ("eval/worlds/trial.py", "eval/worlds/test_trial eval/worlds/test_worlds"),
     ("eval/judging/ages.py", "eval/judging/test_ages"),
