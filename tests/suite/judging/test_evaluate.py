@@ -139,6 +139,16 @@ def test_with_a_monitor_each_policy_flies_twice_on_the_same_trials(pilots, tmp_p
     assert callable(make) and make().name == "diver+monitor"
 
 
+@pytest.mark.slow
+def test_the_mjx_world_flies_more_trials_than_it_has_slots(pilots, tmp_path):
+    ends = []
+    for world in ("mjx", "mujoco"):
+        asked = f"eval --difficulty 0 --track zigzag --trials 150 --simulator {world} --policy"
+        assert run(asked, pilots["diver"], "--out", tmp_path / world) == 0
+        ends.append([row.ended_by for row in read_trials(tmp_path / world / "trials.parquet")])
+    assert len(ends[0]) == 150 and ends[0] == ends[1]
+
+
 def test_trials_that_are_not_asked_for_again_are_kept_and_said(pilots, tmp_path, capsys):
     """A command that goes on with fewer trials must not lose what the first one has flown."""
     asked = ("--track zigzag --policy", pilots["diver"], "--trials")

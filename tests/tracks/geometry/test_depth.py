@@ -70,6 +70,16 @@ def test_meshes_and_polygonal_gates_are_seen_alike(root):
     assert_same_but_at_silhouettes(seen(batch(track, 40), pos_w, rot_w), expected)
 
 
+def test_culling_that_keeps_enough_changes_nothing():
+    track = make_track("ellipse", 9, 3)
+    poses = free_poses(*model_of(track), track, np.random.default_rng(7), 2 * POSES)
+    scene, have = batch(track, 2 * POSES, MAX_COUNTS), counts(track.scene)
+    some = have._replace(boxes=have.boxes - 12, cylinders=8, capsules=6, spheres=6)
+    # Two programs round differently, relative to the distance; a lost object is off by centimetres.
+    culled, whole = seen(scene, *poses, limits=some), seen(scene, *poses)
+    np.testing.assert_allclose(culled, whole, rtol=1e-4, atol=1e-4)
+
+
 def test_culling_keeps_what_only_reaches_into_view():
     """A long box whose middle is out of view is kept before a far one in the middle of it."""
     boxes = Boxes(

@@ -199,6 +199,13 @@ def test_repeated_corners_change_nothing():
     assert is_inside(padded, np.zeros(2)) and not is_inside(padded, np.array([0.0, 0.51]))
 
 
+def test_both_libraries_agree():
+    center_w, rot_w, opening, before, after = draw(4, 12)
+    steps = (placed(center_w, rot_w, point) for point in (before, after))
+    given = (center_w, rot_w, opening, *steps)
+    np.testing.assert_array_equal(jax.jit(crossing)(*given), crossing(*given))
+
+
 @pytest.mark.parametrize(("distance", "near"), [(0.34, True), (0.36, False)])
 def test_the_radius_rule_is_a_ball_of_35_cm(distance, near):
     direction = np.array([2.0, -1.0, 2.0]) / 3
