@@ -181,20 +181,3 @@ def test_a_place_that_cannot_be_written_is_refused(command, place, tmp_path, mon
     refused(capsys, WRITERS[command], "--out", PLACES[place])
     assert Path("file").read_text() == "kept"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["circle", "file", "read-only"]
-
-
-@pytest.mark.parametrize(
-    "place", ["file/it.rrd", "/dev/null/it.rrd", f"{'x' * 300}.rrd", "circle/it.rrd", "it.mp4"]
-)
-def test_a_recording_to_an_impossible_place_is_refused_before_flying(
-    place, tmp_path, monkeypatch, capsys
-):
-    def flown(*args):
-        raise AssertionError("it has flown")
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("suite.judging.evaluate.evaluate", flown)
-    Path("file").write_text("kept")
-    Path("circle").symlink_to("circle")
-    refused(capsys, "eval --trials 1 --out out --rerun", place)
-    assert not list(tmp_path.glob("out*"))

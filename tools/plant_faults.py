@@ -47,8 +47,8 @@ class Fault(NamedTuple):
 FAULTS = (
     # tracks: field, gates, cameras, solids
     Fault("tracks", "return ((1 - aligned) / xp.max", "return ((1 + aligned) / xp.max",
-          "test_field"),
-    Fault("tracks", "fraction = -before[..., 0] /", "fraction = before[..., 0] /", "test_crossing"),
+          "test_geometry"),
+    Fault("tracks", "fraction = -before[..., 0] /", "fraction = before[..., 0] /", "test_geometry"),
     Fault(
         "tracks", "2 * (x * y - w * z), 2 * (x * z + w * y)",
         "2 * (x * y + w * z), 2 * (x * z + w * y)", "test_geometry",
@@ -60,13 +60,13 @@ FAULTS = (
     Fault(
         "tracks", "along = jnp.clip((away * rods.axis_w).sum(-1), -rods",
         "along = jnp.clip((away * rods.axis_w).sum(-1), 0.0 * rods",
-        "test_clearance",
+        "geometry/test_depth",
     ),
     Fault("tracks", "center_w, angle + turn * np.pi / 2", "center_w, angle + np.pi / 2",
           "test_families"),
     # policies: networks, observation, C
     Fault("policies", "new + update * (hidden - new)", "hidden + update * (new - hidden)",
-          "test_layers"),
+          "test_network"),
     Fault("policies", "numbers = [vel_b, rot_w[..., 2, :]", "numbers = [vel_b, rot_w[..., :, 2]",
           "test_observation"),
     Fault("policies", "x < -8.0f ? -8.0f : x > 8.0f ? 8.0f : x", "x", "test_c"),
@@ -113,7 +113,7 @@ FAULTS = (
           "return x * (1 - factor) + jax.lax.stop_gradient(x * factor)", "test_point_mass"),
     Fault("suite/train", "stride * cotangents)", "1.0 * cotangents)", "test_rollout"),
     Fault("suite/train", "error = reward + discount * going * value[1:] - value[:-1]",
-          "error = reward + discount * value[1:] - value[:-1]", "test_objective"),
+          "error = reward + discount * value[1:] - value[:-1]", "test_ppo"),
     # suite: Delta Action Model
     Fault("suite/delta", "mean_norm(pos - windows.pos_w[:, 1:])",
           "mean_norm(pos - windows.pos_w[:, :-1])", "delta/test_fit"),

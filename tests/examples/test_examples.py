@@ -106,7 +106,7 @@ def test_the_example_runs(name, short, tmp_path, monkeypatch, capsys):
 
 
 def diagnosed(config, console):
-    """Stand for the diagnosis, which tests/suite/commands/test_import.py makes in full (slow)."""
+    """Stand for the diagnosis, which tests/suite/commands/test_logs.py makes in full (slow)."""
     assert load_vehicle(config.vehicle) and len(read_flights(flight_files(config.flights))[0]) == 3
     (config.out / "report.html").write_text("as the command writes it")
     entry = {"value": [0.004, 0.001, None], "ci95": [[0.003, 0.005], [0.0, 0.002], None]}

@@ -1,24 +1,31 @@
-"""`load_policy` finds what is meant; a checkpoint and its parameters fly alike."""
+"""Policies by name, their contracts, and that every export is one policy, layer for layer."""
 
+import dataclasses
 import hashlib
+import json
 import os
 import shutil
-import subprocess
 import sys
 from dataclasses import replace
 
 import jax
 import numpy as np
+import onnx
 import pytest
+import torch
 
 from policies import shipped
+from policies.block_policy import BlockPolicy
+from policies.contract import KEY, contract_of, read_contract, refuse_differences, spec_of
+from policies.formats.export import export_module, export_policy
+from policies.formats.onnx_graph import IR_VERSION, OPSET, onnx_model
 from policies.formats.policy_file import load_policy_checkpoint, save_policy
-from policies.native import load_native, native_policy
+from policies.formats.spec_json import KEY as SPEC_KEY
 from policies.networks import network
 from policies.policy import load_policy
-from policies.spec import PolicyError
-from tests.support.policy_files import SPEC
-from tests.support.tools import program
+from policies.spec import ActionSpec, DepthEncoding, PolicyError, PolicySpec
+from tests.support.policy_files import SPEC, action_of, lively
+from tests.support.tools import program, python
 
 
 @pytest.fixture
@@ -77,20 +84,6 @@ def test_a_policy_is_shipped_with_another_usual_speed(tmp_path, monkeypatch, roo
     assert load_policy_checkpoint(tmp_path / "race").spec == replace(spec, speed=0.85)
 
 
-def test_a_checkpoint_is_named_and_flies_as_its_parameters_do(checkpoint, params):
-    loaded, made = load_native(checkpoint, "tiny"), native_policy(params, SPEC, "tiny")
-    assert (loaded.name, loaded.spec, loaded.hidden_shape) == ("tiny", SPEC, (64,))
-    rng = np.random.default_rng(0)
-    state = rng.normal(size=(3, 12)).astype(np.float32)
-    image = rng.uniform(-0.3, 9.4, (3, 24, 32)).astype(np.float32)
-    fresh = np.ones(3, bool)
-    answers = [policy.act(policy.start(3), state, image, fresh) for policy in (loaded, made)]
-    for one, two in zip(*answers, strict=True):
-        assert one.tobytes() == two.tobytes()
-    expected, _ = jax.jit(network.step)(params, made.start(3), state, image)
-    np.testing.assert_allclose(answers[0][0], expected, atol=1e-5, rtol=1e-5)
-
-
 def test_thread_counts_do_not_change_our_network(checkpoint):
     """XLA's pool may split the work any way; the bits have to stay."""
     script = (
@@ -102,12 +95,198 @@ def test_thread_counts_do_not_change_our_network(checkpoint):
         "print(hashlib.sha256(a.tobytes() + h.tobytes()).hexdigest(), p.rows)\n"
     )
     flags = f"{os.environ['XLA_FLAGS']} --xla_cpu_multi_thread_eigen=false"
-    one_thread = subprocess.run(
-        [sys.executable, "-c", script, str(checkpoint)], capture_output=True, text=True, check=True,
-        env=os.environ | {"XLA_FLAGS": flags},
-    )  # fmt: skip
+    one_thread = python(script, checkpoint, check=True, env=os.environ | {"XLA_FLAGS": flags})
     policy, rng = load_policy(checkpoint), np.random.default_rng(0)
     state, image = rng.normal(size=(64, 12)), rng.normal(size=(64, 24, 32))
     answer = policy.act(policy.start(64), state, image, np.ones(64, bool))
     digest = hashlib.sha256(b"".join(part.tobytes() for part in answer)).hexdigest()
     assert one_thread.stdout == f"{digest} 64\n"
+
+
+SPECS = [
+    PolicySpec(),
+    PolicySpec(rate_hz=50, second_gate=True, speed_input=True, speed=0.9),
+    PolicySpec(action=ActionSpec("ctbr", (9.0, 6.0, 6.0, 6.0), (9.0, 0.0, 0.0, 0.0))),
+    PolicySpec(action=ActionSpec("motors", (0.5,), (0.5,), "speed"),
+               depth=DepthEncoding(channel_axis=True, uint8=True)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("spec", SPECS)
+def test_a_contract_comes_back_with_its_digest_and_gives_the_spec(spec):
+    contract = contract_of(spec, (4,))
+    again = read_contract(contract.text, "here")
+    assert again == contract and again.digest == contract.digest
+    assert spec_of(again, "here") == dataclasses.replace(spec, hidden_size=4)
+
+
+def test_the_digest_is_one_for_one_meaning():
+    assert contract_of(PolicySpec(rate_hz=30)).digest == contract_of(PolicySpec()).digest
+    assert contract_of(PolicySpec(rate_hz=31)).digest != contract_of(PolicySpec()).digest
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "said"),
+    [
+        (("state", 2, "frame"), "FRD", r"state\[2\].frame is 'FRD', the suite provides 'body"),
+        (("state", 0, "scale"), 0.1, r"state\[0\].scale is 0.1, the suite provides 1.0"),
+        (("state", 0, "name"), "rates", r"state\[0\].name is 'rates'"),
+        (("action", "frame"), "FRD", "action.frame is 'FRD'"),
+        (("action", "unit"), ["g"] * 3, "action.unit"),
+        (("image", "encoding"), "depth", "image.encoding is 'depth'"),
+        (("image", "near_m"), 20.0, "depth.near is 20 m"),
+        (("memory",), [5000], r"here: memory\[0\] is 5000"),
+        (("action", "kind"), "velocity", "unknown kind of action 'velocity'"),
+    ],
+)
+def test_what_the_suite_does_not_provide_is_refused_by_its_place(path, value, said):
+    data = json.loads(contract_of(PolicySpec()).text)
+    del data["digest"]
+    part = data
+    for key in path[:-1]:
+        part = part[key]
+    part[path[-1]] = value
+    with pytest.raises(PolicyError, match=said):
+        spec_of(read_contract(json.dumps(data), "here"), "here")
+
+
+def test_a_contract_changed_by_hand_or_of_another_version_is_refused():
+    data = contract_of(PolicySpec()).to_json()
+    with pytest.raises(PolicyError, match="changed by hand"):
+        read_contract({**data, "rate_hz": 50.0}, "here")
+    for key, value, said in (("version", 2, "version is 2"), ("rate", 1, "'rate' at the top is"),
+                             ("rate_hz", "fast", "rate_hz is 'fast'")):  # fmt: skip
+        with pytest.raises(PolicyError, match=said):
+            read_contract({**data, key: value}, "here")
+
+
+def test_memories_differ_only_where_both_are_known():
+    spec = PolicySpec()
+    refuse_differences(contract_of(spec), contract_of(spec, (3,)), "here", "that")
+    with pytest.raises(PolicyError, match=r"memory \(3,\), that \(4,\)"):
+        refuse_differences(contract_of(spec, (3,)), contract_of(spec, (4,)), "here", "that")
+
+
+def test_it_travels_in_checkpoint_onnx_and_torch_with_where_it_comes_from(checkpoint, exported):
+    spec = load_policy_checkpoint(checkpoint).spec
+    digest = contract_of(spec).digest
+    stored = json.loads((checkpoint / "config.json").read_text())[KEY]
+    assert read_contract(stored, "config").memory == (64,)
+    props = onnx.load(exported / "tiny.onnx").metadata_props
+    extra = dict.fromkeys((KEY, SPEC_KEY), "")
+    torch.export.load(exported / "tiny.pt2", extra_files=extra)
+    for texts in ({each.key: each.value for each in props}, extra):
+        assert read_contract(texts[KEY], "here").digest == digest
+        data = json.loads(texts[SPEC_KEY])
+        assert {"schema", "suite_version", "git_commit", "seed", "name", "spec"} <= data.keys()
+        assert (data["name"], data["seed"]) == ("tiny", 1)
+
+
+class Module(torch.nn.Module):
+    """Answers with three numbers of the state, the image's mean and what BatchNorm makes of it."""
+
+    def __init__(self, norm=False, size=3):
+        super().__init__()
+        self.norm, self.size = torch.nn.BatchNorm1d(12) if norm else None, size
+
+    def forward(self, state, image):
+        state = state if self.norm is None else self.norm(state)
+        return state[:, : self.size] + image.mean((1, 2))[:, None]
+
+
+def test_a_module_flies_in_evaluation_mode_with_the_contract_it_was_exported_with(tmp_path):
+    spec = PolicySpec(rate_hz=50.0, action=ActionSpec(scale=(20.0,)))
+    module = Module(norm=True).train()
+    policy = load_policy(export_module(module, tmp_path / "it.onnx", contract_of(spec)))
+    assert policy.spec == spec and isinstance(policy, BlockPolicy) and not policy.notes
+    assert module.training
+    action = spec.action.to_si(action_of(policy, np.ones((1, 12))))
+    np.testing.assert_allclose(action, 20.0, rtol=1e-4)  # the norm divides by sqrt(1 + 1e-5)
+
+
+def test_an_export_that_does_not_fit_its_contract_is_refused(tmp_path):
+    with pytest.raises(PolicyError, match="output 'action' is float32 .*4"):
+        export_module(Module(size=4), tmp_path / "it.onnx", PolicySpec())
+    export_module(Module(), tmp_path / "it.onnx", PolicySpec())
+    proto = onnx.load(tmp_path / "it.onnx")
+    ctbr = contract_of(PolicySpec(action=ActionSpec("ctbr")))
+    onnx.helper.set_model_props(proto, {KEY: ctbr.text})
+    onnx.save(proto, tmp_path / "it.onnx")
+    with pytest.raises(PolicyError, match=r"'state' has shape .*expected \(batch, 13\)"):
+        load_policy(tmp_path / "it.onnx")
+
+
+def test_weights_without_a_program_are_named(tmp_path):
+    torch.save(Module().state_dict(), tmp_path / "it.pt")
+    with pytest.raises(PolicyError, match="weights without a program"):
+        load_policy(tmp_path / "it.pt", trust=True)
+
+
+def rollout(policy, n, steps):
+    """Actions of a recurrent rollout of random observations, (steps, n, 3)."""
+    rng = np.random.default_rng(7)
+    hidden, actions = policy.start(n), []
+    for _ in range(steps):
+        state = rng.normal(size=(n, policy.spec.state_size)).astype(np.float32)
+        image = rng.uniform(-0.3, 9.4, (n, 24, 32)).astype(np.float32)
+        action, hidden = policy.act(hidden, state, image, rng.random(n) < 0.1)
+        actions.append(action)
+    return np.stack(actions)
+
+
+WIDER = replace(SPEC, second_gate=True, gate_axis=True, second_axis=True, channels=(6, 64, 32))
+
+
+@pytest.mark.parametrize("spec", [SPEC, WIDER])
+def test_the_three_are_equal_over_a_rollout(spec, tmp_path, in_process):
+    folder = save_policy(tmp_path / "it", lively(spec, 3), spec, seed=1)
+    ours = load_policy(folder)
+    expected = rollout(ours, 70, 12)
+    assert ours.spec == spec and np.abs(expected).std() > 1.0
+    for path in export_policy(folder, tmp_path):
+        theirs = load_policy(path, trust=True)
+        assert theirs.spec == spec
+        np.testing.assert_allclose(rollout(theirs, 70, 12), expected, atol=5e-5, rtol=1e-5)
+
+
+def test_a_checkpoint_that_says_no_seed_is_exported_without_one(tmp_path, checkpoint):
+    folder = shutil.copytree(checkpoint, tmp_path / "tiny")
+    config = json.loads((folder / "config.json").read_text())
+    del config["seed"]
+    (folder / "config.json").write_text(json.dumps(config))
+    assert load_policy_checkpoint(folder).seed is None
+    export_policy(folder, tmp_path, ["onnx", "c"])
+    entries = onnx.load(tmp_path / "tiny.onnx").metadata_props
+    text = next(entry.value for entry in entries if entry.key == SPEC_KEY)
+    assert json.loads(text)["seed"] is None
+
+
+def test_plain_torch_and_plain_onnxruntime_run_the_files_at_any_batch(exported):
+    import onnxruntime
+
+    program = torch.export.load(exported / "tiny.pt2").module()
+    session = onnxruntime.InferenceSession(exported / "tiny.onnx")
+    assert [v.name for v in session.get_outputs()] == ["action", "hidden_next"]
+    for n in (1, 3):
+        feed = {"state": (n, 12), "image": (n, 24, 32), "hidden": (n, 64)}
+        feed = {name: np.ones(shape, np.float32) for name, shape in feed.items()}
+        by_torch = program(*(torch.from_numpy(value) for value in feed.values()))
+        by_onnx = session.run(None, feed)
+        for a, b in zip(by_torch, by_onnx, strict=True):
+            np.testing.assert_allclose(a.numpy(), np.asarray(b), atol=2e-5, rtol=1e-5)
+
+
+def test_what_cannot_be_exported_is_refused(tmp_path, checkpoint, exported):
+    with pytest.raises(PolicyError, match="not a shipped policy"):
+        export_policy(exported / "tiny.onnx", tmp_path)
+    with pytest.raises(ValueError, match="unknown format 'onx'. Did you mean 'onnx'"):
+        export_policy(checkpoint, tmp_path, ["onx"])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_it_asks_for_old_standard_operators_only_and_carries_its_texts(params):
+    model = onnx_model(params, SPEC, {"key": "text"})
+    assert model.ir_version == IR_VERSION <= 8
+    assert [(o.domain, o.version) for o in model.opset_import] == [("", OPSET)] and OPSET <= 17
+    assert {node.domain for node in model.graph.node} == {""}
+    assert [(p.key, p.value) for p in model.metadata_props] == [("key", "text")]

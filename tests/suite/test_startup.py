@@ -12,6 +12,7 @@ from suite import cli
 from suite.common import startup
 from suite.common.console import Console
 from tests.support.commands import refused
+from tests.support.tools import python
 from tracks.common import files
 from tracks.common.grid import markdown, rich_table, table
 from tracks.common.names import printable
@@ -236,7 +237,6 @@ def test_warnings_of_numbers_are_not_for_people(suite, root, tmp_path):
 def test_output_is_unbuffered_where_that_is_asked():
     code = "import os; from suite.common.startup import open_streams as o; o(); print(1)"
     for asked, printed in (("1", "1\n"), ("", "")):
-        args = [sys.executable, "-c", f"{code}; os._exit(0)"]
         environment = {**os.environ, "PYTHONUNBUFFERED": asked}
-        found = subprocess.run(args, env=environment, capture_output=True, text=True, check=True)
+        found = python(f"{code}; os._exit(0)", env=environment, check=True)
         assert found.stdout == printed

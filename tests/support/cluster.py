@@ -25,6 +25,13 @@ class Cluster:
         _end(self.nodes[number])
 
 
+def free_port():
+    """Return a port of this machine that is free."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
 @contextlib.contextmanager
 def cluster(folder, nodes=2, memory="3GB", tls=(), **environment):
     """Be a cluster of `nodes` machines with a worker each; skip where the extra is missing.
@@ -32,9 +39,7 @@ def cluster(folder, nodes=2, memory="3GB", tls=(), **environment):
     `tls` are the options of its scheduler and workers that make it one of encrypted messages.
     """
     pytest.importorskip("distributed", reason="needs the extra `cluster`")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     address = f"{'tls' if tls else 'tcp'}://127.0.0.1:{port}"
     started = []
     try:

@@ -25,9 +25,14 @@ def program(path):
     return module
 
 
+def python(code, *arguments, **options):
+    """Run a program in a process of its own; return the finished process with its output."""
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, **options)
+
+
 def built_wheel(source, folder):
     """Build the wheel of the project in `source` as pip does, without pip's own processes."""
     code = "import sys, setuptools.build_meta as build; print(build.build_wheel(sys.argv[1]))"
-    command = [sys.executable, "-c", code, str(folder)]
-    done = subprocess.run(command, cwd=source, check=True, capture_output=True, text=True)
+    done = python(code, folder, cwd=source, check=True)
     return folder / done.stdout.split()[-1]

@@ -3,8 +3,6 @@
 import gc
 import os
 import signal
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -16,6 +14,7 @@ from policies.formats.model_process import ModelProcess
 from policies.policy import load_policy
 from policies.spec import NoAnswer, PolicyError
 from tests.support.policy_files import WEIGHT, onnx_model, port, save_onnx
+from tests.support.tools import python
 
 PRODUCT = helper.make_node("MatMul", ["state", "w"], ["u"])
 FEED = {"state": np.ones((2, 12)), "image": np.ones((2, 24, 32))}
@@ -103,9 +102,7 @@ def test_a_limit_that_this_process_is_under_stays_the_models(tmp_path):
         "resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))\n"
         "print(ModelProcess(open(sys.argv[1], 'rb').read(), 'here', 'onnx').inputs[0].name)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=False
-    )
+    done = python(script, path)
     assert done.stdout.split() == ["state"], done.stderr
 
 

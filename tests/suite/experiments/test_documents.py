@@ -1,4 +1,4 @@
-"""Documents at a small size: flights are a tenth of a second long, a few at a time."""
+"""Documents and trainings at a size of seconds, and their numbers by hand."""
 
 import json
 from dataclasses import replace
@@ -6,13 +6,29 @@ from itertools import product
 
 import pytest
 
+from eval.judging.statistics import wilson
 from eval.worlds import rotorpy as rotorpy_world
 from eval.worlds.trial import Rules
+from suite.common.console import Console
+from suite.common.errors import WorkFailed
+from suite.experiments.ablation import Config as Ablation
+from suite.experiments.ablation import _comparison_grid, pooled, settings
+from suite.experiments.pages.paper import ablation as printed
+from suite.experiments.schemes import Config as SchemesConfig
+from suite.experiments.schemes import document, first_times, schemes
 from suite.experiments.simulators import REASONS, Config, changed_trials, conditions
 from suite.experiments.study import disturbed, judging
+from suite.experiments.study.cache import Workspace
+from suite.experiments.study.summary import Spread, summaries
+from suite.experiments.study.training import TrainingResult
+from suite.train import run as training_run
+from suite.train.config import TrainConfig
+from suite.train.ppo.config import PpoConfig
 from tests.support import judged_cells
 from tests.support.documents import another_racer, page, reproduce
 from tests.support.engines import STAND_IN
+from tests.support.training import boxes_worlds
+from tracks.common.grid import Grid
 
 
 class Sky:
@@ -144,3 +160,156 @@ def test_why_is_told_by_the_controls(rotorpy):
     assert {*mine.values(), *unknown.values()} == set(REASONS)
     assert [change["why"] for change in found if change["column"] in (single, aired)] == [None] * 2
     assert found[0]["endings"][base] == tested[0].results["p"][0].ending
+
+
+TINY = "--set spec.hidden_size=8 spec.camera.width=20 spec.camera.height=20 episode.steps=6"
+TINY += " --iterations 2 --worlds 4 --trials 3 --seconds 0.5 --training-seeds 4 --only"
+
+
+@pytest.fixture
+def small_scenes(monkeypatch):
+    for module in ("train.run", "train.ppo.update", "experiments.study.validation"):
+        monkeypatch.setattr(f"suite.{module}.sample_worlds", boxes_worlds)
+
+
+def test_settings_differ_in_field_and_progress_alone():
+    rows = {row.key: row for row in settings(Ablation())}
+    added = {"field 0.8", "field 1.2", "field 1.6", "field 3.2", "progress 1.2"}
+    assert set(rows) - set(printed()[1]) == added
+    losses = {key: row.recipe.loss for key, row in rows.items()}
+    for key, loss in losses.items():
+        kind, weight = key.split()
+        assert (loss.field_gain > 0) == (kind == "field")
+        progress = {"progress": loss.progress, "progress_norm": loss.progress_norm}
+        own = progress.pop("progress_norm" if kind == "normalised" else "progress")
+        assert own == float(weight) and list(progress.values()) == [0]
+        assert rows[key].recipe.episode.gates == 4 and loss.projection == 0
+    others = {str(row.recipe).replace(str(row.recipe.loss), "") for row in settings(Ablation())}
+    assert len(others) == 1
+    nearly = settings(Ablation(set=("loss.progress=0.4000001",)))
+    assert [row.key for row in nearly].count("field 0.4") == 1
+    assert len(settings(Ablation(recipe="paper"))) == 11, "its own weight is one of the paper's"
+
+
+def test_schemes_share_all_but_how_they_learn():
+    ppo, ours, bare = (scheme.recipe for scheme in schemes(SchemesConfig()))
+    assert isinstance(ppo, PpoConfig) and isinstance(ours, TrainConfig)
+    assert ppo.iterations == ours.optimizer.iterations
+    for name in ("spec", "physics", "quadrotor", "episode", "seed"):
+        assert getattr(ppo, name) == getattr(ours, name) == getattr(bare, name)
+    assert ours == settings(Ablation(only=("field 0.4",)))[0].recipe
+    assert bare.loss.field_gain == 0 and bare.loss.progress == 0.4
+    assert (bare.loss.projection, bare.loss.projection_decay) == (3.0, 0.5)
+    (longer,) = schemes(SchemesConfig(ppo_iterations=7, only=("ppo",)))
+    assert isinstance(longer.recipe, PpoConfig) and longer.recipe.iterations == 7
+
+
+@pytest.mark.slow
+def test_the_ablation_from_one_command_and_again(tmp_path, monkeypatch, small_scenes):
+    args = [*TINY.split(), "field 0.4", "normalised 6.4"]
+    train, made = training_run.train, []
+
+    def diverging(config, folder, console, watch=None):
+        made.append((config.loss.progress_norm, config.seed))
+        if config.loss.progress_norm:
+            raise WorkFailed("training diverged at iteration 1")
+        return train(config, folder, console)
+
+    monkeypatch.setattr(training_run, "train", diverging)
+    assert reproduce(tmp_path, "ablation", *args) == 0
+    assert made == [(0, 4), (6.4, 4)]
+    text, numbers = page(tmp_path, "ablation")
+    field, normalised = numbers["rows"]
+    assert (field["seeds"], field["diverged"]) == (1, 0)
+    assert (normalised["seeds"], normalised["diverged"]) == (1, 1)
+    # In half a second nobody passes four gates; who has not moved far hits nothing.
+    assert field["over"]["success_cross"]["most"] == field["pooled"]["success_cross"]["low"] == 0
+    assert field["over"]["collision_free"]["least"] == 1 and field["over"]["v_max"]["mean"] > 0
+    assert "| without, L_p^norm | 6.4 | diverged | - |" in text and "| 1 of 1 |" in text
+    monkeypatch.setattr(training_run, "make_update", pytest.fail)
+    assert reproduce(tmp_path, "ablation", *args) == 0, "nothing is trained again"
+    assert (tmp_path / "docs" / "ablation.md").read_text() == text
+
+
+@pytest.mark.slow
+def test_the_comparison_of_schemes_from_one_command(tmp_path, small_scenes):
+    assert reproduce(tmp_path, "schemes", *TINY.split(), "ours", "ppo") == 0
+    text, numbers = page(tmp_path, "schemes")
+    assert [row["scheme"] for row in numbers["rows"]] == ["ppo", "ours"]
+    for row in numbers["rows"]:
+        assert row["steps"] == [0, 4 * 6, 2 * 4 * 6] and row["time"][0] == 0 < row["time"][1]
+        assert row["curves"]["collision_free"][0]["mean"] == 1.0
+        assert row["compile_s"] > 0 and row["reached"]["1"] == []
+    # Before the first step both are the same network in the same worlds.
+    one, two = (row["curves"]["reward"][0] for row in numbers["rows"])
+    assert one["mean"] == pytest.approx(two["mean"]) and one["mean"] != 0
+    assert "not reached" in text
+
+
+def trained(key, seed, *points, diverged=""):
+    return TrainingResult(key, seed, "", 60.0, 5.0, "c", diverged, list(points))
+
+
+def judged(key, *cross, rate=1.0, v_max=5.0):
+    """Return runs with these shares of successes; a run without one has diverged."""
+    for seed, value in enumerate(cross):
+        numbers = {"success_cross": value, "collision_free": rate, "v_max": v_max + seed,
+                   "v_max_most": v_max + 2, "gates": 4.0}  # fmt: skip
+        if value is None:
+            yield trained(key, seed, diverged="it diverged")
+        else:
+            yield trained(key, seed, numbers)
+
+
+def test_spread_and_pooled_interval_by_hand():
+    chosen = settings(Ablation(only=("field 0.4", "progress 3.2", "normalised 6.4")))
+    runs = [
+        *judged("field 0.4", 0.9, 1.0, 0.8),
+        *judged("progress 3.2", 0.3, 0.1, None, rate=0.3),
+        *judged("normalised 6.4", None),
+    ]
+    field, bare, gone = summaries(chosen, runs)
+    assert field.at[-1]["success_cross"] == pytest.approx(Spread(0.9, 0.8, 1.0))
+    assert field.at[-1]["v_max"] == Spread(6.0, 5.0, 7.0)
+    assert pooled(field, "success_cross", 10) == wilson(27, 30)
+    assert (bare.seeds, bare.diverged) == (3, 1)
+    assert pooled(bare, "success_cross", 10) == wilson(4, 20)
+    assert not gone.at and gone.diverged == 1
+    line = [cell.text for cell in _comparison_grid([field], 10).rows[0]]
+    assert line[2:5] == ["90 [80, 100]", "[74, 97]", "95"]
+    assert line[8:11] == ["6.0 [5.0, 7.0]", "7.0", "6.5"]
+
+
+def learnt(scheme, seed, pace, *gates, diverged=""):
+    """Return a run measured at 0, 100 and 200 steps."""
+    points = (
+        {"steps": 100.0 * k, "time": pace * k, "gates": g, "reward": 10 * g, "v_max": 4.0,
+         "collision_free": 1.0, "success_cross": g / 4}
+        for k, g in enumerate(gates)
+    )  # fmt: skip
+    return trained(scheme, seed, *points, diverged=diverged)
+
+
+def test_a_page_of_schemes_that_all_diverged_has_no_chart(tmp_path, monkeypatch):
+    runs = [learnt("ours", seed, 1.0, diverged="it diverged") for seed in (0, 1, 2)]
+    monkeypatch.setattr("suite.experiments.study.training.train_all", lambda *_: runs)
+    contents = document(SchemesConfig(only=("ours",)), Workspace(tmp_path, tmp_path), Console())
+    chartless, *_ = contents.parts["Learning curves"]
+    assert isinstance(chartless, Grid) and contents.numbers["rows"][0]["diverged"] == 3
+
+
+def test_curves_and_first_times_by_hand():
+    runs = [
+        learnt("ppo", 0, 4.0, 0.0, 0.5, 1.5),
+        learnt("ppo", 1, 4.0, 0.0, 0.5, 0.5),
+        learnt("ours", 0, 1.0, 0.0, 1.0, 3.0),
+        learnt("ours", 1, 3.0, 0.0, 2.0, 4.0),
+        learnt("ours", 2, 3.0, 0.0, diverged="it diverged"),
+    ]
+    ppo, ours = summaries(schemes(SchemesConfig(only=("ours", "ppo"))), runs)
+    assert [p["steps"].mean for p in ours.at] == [0, 100, 200] and ours.diverged == 1
+    assert [p["time"].mean for p in ours.at] == [0, 2, 4]
+    assert [p["gates"] for p in ours.at[1:]] == [Spread(1.5, 1.0, 2.0), Spread(3.5, 3.0, 4.0)]
+    assert first_times(ours, 2) == [(200, 2.0), (100, 3.0)]
+    assert first_times(ours, 3) == [(200, 2), (200, 6)]
+    assert first_times(ppo, 1) == [(200, 8.0)] and first_times(ppo, 2) == []

@@ -1,32 +1,47 @@
-"""Who flies which trials, in what manner, in how many processes, and its digest."""
+"""Who flies which trials, and how; a policy as content; the Python interface; users' own files."""
 
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+import onnx
 import pytest
+import torch
 
 import eval.judging.judge
 import suite
+from eval.effects import EFFECTS
 from eval.judging.results import read_trials
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
+from eval.worlds import WORLDS
 from eval.worlds.trial import TrialSpec
 from policies import shipped
+from policies.contract import contract_of
+from policies.formats.c.project import random_observations
+from policies.formats.export import export_module
 from policies.policy import load_policy
-from policies.spec import PolicyError
+from policies.spec import PolicyError, PolicySpec
 from suite.cli import parse
-from suite.judging import flying
+from suite.commands import check
+from suite.common.console import Quiet
+from suite.diagnose.example import flights as example
+from suite.judging import checking, flying
+from suite.judging.content import PolicyContent, policy_digest
 from suite.judging.flying import Manner, manners, policy_labels, workers_for
 from suite.judging.requests import Collection, Evaluation
-from suite.judging.trials import read_trial_set, trial_list
+from suite.judging.trials import _in_millimetres, read_trial_set, trial_list
 from tests.support.commands import evaluate, refused
-from tests.support.courses import IN_CONTACT
+from tests.support.courses import IN_CONTACT, straight
 from tests.support.engines import STAND_IN
+from tests.support.tools import python
 from tests.support.vehicles import with_effects
-from tracks.common.work.pickling import pack
+from tracks.common.work.pickling import pack, unpack
+from tracks.families import FAMILIES
 from tracks.formats.custom import load_track
 
 YARD = str(Path(__file__).resolve().parents[3] / "tracks" / "examples" / "yard.toml")
@@ -183,3 +198,144 @@ def test_options_become_the_request_and_recorded_seeds_are_far_from_judged_ones(
     given = asked("eval", "--policy", "race-paper", "--policy", "a.onnx", "--trials", "2")
     assert (given.policies, given.trials) == (("race-paper", "a.onnx"), 2)
     assert asked("collect").seed - asked("eval").seed >= 100_000
+
+
+def answers(policy):
+    state, image, _ = random_observations(policy.spec, 64)
+    return policy.act(policy.start(64), state, image, np.ones(64, bool))[0]
+
+
+def test_a_policy_that_came_as_content_keeps_its_name_and_is_the_same_without_its_files(tmp_path):
+    folder = tmp_path / "my.policy"
+    folder.mkdir()
+    for name in ("config.json", "weights.safetensors", "card.md"):
+        (folder / name).write_bytes((shipped.folder("race-paper") / name).read_bytes())
+    content = PolicyContent.of(folder)
+    assert [name for name, _ in content.files] == ["config.json", "weights.safetensors"]
+    packed, expected = pack(content), answers(load_policy(folder))
+    for path in folder.iterdir():
+        path.unlink()
+    found = unpack(packed)()
+    assert found.name == "my.policy" and unpack(packed)() is found, "loaded once"
+    assert np.array_equal(answers(found), expected)
+    (tmp_path / "policy.h").write_text("a header")
+    (tmp_path / "policy.c").write_text("a program")
+    content = PolicyContent.of(tmp_path / "policy.c")
+    assert (content.name, content.file) == (tmp_path.name, "policy.c")
+    assert [name for name, _ in content.files] == ["policy.h", "policy.c"]
+    with pytest.raises(PolicyError, match="trust"):
+        content()
+
+
+def test_a_digest_changes_with_any_byte_of_what_flies_and_no_other(tmp_path):
+    folder, seen = tmp_path / "p", []
+    folder.mkdir()
+    for name, text in (("config.json", "{}"), ("config.json", "{ }"), ("weights.safetensors", "a")):
+        (folder / name).write_text(text)
+        seen.append(policy_digest(str(folder)))
+    assert len(set(seen)) == 3
+    (folder / "card.md").write_text("words")
+    assert policy_digest(str(folder)) == seen[-1]
+    path, seen = onnx_file(tmp_path), []
+    for scale in (1, 2):
+        (tmp_path / "w.bin").write_bytes(np.full(300, scale, np.float32).tobytes())
+        seen.append(policy_digest(str(path)))
+    assert len(set(seen)) == 2
+
+
+def test_an_onnx_file_behind_a_link_comes_with_its_weights(tmp_path):
+    folder = tmp_path / "real"
+    folder.mkdir()
+    path = onnx_file(folder)
+    (tmp_path / "there").symlink_to(folder)
+    (tmp_path / "mine.onnx").symlink_to(path)
+    whole = {name: (folder / name).read_bytes() for name in ("it.onnx", "w.bin")}
+    content = PolicyContent.of(tmp_path / "there" / "it.onnx")
+    assert (content.name, content.file, dict(content.files)) == ("real", "it.onnx", whole)
+    content = PolicyContent.of(tmp_path / "mine.onnx")
+    assert content.file == "mine.onnx"
+    assert dict(content.files) == {"mine.onnx": whole["it.onnx"], "w.bin": whole["w.bin"]}
+
+
+def onnx_file(folder):
+    """Write it.onnx with its weights beside it in w.bin; return its path."""
+    onnx = pytest.importorskip("onnx")
+    weights = onnx.numpy_helper.from_array(np.ones(300, np.float32), "w")
+    node = onnx.helper.make_node("Identity", ["w"], ["action"])
+    graph = onnx.helper.make_graph([node], "g", [], [], [weights])
+    path = folder / "it.onnx"
+    onnx.save(
+        onnx.helper.make_model(graph), path,
+        save_as_external_data=True, location="w.bin", size_threshold=0,
+    )  # fmt: skip
+    return path
+
+
+FLIGHT = min(path.name for path in example.FOLDER.glob("*.parquet"))
+
+
+def test_a_track_in_millimetres_is_reported():
+    track = straight()
+    assert _in_millimetres("here", track) == []
+    gates = track.scene.gates._replace(center_w=1000 * track.scene.gates.center_w)
+    gates = gates._replace(opening_g=1000 * gates.opening_g)
+    large = replace(track, scene=track.scene._replace(gates=gates))
+    assert "millimetres" in _in_millimetres("here", large)[0]
+
+
+def test_modules_in_the_working_folder_do_not_stand_for_ours_or_pythons(tmp_path, root):
+    for name in ("eval", "socket", "tokenize"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('mine')\n")
+    code = (
+        f"import sys; sys.path[0] = {str(root)!r}; import socket, tokenize\n"
+        "from suite import cli\n"
+        "from tracks.common.work.processes import worker_pool\n"
+        "sys.path.insert(0, ''); sys.argv[1:] = ['effects']; main = cli.main\n"
+        # A process of its own begins as those that fly trials do.
+        "cli.main = lambda: main() or worker_pool(1).submit(int, 0).result()\n"
+        "cli.entry()\n"
+    )
+    done = python(code, cwd=tmp_path)
+    assert done.returncode == 0 and "mine" not in done.stderr, done.stderr
+
+
+def test_files_come_back_and_a_program_registers_names_for_its_process(tmp_path, monkeypatch):
+    vehicle, log = suite.load_vehicle("racer5"), suite.read_flight(example.FOLDER / FLIGHT)
+    suite.save_vehicle(vehicle, tmp_path / "it.toml")
+    assert suite.load_vehicle(tmp_path / "it.toml") == vehicle
+    again = suite.read_flight(suite.write_flight(tmp_path / "it.parquet", log))
+    np.testing.assert_array_equal(again.pos_w, log.pos_w)
+    effect = replace(EFFECTS["linear_drag"], name="mine")
+    for registry, value, register in (
+        (EFFECTS, effect, suite.register_effect),
+        (FAMILIES, lambda difficulty, rng: None, partial(suite.register_track, "mine")),
+        (WORLDS, type("Mine", (), {}), partial(suite.register_simulator, "mine")),
+    ):
+        for held in ("_entries", "_values"):
+            monkeypatch.setattr(registry, held, dict(getattr(registry, held)))
+        register(value)
+        assert registry["mine"] is value
+        with pytest.raises(ValueError, match="'mine' exists already"):
+            register(value)
+
+
+def test_check_reports_the_contract_and_an_unscaled_file_that_says_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(checking, "TIME_LIMIT_S", 1.5)
+    answer = check.run(check.Config(policy="race-small", trials=1), Quiet())
+    assert answer["findings"] == [] and answer["contract"]["digest"]
+    with pytest.raises(ValueError, match="nothing to check"):
+        check.run(check.Config(), Quiet())
+
+    class Unscaled(torch.nn.Module):
+        def forward(self, state, image):
+            return torch.tanh(state[:, 6:9]) + 0 * image.mean((1, 2))[:, None]
+
+    path = export_module(Unscaled(), tmp_path / "it.onnx", PolicySpec())
+    proto = onnx.load(path)
+    del proto.metadata_props[:]
+    onnx.save(proto, path)
+    answer = check.run(check.Config(policy=str(path), trials=1), Quiet())
+    faults = [finding["fault"] for finding in answer["findings"]]
+    assert faults[0] == "no_contract" and "action_scale" in faults
+    assert "30 Hz" in answer["findings"][0]["evidence"]
+    assert answer["contract"]["digest"] == contract_of(PolicySpec()).digest

@@ -18,15 +18,16 @@ from suite.train.losses import UNIT_FIELD, speed_to_goal
 from suite.train.rollout import view_in
 from suite.train.step import BEYOND_M, PATH_SAMPLES, approach_shift, make_step, target_gate
 from suite.train.worlds import sample_worlds
-from tests.support.canonical import NOISY, gradient_of
 from tests.support.training import (
     KEY,
+    NOISY,
     SPEC,
     assert_slopes,
     blind,
     boxes_worlds,
     doubled,
     fresh_params,
+    gradient_of,
     largest_difference,
     loss_of,
     small_config,

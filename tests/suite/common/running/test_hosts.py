@@ -1,17 +1,22 @@
-"""Several processes of one training: found by options or a scheduler, as one, and one that dies."""
+"""Trainings in several processes and commands on a cluster: the same files, also after a kill."""
 
 import json
 import os
+import shutil
 import signal
-import socket
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
 import pytest
 
+import eval.judging.judge
+import eval.judging.results
+from policies import shipped
 from policies.formats.checkpoint import load_arrays
+from suite import cli
 from suite.common.running.hosts import (
     Member,
     ProcessOptions,
@@ -19,6 +24,9 @@ from suite.common.running.hosts import (
     is_writer,
     read_member,
 )
+from tests.support.cluster import cluster, free_port
+from tests.support.commands import refused
+from tests.support.tools import program
 
 SLURM = {"SLURM_PROCID": "2", "SLURM_NTASKS": "4", "SLURM_STEP_NODELIST": "node[001-004]"}
 OPEN_MPI = {
@@ -75,13 +83,6 @@ os._exit(0)
 """
 
 
-def address():
-    """Return an address of this machine that is free."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return f"127.0.0.1:{free.getsockname()[1]}"
-
-
 def ends(processes, seconds=300):
     """Return the exit codes of processes and what they said; end all."""
     try:
@@ -95,7 +96,7 @@ def ends(processes, seconds=300):
 
 
 def test_two_processes_meet_agree_and_hear_that_one_is_gone(tmp_path, root):
-    where = address()
+    where = f"127.0.0.1:{free_port()}"
     environment = {**os.environ, "PYTHONPATH": str(root), "JAX_PLATFORMS": "cpu"}
     both = [
         subprocess.Popen(
@@ -136,7 +137,7 @@ class Trainings:
         )  # fmt: skip
 
     def both(self, out):
-        where = ("--coordinator", address(), "--processes", "2", "--process")
+        where = ("--coordinator", f"127.0.0.1:{free_port()}", "--processes", "2", "--process")
         return [self.start(out, *where, str(k)) for k in (0, 1)]
 
     def result(self, out):
@@ -146,8 +147,8 @@ class Trainings:
         return rows, load_arrays(self.folder / out / "policy", kind="policy").arrays
 
 
-def rows_there(path):
-    return len(path.read_text().splitlines()) if path.is_file() else 0
+def lines(path):
+    return path.read_text().splitlines() if path.is_file() else []
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +167,7 @@ def test_two_processes_train_as_one_and_go_on_after_a_kill_of_either(trainings, 
     try:
         curve = trainings.folder / out / "metrics.jsonl"
         until = time.monotonic() + 300
-        while rows_there(curve) < 20 and time.monotonic() < until:
+        while len(lines(curve)) < 20 and time.monotonic() < until:
             time.sleep(0.1)
         processes[killed].send_signal(signal.SIGKILL)
     finally:
@@ -174,9 +175,86 @@ def test_two_processes_train_as_one_and_go_on_after_a_kill_of_either(trainings, 
     assert codes[killed] == -signal.SIGKILL and codes[1 - killed] == 1, said
     assert "another process of this training is gone" in said[1 - killed]
     assert "same command on every host" in said[1 - killed] and "Traceback" not in said[1 - killed]
-    assert 20 <= rows_there(curve) < 120, "it was cut off on the way"
+    assert 20 <= len(lines(curve)) < 120, "it was cut off on the way"
     codes, said = ends(trainings.both(out))
     assert codes == [0, 0], said
     (rows, arrays), (expected, weights) = trainings.result(out), trainings.result("one")
     assert rows == expected, "the curve of one process with the same devices, to the bit"
     assert all(np.array_equal(arrays[name], weights[name]) for name in weights)
+
+
+TRIALS = ["--track", "zigzag", "--difficulty", "0,9", "--trials", "12"]
+FILES = ("table.md", "trials.parquet")
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """The policy by path, and its table as one process makes it."""
+    folder = tmp_path_factory.mktemp("flown")
+    shutil.copytree(shipped.folder("race-paper"), folder / "mine")
+    args = ["eval", "--policy", str(folder / "mine"), *TRIALS]
+    assert cli.main([*args, "--workers", "1", "--out", str(folder / "one")]) == 0
+    return args, folder / "one"
+
+
+def same_table(there, here):
+    return all((there / name).read_bytes() == (here / name).read_bytes() for name in FILES)
+
+
+def kill_a_node(journal, nodes):
+    """Kill one after a third of the trials."""
+    until = time.monotonic() + 200.0
+    while len(lines(journal)) <= 8 and time.monotonic() < until:
+        time.sleep(0.05)
+    nodes.kill(0)
+
+
+@pytest.mark.slow
+def test_a_node_killed_after_a_third_leaves_the_table_as_it_is(flown, tmp_path, monkeypatch):
+    args, one = flown
+    monkeypatch.setattr(eval.judging.judge, "MOST_A_PIECE", 2)
+    out = tmp_path / "out"
+    with cluster(tmp_path) as nodes:
+        journal = out / "journal-0.jsonl"
+        beside = threading.Thread(target=kill_a_node, args=(journal, nodes))
+        beside.start()
+        assert cli.main([*args, "--workers", nodes.address, "--out", str(out)]) == 0
+        beside.join()
+    assert same_table(out, one)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "command",
+    [
+        "collect --policy race-paper --track zigzag --difficulty 0 --trials 6",
+        "reproduce robustness --policy race-paper --policy race --trials 2 --only wind",
+        "loop --recipe quick --iterations 4 --finetune-iterations 2 --fit-iterations 4 --trials 2 "
+        "--flights 2 --track zigzag --difficulty 0 --set episode.batch=4 episode.steps=20",
+        "blind make --simulator continuous --seed 5 --count 2",
+    ],
+    ids=lambda command: command.split()[0],
+)
+def test_a_command_comes_to_the_same_on_a_cluster(command, tmp_path, root, monkeypatch):
+    monkeypatch.syspath_prepend(root / "tools")
+    digest = program(root / "tools" / "kills.py").digest
+    here, there = tmp_path / "here", tmp_path / "there"
+    again = ["blind run"] if command.startswith("blind") else []
+    with cluster(tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache")) as nodes:
+        for words in (command, *again):
+            for out, workers in ((here, "1"), (there, nodes.address)):
+                cache = ["--cache", str(out / "cache")] if command.startswith("reproduce") else []
+                args = [*words.split(), *cache, "--out", str(out), "--workers", workers]
+                assert cli.main(args) == 0
+    assert digest(here) == digest(there)
+    # A document has none of the files that a digest is of.
+    pages = [path.name for path in here.glob("robustness*")]
+    assert all((here / page).read_bytes() == (there / page).read_bytes() for page in pages)
+    assert pages or digest(here) != "nothing"
+
+
+def test_a_missing_extra_is_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    args = (*TRIALS, "--workers", "head:8786", "--out", tmp_path / "out")
+    assert "pip install 'diffracing-suite[cluster]'" in refused(capsys, "eval", *args)
+    assert not (tmp_path / "out").exists()

@@ -17,11 +17,10 @@ import pytest
 
 from suite.common.errors import explain
 from tests.support.cluster import cluster
+from tests.support.tools import python
 from tracks.common.work import WorkerDied, core_shares, run_pieces, worker_count
 from tracks.common.work.cluster import UnusableCluster
 from tracks.common.work.pickling import software
-
-CORES = sorted(os.sched_getaffinity(0))
 
 
 @pytest.fixture(scope="module")
@@ -74,10 +73,6 @@ def lived(folder, piece):
         file.write(f"{os.getpid()}\n")
     time.sleep(0.1)
     yield piece * piece
-
-
-def where(piece):
-    yield piece, tuple(sorted(os.sched_getaffinity(0)))
 
 
 def slow(piece):
@@ -147,13 +142,6 @@ def test_no_core_is_in_two_shares(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 5, 6, 7, 9})
     assert core_shares(2) == [[3, 5], [6, 7]]
     assert core_shares(1) == [[3, 5, 6, 7, 9]]
-
-
-@pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
-def test_pinned_processes_share_no_core():
-    found = {}
-    run_pieces(where, range(6), 2, lambda _, result: found.update([result]), pinned=True)
-    assert set(found.values()) <= set(map(tuple, core_shares(2)))
 
 
 def test_processes_end_with_the_one_they_work_for(tmp_path, root):
@@ -246,7 +234,7 @@ os._exit(late)
 def test_a_port_of_something_else_is_refused_in_the_time_that_is_promised():
     """In a process of its own, as Dask's client tries on beside when we gave it up."""
     pytest.importorskip("distributed")
-    done = subprocess.run([sys.executable, "-c", NO_SCHEDULER], capture_output=True, text=True)
+    done = python(NO_SCHEDULER)
     assert done.returncode == 0 and not done.stderr, done.stderr
     said = done.stdout.splitlines()
     assert len(said) == 4 and said[0].startswith("--workers tcp://127.0.0.1:9: ")

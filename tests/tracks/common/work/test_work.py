@@ -2,8 +2,6 @@
 
 import errno
 import os
-import subprocess
-import sys
 from types import MappingProxyType
 
 import pytest
@@ -12,6 +10,7 @@ from eval.effects import find_effect
 from eval.logs.columns import FlightLogError
 from suite.cli import main
 from suite.common.errors import explain
+from tests.support.tools import python
 from tracks.common.work import MOST, processes, read_workers, threads
 from tracks.common.work.pickling import failure, pack, remote_error, unpack
 from tracks.common.work.threads import one_thread_a_product, set_threads, share_threads
@@ -119,10 +118,8 @@ def test_the_encoders_gradient_has_the_same_bits_on_any_number_of_cores():
     found = set()
     for number, pinned in ((None, True), (None, False), ("8", False), ("64", False)):
         environment = {**os.environ, **({} if number is None else {"NPROC": number})}
-        done = subprocess.run(
-            [sys.executable, "-c", GRADIENT], env=environment, capture_output=True, check=True,
-            preexec_fn=(lambda: os.sched_setaffinity(0, [one])) if pinned else None,
-        )  # fmt: skip
+        on_one = (lambda: os.sched_setaffinity(0, [one])) if pinned else None
+        done = python(GRADIENT, env=environment, check=True, preexec_fn=on_one)
         found.add(done.stdout)
     assert len(found) == 1
 

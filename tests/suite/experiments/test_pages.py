@@ -1,24 +1,27 @@
-"""Pages from numbers made by hand; main tables of README and docs/results.md are those of pages.
-
-The tables of table2, ablation and schemes are compared with JSON files, and the counts of blind
-cases with the sums of their sets.
-"""
+"""Pages: their text and numbers, the published ones, and what suite reproduce refuses."""
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from eval.judging.statistics import Interval, wilson
+from policies import shipped
+from suite import cli
+from suite.cli import parse
+from suite.commands import reproduce as command
 from suite.common.console import Console
 from suite.common.report import Picture
+from suite.experiments import EXPERIMENTS, published
 from suite.experiments.pages.document import BEGIN, END, PageContents, check_page, write_document
 from suite.experiments.pages.paper import goals
-from suite.experiments.study.cache import Workspace
+from suite.experiments.study.cache import FLIES, Workspace, code_digest, page_code
+from suite.judging.content import policy_digest
 from suite.loop.tables import difference_cell
+from tests.support import commands
 from tests.support.judged_cells import cell
 from tracks.common.grid import Cell, table
 
@@ -98,7 +101,7 @@ def test_goals_by_hand():
     assert goals([cell("ellipse", 6, 1.0, 6.2)])[0].of_ten_miss is None, "too few trials"
 
 
-ROOT = Path(__file__).resolve().parents[4]
+ROOT = Path(__file__).resolve().parents[3]
 RESULTS = ROOT / "docs" / "results"
 NUMBERS = {path.stem: json.loads(path.read_text("utf-8")) for path in RESULTS.glob("*.json")}
 
@@ -194,3 +197,99 @@ def test_the_counts_of_blind_cases_are_the_sums_of_their_sets():
     for cells in totals:
         row = " | ".join(cell or "not tested" for cell in cells[:3])
         assert (f"| {row} |" in results) == (cells != no_gap), row
+
+
+def write_page(folder, name, flown, code):
+    made_by = {"ours": f"{flown[0]}, SHA-256 {flown[1][:16]}", "vehicle": "reference"}
+    page = {"git_commit": "f8502435b6b42b44", "made_by": made_by, "code_sha256": code}
+    (folder / f"{name}.json").write_text(json.dumps(page))
+
+
+def test_a_page_is_older_than_another_policy_or_other_code(tmp_path, capsys):
+    code, current = code_digest(*FLIES), policy_digest(shipped.DEFAULT)
+    write_page(tmp_path, "table2", (shipped.DEFAULT, current), code)
+    write_page(tmp_path, "simulators", (shipped.DEFAULT, "0" * 16), code)
+    write_page(tmp_path, "robustness", ("runs/mine", current), "another")
+    write_page(tmp_path, "faults", (shipped.DEFAULT, current), code)
+    write_page(tmp_path, "schemes", (shipped.DEFAULT, current), page_code("schemes"))
+    _, config = parse("reproduce", ["status", "--out", str(tmp_path)])
+    pages = command.run(config, Console())["pages"]
+    assert pages["table2"] == {"commit": "f8502435b6b42b44", "newer": []}
+    assert pages["simulators"]["newer"] == ["policy"]
+    assert pages["robustness"]["newer"] == pages["faults"]["newer"] == ["code"]
+    assert pages["schemes"]["newer"] == []
+    assert pages["ablation"]["newer"] is None
+    assert "not made" in capsys.readouterr().out
+
+
+def test_all_makes_every_page_by_the_command_of_the_published_one(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(command, "_make_page", lambda config, console: asked.append(config) or {})
+    _, config = parse("reproduce", ["all", "--out", str(tmp_path)])
+    assert list(command.run(config, Console())["seconds"]) == list(published.PUBLISHED)
+    assert [type(c.experiment).__module__.rpartition(".")[2] for c in asked] == list(
+        published.PUBLISHED
+    )
+    assert set(published.PUBLISHED) <= set(EXPERIMENTS)
+    assert all(replace(c, experiment=None) == replace(config, experiment=None) for c in asked)
+    compared = []
+    for name, options in published.PUBLISHED.items():
+        if not (page := RESULTS / f"{name}.json").is_file():
+            continue
+        command_line = json.loads(page.read_text())["made_by"]["command"].strip("`")
+        assert command_line.startswith(f"suite reproduce {name} "), name
+        given = re.sub(r"--(out|workers|policy) \S+", "", command_line).split()[3:]
+        assert sorted(given) == sorted(options.split()), name
+        compared.append(name)
+    assert len(compared) >= 6
+
+
+def test_every_experiment_is_listed_and_has_help_for_every_option(capsys):
+    assert cli.main(["reproduce"]) == 0
+    listed = capsys.readouterr().out
+    for name in EXPERIMENTS:
+        assert cli.main(["reproduce", name, "--help"]) == 0
+        said = capsys.readouterr().out
+        assert name in listed and f"suite reproduce {name} [-h]" in said and "--json" in said
+        assert "--cache" in said.partition("advanced options")[2]
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("table3", "unknown"),
+        ("table2 --policy race-papr", "Did you mean 'race-paper'?"),
+        ("table2 --policy nowhere/policy", "nowhere/policy: no such file"),
+        ("simulators --policy {folder}/mine.pt2", "suite reproduce never does"),
+        ("simulators --simulator reference", "reference: the page compares with mujoco"),
+        ("simulators --simulator mjx --simulator mjx", "--simulator mjx is given twice"),
+        ("robustness --only linear_darg", "Did you mean 'linear_drag'?"),
+        ("robustness --policy race --policy race", "--policy race is given twice"),
+        ("perception --only stero", "Did you mean 'stereo'?"),
+        ("ablation --seed 0", "--seed 0 is one of --training-seeds"),
+        ("ablation --only field@0.41", "Did you mean 'field 0.4'?"),
+        ("ablation --set episode.batch=9", "this command sets episode.batch; give --worlds"),
+        ("ablation --set loss.field_gain=0", "loss.field_gain is 0, allowed is a number above"),
+        ("ablation --worlds 5", "episode.batch is 5, allowed are multiples of episode.shards (2)"),
+        ("ablation --recipe race-small", "--recipe race-small has 3 phases, allowed is a recipe"),
+        ("ablation --workers 99", "--workers is 99"),
+        ("schemes --training-seeds 1 1", "--training-seeds is 1 1"),
+        ("schemes --worlds 5 --set episode.shards=1", "PPO are multiples of its 2 minibatches"),
+        ("schemes --set loss.progress=1.2", "this command sets loss.progress; give --progress"),
+        ("faults --workers 10.0.0.1:8786", "--workers is tcp://10.0.0.1:8786; allowed"),
+        ("gpu", "JAX finds no GPU here"),
+        ("gpu --worlds 4 8 --train-worlds 6", "allowed are those of --worlds: 4 8"),
+    ],
+)
+def test_what_cannot_be_used_is_said_before_anything_is_done(
+    line, words, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr("suite.train.run.train", None)
+    monkeypatch.setattr("suite.experiments.study.judging.fly_share", None)
+    program, place = tmp_path / "mine.pt2", tmp_path / "place"
+    program.touch()
+    place.mkdir()
+    args = [word.replace("@", " ").format(folder=tmp_path) for word in line.split()]
+    out = ("--out", place / "docs", "--cache", place / "cache")
+    assert words in commands.refused(capsys, "reproduce", *args, *out)
+    assert not list(place.iterdir())
