@@ -123,12 +123,12 @@ FAULTS = (
           "delta/test_windows"),
     # suite: diagnosis
     Fault("suite/diagnose", "(slow**2).sum(axis=(2, 3)) - (explained**2).sum(axis=(2, 3))",
-          "(slow**2).sum(axis=(2, 3))", "diagnose/fit/test_fit"),
+          "(slow**2).sum(axis=(2, 3))", "diagnose/fit/test_rollouts"),
     Fault("suite/diagnose", "float((1 + as_extreme.sum()) / (1 + len(as_extreme)))",
-          "float(as_extreme.sum() / (1 + len(as_extreme)))", "test_permutation"),
+          "float(as_extreme.sum() / (1 + len(as_extreme)))", "diagnose/fit/test_search"),
     # suite: blind cases, link
     Fault("suite/blind", "return vector[:, [1, 0, 2]] * [1.0, -1.0, 0.0]",
-          "return vector[:, [1, 0, 2]] * [-1.0, 1.0, 0.0]", "test_air"),
+          "return vector[:, [1, 0, 2]] * [-1.0, 1.0, 0.0]", "continuous/test_engine"),
     Fault("suite/blind", "yield bool(span[0] <= true <= span[1])", "yield bool(true <= span[1])",
           "test_score"),
     Fault("suite/judging/link", "np.asarray(quat_wxyz, float) * QUAT_HALF_TURN",

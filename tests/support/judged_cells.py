@@ -23,6 +23,14 @@ def result(seed, success=True, policy="ours", difficulty=3, speed=5.0):
     )  # fmt: skip
 
 
+def results_of(won, trials=40):
+    """Return the results of each policy, which succeeds in so many of the trials of two cells."""
+    return {
+        name: [result(k, k < count, "p", k % 2) for k in range(trials)]
+        for name, count in won.items()
+    }
+
+
 ROWS = [result(0), result(1, False), result(2), result(3)]
 
 

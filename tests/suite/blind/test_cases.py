@@ -1,11 +1,30 @@
-"""The cases of a set: their numbers, and that sets share none."""
+"""The cases of a set: their numbers, how they are built, and how strong what is hidden is."""
 
+import json
 from collections import Counter
+from dataclasses import replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from eval.effects import EFFECTS, nameable_effects
-from suite.blind.cases import DRAWERS, MULTIPLES, SETS, draw_cases, draw_continuous_cases
+from eval.flights.simulate import SENSORS, fly, log_of
+from eval.flights.trajectory import Trajectory
+from eval.logs.flight_log import read_flight
+from suite.blind import build as module
+from suite.blind.build import build
+from suite.blind.cases import DRAWERS, MULTIPLES, SETS, Case, draw_cases, draw_continuous_cases
+from suite.blind.continuous.timing import draw_conditions
+from suite.blind.make import open_answers
+from suite.blind.oracle import information as oracle
+from suite.blind.oracle import strength
+from suite.blind.outside import KINDS as OUTSIDE
+from suite.blind.outside import changed_values, draw_change
+from suite.blind.simulators import simulator_for
+from tests.support.blind import SINGLE
+from tests.support.ways import BARE, bare_flights
+from tracks.common.files import plain
 
 
 def test_a_full_set_has_the_numbers_that_were_promised():
@@ -55,11 +74,175 @@ def test_a_few_cases_are_of_every_kind_and_none_of_an_effect_that_no_flight_can_
 
 
 def test_no_two_simulators_and_no_two_sets_share_a_seed():
-    seeds = [
-        case.seed
-        for draw in DRAWERS.values()
-        for seed in SETS.values()
-        for case in draw(seed, None).values()
-        if case.kind != "separated"
-    ]
+    sets = [draw(seed, None).values() for draw in DRAWERS.values() for seed in SETS.values()]
+    seeds = [case.seed for cases in sets for case in cases if case.kind != "separated"]
     assert len(seeds) == len(set(seeds))
+
+
+NAMES = ("rotor_drag", "linear_drag", "com_offset", "gyro_bias", "weak_motor")
+
+
+@pytest.fixture(scope="module")
+def flights():
+    return [log_of(flight, BARE, SENSORS["capture"], None) for flight in bare_flights()]
+
+
+@pytest.fixture(scope="module")
+def info(flights):
+    return oracle.information(BARE, flights, SENSORS["capture"])
+
+
+def test_information_grows_with_flights_and_knows_hand_worked_parts(flights, info):
+    one = oracle.information(BARE, flights[:1], SENSORS["capture"], NAMES)
+    of_both = [info.columns.index(column) for column in one.columns]
+    assert (np.diag(info.matrix)[of_both] >= np.diag(one.matrix) - 1e-9).all()
+    # A gyro bias moves one channel by itself; each row says 1 / sigma^2, less what the unknown
+    # start takes (its rate and its drift in attitude).
+    index = one.columns.index(oracle.Column("gyro_bias", "bias", 2))
+    stretches = int(flights[0].time_s[-1] - 0.3)
+    most = 101 * stretches / SENSORS["capture"].gyro ** 2
+    assert 0.1 * most < one.matrix[index, index] < most
+
+
+def test_lookalikes_look_alike_and_strangers_do_not(info):
+    size = 6.0 * oracle.detectable(info.block("rotor_drag"), np.ones(1))
+    change = {"rotor_drag": size * np.ones(1)}
+    given = (info, change, "rotor_drag")
+    near, far = (oracle.remaining_ratio(*given, k, BARE) for k in ("linear_drag", "com_offset"))
+    whole = 36.0 * 12.5
+    assert near < 0.05 * whole and 0.5 * whole < far <= whole * (1 + 1e-6)
+    (found,) = oracle.alternatives(info, change, BARE).values()
+    assert "com_offset" not in found and "accelerometer_bias" not in found
+
+
+def test_every_effect_has_columns_but_what_cannot_be_told():
+    columns = oracle.columns_of(False)
+    assert {column.effect for column in columns} == set(nameable_effects()) - {"gusts"}
+    assert oracle.Column("com_offset", "offset", 2) not in columns
+    sag = [c.parameter for c in oracle.columns_of(True) if c.effect == "battery_sag"]
+    assert sag == ["per_volt"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("vehicle", "sensors", "names"),
+    [
+        ("dragged", "full", ["rotor_drag", "clock_offset", "weak_motor", "gusts"]),
+        ("bare", "capture", ["constant_wind", "gusts"]),
+    ],
+)
+def test_the_committed_table_is_what_is_worked_out(vehicle, sensors, names):
+    stored = json.loads(strength.TABLE.read_text())["vehicles"][vehicle][sensors]
+    assert list(stored) and set(stored) == set(nameable_effects())
+    for name, entry in strength.strengths(vehicle, sensors, names).items():
+        assert entry["columns"] == stored[name]["columns"]
+        if "matrix" in entry:
+            np.testing.assert_allclose(entry["matrix"], stored[name]["matrix"], rtol=1e-6)
+        else:
+            kept = np.inf if stored[name]["detectable"] is None else stored[name]["detectable"]
+            assert entry["detectable"] == pytest.approx(kept, rel=1e-6)
+
+
+@pytest.mark.parametrize(("size", "strong"), [(0.0, False), (0.02, False), (1.0, True)])
+def test_a_wind_beyond_its_bound_is_never_detectable(monkeypatch, size, strong):
+    """What rotors in forward flight pass on of a wind would show a gust of 30 m/s."""
+    rows = np.random.default_rng(0).standard_normal((40 * oracle.GUST_DRAWS, 30))
+    monkeypatch.setattr(oracle, "fly", lambda *_, **__: [])
+    monkeypatch.setattr(oracle, "linearised", lambda *_: SimpleNamespace(residual=size * rows))
+    found = oracle.gust_strength(BARE, (), SENSORS["capture"], "gusts", np.random.default_rng(0))
+    assert np.isfinite(found) == strong and (not strong or found < 8.0)
+
+
+def test_an_effect_that_is_not_in_the_table_is_worked_out(monkeypatch):
+    monkeypatch.setattr(strength, "_entry", strength._entry.__wrapped__)
+    entry = {"columns": [["turn", 0], ["late", 0]], "matrix": [[25.0, 0.0], [0.0, 100.0]]}
+    monkeypatch.setattr(strength, "strengths", lambda vehicle, sensors, names: {names[0]: entry})
+    along = [strength.detectable_along("bare", "full", "imu_fault", axis) for axis in np.eye(2)]
+    assert along == pytest.approx([1.0, 0.5])
+    (_, late) = strength.columns_in_table("bare", "full", "imu_fault")
+    assert late == oracle.Column("imu_fault", "late", 0)
+
+
+def test_a_case_is_the_same_to_the_bit_and_its_seed_matters(made_set, monkeypatch, short_flights):
+    monkeypatch.setattr(module, "_expected_names", lambda *_: {})  # how strong it is takes longest
+    first, again = build(SINGLE), made_set / "cases" / "case_001" / "flight_1.parquet"
+    np.testing.assert_array_equal(first.logs[0].pos_w, read_flight(again).pos_w)
+    assert (first.logs[0].integrator, first.logs[0].step_s) == ("euler", 0.002)
+    stored = open_answers(made_set)["case_001"]
+    (effect,), (kept,) = plain(first.answer)["effects"], stored.pop("effects")
+    assert {"kind", "verdict"} <= set(stored) and stored["verdict"] == "named"
+    assert all(kept[key] == effect[key] for key in ("name", "parameters", "multiple"))
+    assert kept["sigma"] > 0.0
+    other = build(replace(SINGLE, seed=(6, 1)))
+    assert other.answer["effects"][0]["parameters"] != first.answer["effects"][0]["parameters"]
+    # What is hidden is in the flights, and not in the vehicle file.
+    assert "linear_drag" not in first.nominal.effects
+    coefficient = np.array(first.answer["effects"][0]["parameters"]["coefficient"])
+    (flight,) = fly(first.nominal, first.truth, first.trajectories)
+    vel_b = np.einsum("tij,ti->tj", flight.motion.rot_w, flight.motion.vel_w)
+    # The accelerometer of a vehicle without other aerodynamics shows the drag alone across.
+    across = flight.acc_b[1:, :2]
+    np.testing.assert_allclose(across, -coefficient[:2] * vel_b[:-1, :2], rtol=1e-6, atol=1e-9)
+
+
+def test_outside_cases_say_how_much_the_catalogue_cannot_explain(short_flights):
+    built = build(Case("outside", ("ripple",), 6.0, "bare", "capture", (5, 3)))
+    outside = built.answer["outside"]
+    assert built.answer["verdict"] == "unknown" and not built.truth.effects
+    assert outside["multiple"] == pytest.approx(6.0, rel=0.25) or outside["strength"] == 0.3
+
+
+def test_physics_outside_the_catalogue_moves_the_vehicle_and_a_load_weighs_what_it_weighs():
+    way = Trajectory("climb", duration_s=2.0, speed=3.0, size=1.0)
+    (bare,) = fly(BARE, BARE, [way])
+    for name, kind in OUTSIDE.items():
+        moved = fly(BARE, BARE, [way], extra=kind.make(kind.usual, BARE.mass))[0]
+        acts = np.abs(moved.extra.force_b).max()
+        acts += np.abs(moved.acting.thrust - moved.command.thrust).max()
+        assert acts > 0.0 and np.abs(moved.motion.pos_w - bare.motion.pos_w).max() > 1e-5, name
+    load = OUTSIDE["slung_load"].make(0.03, BARE.mass)
+    flight = fly(BARE, BARE, [Trajectory("hover", 0.2)], extra=load)[0]
+    assert flight.extra.force_b[0, 2] == pytest.approx(-0.03 * 9.81, rel=1e-6)
+
+
+def test_a_strength_is_the_multiple_of_the_table_or_cut_at_a_bound():
+    for name in nameable_effects():
+        in_wind = name in ("constant_wind", "gusts")
+        vehicle = strength.nominal_vehicle("dragged" if in_wind else "bare")
+        rng = np.random.default_rng(3)
+        change, multiple = draw_change(rng, vehicle, "full", name, 2.0)
+        values = changed_values(vehicle, "full", name, change, rng)
+        assert multiple <= 2.0 and np.abs(change).max() > 0.0, name
+        direction = change / np.linalg.norm(change)
+        unit = strength.detectable_along(vehicle.name, "full", name, direction)
+        assert np.linalg.norm(change) / unit == pytest.approx(multiple, rel=1e-6), name
+        assert len(strength.columns_in_table(vehicle.name, "full", name)) == len(change)
+        assert isinstance(values, EFFECTS[name].values)
+
+
+CONTINUOUS = replace(SINGLE, seed=(6, 70_001), simulator="continuous")
+
+
+def test_a_continuous_cases_vehicle_has_the_loop_that_its_seed_draws(monkeypatch, short_flights):
+    """That a flight is the same to the bit again is asked in test_flights.py."""
+    judged = []
+    monkeypatch.setattr(module, "_expected_names", lambda *given: judged.append(given) or {})
+    first = build(CONTINUOUS)
+    conditions = first.answer["conditions"]
+    assert first.nominal.controller.frequency == conditions["loop_hz"]
+    assert first.nominal.name == "bare" and not first.nominal.effects
+    assert first.logs[0].integrator is None
+    about = dict(first.logs[0].about)
+    assert about == {"source": "suite blind", "vehicle": "bare"}, "nothing of the conditions"
+    spacing = np.median(np.diff(first.logs[0].time_s))
+    assert spacing == pytest.approx(1.0 / conditions["row_hz"], rel=0.1)
+    # Its strength is worked out on the flight as it was, without noise.
+    ((_, nominal, (exact,), _, named),) = judged
+    assert nominal == first.nominal and list(named) == ["linear_drag"]
+    jumps = [np.diff(log.vel_w, 2, axis=0).std() for log in (exact, first.logs[0])]
+    assert jumps[0] < 0.1 * jumps[1]
+    simulator = simulator_for(CONTINUOUS, np.random.default_rng(3))
+    drawn = draw_conditions(np.random.default_rng(3))
+    assert simulator.conditions["row_hz"] == drawn.row_hz
+    assert simulator.nominal.controller.frequency == drawn.loop_hz
+    assert not simulator_for(SINGLE, np.random.default_rng()).conditions

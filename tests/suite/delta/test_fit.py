@@ -1,32 +1,30 @@
-"""Lag, drag and delay found again, and a residual learned, on flights whose truth is known."""
+"""From flight logs to a fitted model: what is learned of a known truth, refused and reported."""
 
+import json
 from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import pytest
 
+from eval.logs.faults.finding import Finding
 from eval.logs.flight_log import write_flight
+from eval.quadrotor.vehicle_file import load_vehicle
 from policies.formats.policy_file import load_delta
 from suite.common.console import Console
 from suite.delta.fit import FitConfig, _descend, _loss, identify, window_errors
-from suite.delta.replay import PointMassModel, nominal_model
-from suite.delta.run import errors_grid, fit_delta
+from suite.delta.replay import PointMassModel, check_corrects, describe_dynamics, nominal_model
+from suite.delta.run import errors_grid, fit_delta, flight_files, long_enough, split
 from suite.delta.windows import cut_windows
-from suite.train.config import PointMassConfig
+from suite.train.config import PointMassConfig, QuadrotorConfig
+from suite.train.recipes import race, race_paper
 from tests.support.point_mass_flights import fly
+from tests.support.vehicles import with_lag
 from tracks.common.files import plain
 from tracks.common.grid import markdown
-
-
-class Record(NamedTuple):
-    """Windows that were flown."""
-
-    pos_w: np.ndarray
-    vel_w: Any = None
-
 
 PHYSICS = PointMassConfig(drag=(0.3, 0.3), drag_up=(0.3, 0.3), action_delay=(0.5, 0.5))
 CONFIG = FitConfig(horizon_s=0.6, stride_s=0.3, iterations=100, batch=32, rate=1e-2, held_out=0.5)
@@ -43,12 +41,9 @@ def test_lag_drag_and_delay_of_a_point_mass_are_identified_in_a_third_of_the_ste
     np.testing.assert_allclose(found.drag, truth.drag, atol=0.04)
     taken: list[int] = []
     nothing: Any = None
-
-    def descend(config, loss, start, windows, iterations, watch):
-        taken.append(iterations)
-        return start
-
-    monkeypatch.setattr("suite.delta.fit._descend", descend)
+    monkeypatch.setattr(
+        "suite.delta.fit._descend", lambda *given: taken.append(given[4]) or given[2]
+    )
     for iterations in (2, 9):
         identify(FitConfig(iterations=iterations), PHYSICS, nothing)
     assert taken == [1, 3]
@@ -69,8 +64,7 @@ def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(tmp_path, monke
     monkeypatch.setattr(console, "progress", lambda *_: told)
     result = fit_delta(CONFIG, PHYSICS, [tmp_path], tmp_path / "out", console)
     without, identified, with_delta = result.errors.values()
-    assert result.identified is not None
-    assert without.position_m > 0.1
+    assert result.identified is not None and without.position_m > 0.1
     assert with_delta.position_m < 0.3 * without.position_m
     assert with_delta.velocity_m_s < 0.4 * without.velocity_m_s
     assert with_delta.position_m < identified.position_m
@@ -85,10 +79,16 @@ def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(tmp_path, monke
     assert said == markdown(grid) and "| point mass with Delta Action Model |" in said
 
 
+class Record(NamedTuple):
+    """Windows that were flown."""
+
+    pos_w: np.ndarray
+    vel_w: Any = None
+
+
 def test_a_replay_is_held_against_the_record_of_its_own_time():
     """The record itself has no error; one that is off by 3 and 4 has that of a distance of 5."""
-    rng = np.random.default_rng(0)
-    record = Record(*rng.normal(size=(2, 4, 6, 3)))
+    record = Record(*np.random.default_rng(0).normal(size=(2, 4, 6, 3)))
     config = FitConfig(velocity_weight=0.5, size_weight=0.25)
 
     def flown(off_m, off_m_s, correction):
@@ -111,3 +111,102 @@ def test_the_steps_of_a_descent_become_small():
     _descend(config, loss, np.float32(0.5), windows, 60, lambda _, x: seen.append(float(x)))
     steps = np.abs(np.diff(seen))
     assert steps[-3:].max() < 0.02 * steps[:3].max()
+
+
+def test_flight_logs_are_found_once_and_without_any_nothing_is_written(tmp_path):
+    with pytest.raises(ValueError, match="no flight logs in"):
+        fit_delta(FitConfig(), PHYSICS, [tmp_path], tmp_path / "out", Console())
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "a").mkdir()
+    for name in ("0.parquet", "1.parquet", "2.csv"):
+        (tmp_path / name).touch()
+    twice = [tmp_path, tmp_path / "a" / ".." / "0.parquet"]
+    assert len(flight_files(twice)) == 3, "a flight that is named twice counts once"
+
+
+QUAD = QuadrotorConfig(load_vehicle("reference"))
+SLOWER = QuadrotorConfig(replace(with_lag(QUAD.vehicle, 0.05), name="other"))
+
+
+@pytest.mark.parametrize(
+    ("dynamics", "missing"),
+    [(PHYSICS, "action_y"), (PHYSICS, "decisions"), (QUAD, "policy_step"), (QUAD, "cmd_thrust")],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_flights_without_what_a_fit_needs_are_refused(tmp_path, dynamics, missing, capsys):
+    doubt = Finding("doubt", "motors", "6 motors turn", "motor_count", 6.0, 0.97, "none")
+    kept = {"findings": [doubt._asdict()]}
+    for i, log in enumerate(fly(nominal_model(PHYSICS), 2, seconds=1.5)):
+        extra = {name: column for name, column in log.extra.items() if name != missing}
+        if missing == "decisions":
+            extra["policy_step"] = np.zeros(len(log.time_s))
+        given = {"thrust_cmd": np.full_like(log.time_s, 9.81), "rate_cmd_b": log.rate_b}
+        if missing == "cmd_thrust":
+            given = {"rotor_speed": np.full((len(log.time_s), 4), 900.0)}
+        write_flight(tmp_path / f"{i}.parquet", replace(log, extra=extra, about=kept, **given))
+    with pytest.raises(ValueError, match=r"record (longer )?flights with suite collect"):
+        fit_delta(FitConfig(), dynamics, [tmp_path], tmp_path / "out", Console())
+    # A log that an earlier step does not refuse repeats the open findings of its import.
+    assert missing != "cmd_thrust" or "6 motors turn" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def logs():
+    return fly(nominal_model(PHYSICS), 7, seconds=1.5)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.25, 0.5, 0.99])
+def test_a_split_has_no_overlap_and_leaves_nobody_out(logs, share):
+    splits = []
+    for seed in range(5):
+        known, held = ([log.name for log in part] for part in split(logs, share, seed))
+        assert sorted(known + held) == sorted(log.name for log in logs)
+        assert known and len(held) == min(6, max(1, round(share * 7)))
+        splits.append(tuple(held))
+    assert len(set(splits)) > 1, "another seed holds out others"
+
+
+def test_what_cannot_be_split_is_refused_and_flights_shorter_than_a_window_are_left_out(logs):
+    with pytest.raises(ValueError, match="1 flight given, at least 2"):
+        split(logs[:1], 0.25, 0)
+    for share in (0.0, 1.0, float("nan")):
+        with pytest.raises(ValueError, match=f"held_out is {share}"):
+            split(logs, share, 0)
+    crash = replace(fly(nominal_model(PHYSICS), 1, seconds=0.8)[0], name="crash")
+    kept, words = long_enough([*logs, crash], 1.0)
+    assert [log.name for log in kept] == [log.name for log in logs]
+    assert words == ["crash: left out, it lasts 0.77 s and a window 1 s"]
+    assert long_enough([logs[0], crash], 1.0) == ([logs[0], crash], [])
+
+
+def corrects(fitted, flown, rate_hz=15.0):
+    """Check a run's dynamics against those that a checkpoint of 15 Hz has, as JSON has them."""
+    fit = None if fitted is None else {"rate_hz": 15.03, **describe_dynamics(fitted)}
+    kept = json.loads(json.dumps(plain(fit or {})))
+    check_corrects(kept, flown, rate_hz, Path("runs/delta/delta"))
+
+
+RACE = race().physics
+DRAGS = "drag 0.45 0.45 1.1 1/s.* this run's has .*drag 0.45 0.45 0.45 1/s.*--recipe"
+
+
+def test_other_ranges_with_the_same_middle_and_another_name_of_the_vehicle_do_not_count():
+    corrects(None, RACE)
+    corrects(RACE, replace(RACE, drag=(0.0, 0.9), lag_std=0.0))
+    corrects(QUAD, replace(QUAD, vehicle=replace(QUAD.vehicle, name="mine"), mass_std=0.0))
+
+
+@pytest.mark.parametrize(
+    ("fitted", "flown", "rate_hz", "words"),
+    [
+        (RACE, race_paper().physics, 15.0, DRAGS),
+        (RACE, replace(RACE, action_delay=(0.5, 1.5)), 15.0, "delay 1 decisions; take"),
+        (RACE, RACE, 30.0, "with 15 decisions a second, and this run has 30: .*--finetune .*=15"),
+        (QUAD, SLOWER, 15.0, "another vehicle than 'other'; take its --vehicle"),
+        (QUAD, PHYSICS, 15.0, "corrects --model quad, .* point"),
+        (None, QUAD, 15.0, "corrects --model point, .* quad"),
+    ],
+)
+def test_other_dynamics_or_another_rate_are_refused(fitted, flown, rate_hz, words):
+    with pytest.raises(ValueError, match=words):
+        corrects(fitted, flown, rate_hz)

@@ -1,4 +1,4 @@
-"""What `suite diagnose` writes, by rollouts and by views, and what it refuses."""
+"""What `suite diagnose` writes, refuses and plans; the shipped example of flights for it."""
 
 import json
 import re
@@ -8,28 +8,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from eval.effects import EFFECTS
+from eval.flights import simulate
+from eval.flights.trajectory import Trajectory
 from eval.logs.flight_log import read_flight, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.cli import main
+from suite.diagnose import plan as planning
 from suite.diagnose import run as diagnose_run
+from suite.diagnose.diagnose import diagnose
+from suite.diagnose.example import flights as example
+from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.sources.rollouts import can_fly
+from tests.support.broken_logs import rows
 from tests.support.commands import refused
-from tests.support.diagnosis_flights import fly
+from tests.support.diagnosis_flights import fly_all
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.recordings import columns
-from tests.support.vehicles import PLAIN, REMEMBERING, with_effects
+from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
 
 STEPS = ["The logs", "The measurement noise", "The candidates",
          "Alternatives to the named effects", "Remaining error", "The evidence"]  # fmt: skip
 
 
-@pytest.fixture
-def written(diagnosed):
-    """Return the folder of what was written."""
-    return diagnosed[0]
-
-
-def test_files_come_out_whole_and_bad_flights_are_named(written):
+def test_files_come_out_whole_and_bad_flights_are_named(diagnosed):
+    written = diagnosed[0]
     found = json.loads((written / "diagnosis.json").read_text(encoding="utf-8"))
     assert json.loads((written.parent / "said.json").read_text(encoding="utf-8")) == found
     assert any("bad.csv" in warning for warning in found["warnings"])
@@ -53,7 +56,8 @@ def test_without_a_recording_all_else_is_written(diagnosed, tmp_path, monkeypatc
     assert {path.name for path in tmp_path.iterdir()} == names
 
 
-def test_every_step_is_in_the_report(written):
+def test_every_step_is_in_the_report(diagnosed):
+    written = diagnosed[0]
     text = (written / "report.html").read_text(encoding="utf-8")
     shown = re.findall(r"<h2>(.*?)</h2>", text)
     assert shown[:2] == ["What to do next", "Measured and simulated"]
@@ -66,7 +70,8 @@ def test_every_step_is_in_the_report(written):
         assert (written / link).is_file()
 
 
-def test_the_recording_has_what_was_measured_and_simulated(written):
+def test_the_recording_has_what_was_measured_and_simulated(diagnosed):
+    written = diagnosed[0]
     found = columns(written / "recording.rrd")
     entities = {entity for entity, _ in found}
     simulated = ["simulated\\ as\\ given", "simulated\\ with\\ the\\ named\\ effects"]
@@ -94,11 +99,9 @@ def test_a_file_with_a_load_on_a_line_is_refused_before_flights_are_read(command
     assert "effects.slung_load" in said and "remove it" in said
 
 
-def test_what_is_read_is_not_written_over_and_flights_too_short_or_missing_are_refused(
-    tmp_path, capsys
-):
-    save_vehicle(PLAIN, tmp_path / "vehicle.toml")
+def test_an_input_that_would_be_written_over_and_too_few_flights_are_refused(tmp_path, capsys):
     own, out = tmp_path / "vehicle.toml", ("--out", tmp_path)
+    save_vehicle(PLAIN, own)
     said = refused(capsys, "diagnose --vehicle", own, tmp_path, *out)
     assert "vehicle.toml is also an input and would be overwritten" in said
     assert "none.csv" in refused(capsys, "diagnose --vehicle reference", tmp_path / "none.csv")
@@ -106,8 +109,13 @@ def test_what_is_read_is_not_written_over_and_flights_too_short_or_missing_are_r
     (tmp_path / "run.json").write_text(json.dumps(record))
     said = refused(capsys, "diagnose --vehicle reference", tmp_path, *out)
     assert "holds a run of another kind (made by suite loop)" in said
-    path = write_flight(tmp_path / "short.parquet", fly(PLAIN, 0, duration_s=1.2))
-    assert "1.3 s" in refused(capsys, "diagnose --vehicle reference", path)
+    logs, new = fly_all([PLAIN] * 2, range(2), duration_s=3.0, motors=True), tmp_path / "new"
+    short = write_flight(tmp_path / "short.parquet", rows(logs[0], logs[0].time_s < 1.2))
+    assert "1.3 s" in refused(capsys, "diagnose --vehicle reference", short)
+    one, other = (write_flight(tmp_path / f"{log.name}.parquet", log) for log in logs)
+    given = (one, "--reference", other, "--vehicle", own, "--out", new)
+    assert "at least 2" in refused(capsys, "diagnose", *given)
+    assert not (new / "diagnosis.json").exists()
 
 
 def test_logs_without_what_a_rollout_needs_are_diagnosed_by_views(log):
@@ -121,18 +129,17 @@ def test_logs_without_what_a_rollout_needs_are_diagnosed_by_views(log):
     assert not can_fly([replace(log, rotor_speed=None)], REMEMBERING)
 
 
-def test_a_change_is_written_as_every_diagnosis_is(tmp_path, capsys):
+def test_a_change_is_written_as_every_diagnosis_is(tmp_path, capsys, monkeypatch):
     save_vehicle(VEHICLE, tmp_path / "v.toml", "for a test")
     for folder, seed, effects in (("new", 8, {"mass_offset": (0.15,)}), ("old", 9, {})):
         (tmp_path / folder).mkdir()
         for number, log in enumerate(flights(2, seed, 4.0, 2.0, hidden=effects)):
             write_flight(tmp_path / folder / f"{number}.parquet", log)
-    words = ["diagnose", str(tmp_path / "new"), "--reference", str(tmp_path / "old"), "--plan",
-             "--drive", "motors", "--vehicle", str(tmp_path / "v.toml"),
-             "--out", str(tmp_path / "out")]  # fmt: skip
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out/recording.rrd").touch()
-    assert main([*words, "--json"]) == 0
+    monkeypatch.chdir(tmp_path)
+    Path("out").mkdir()
+    Path("out/recording.rrd").touch()
+    words = "diagnose new --reference old --plan --drive motors --vehicle v.toml --out out --json"
+    assert main(words.split()) == 0
     kept = {"diagnosis.json", "vehicle.toml", "report.html", "run.json"}
     assert {path.name for path in (tmp_path / "out").iterdir()} - {"plan"} == kept
     said = capsys.readouterr()
@@ -158,11 +165,100 @@ def test_a_change_is_written_as_every_diagnosis_is(tmp_path, capsys):
     assert load_vehicle(str(tmp_path / "out/vehicle.toml")).effects
 
 
-def test_a_single_reference_is_refused(tmp_path, capsys):
-    save_vehicle(VEHICLE, tmp_path / "v.toml", "for a test")
-    for number, log in enumerate(flights(2, duration_s=3.0)):
-        write_flight(tmp_path / f"{number}.parquet", log)
-    words = ("--reference", tmp_path / "1.parquet", "--vehicle", tmp_path / "v.toml")
-    said = refused(capsys, "diagnose --out", tmp_path / "out", tmp_path / "0.parquet", *words)
-    assert "at least 2" in said
-    assert not (tmp_path / "out" / "diagnosis.json").exists()
+LAGGED = with_lag(PLAIN, 0.03)
+SET = {"effects": [{"name": "rotor_drag", "alternatives": ["linear_drag"]}]}
+(DRAGS,) = planning.separations_of(["rotor_drag", "linear_drag"])
+
+
+def test_the_plan_is_for_the_sets_alone_and_comes_back_from_its_file(tmp_path):
+    ways, words = planning.trajectories_for(SET)
+    assert {way.kind for way in ways} == {way.kind for way in DRAGS.separating}
+    assert len(ways) == 2 * len(DRAGS.separating) and DRAGS.words in words[0]
+    alone = {"effects": [{"name": "rotor_drag", "alternatives": []}]}
+    assert planning.trajectories_for(alone) == ([], [])
+    assert planning.write_plan(tmp_path / "plan", [], [])["flights"] == []
+    assert not (tmp_path / "plan").exists()
+    ways = [Trajectory("punches", 3.0, speed=2.0), Trajectory("hover", 2.0, turn="sweep")]
+    plan, folder = planning.write_plan(tmp_path / "plan", ways, ["fly them"]), tmp_path / "plan"
+    written = json.loads((folder / "plan.json").read_text())
+    assert [Trajectory(**flight["trajectory"]) for flight in written["flights"]] == ways
+    table = np.loadtxt(folder / plan["flights"][0]["file"], delimiter=",", skiprows=1)
+    assert table.shape == (301, len(planning.COLUMNS))
+    wanted = ways[0].reference(table[:, 0])
+    np.testing.assert_allclose(table[:, 1:4], wanted.pos_w, atol=1e-5)
+    np.testing.assert_allclose(table[:, 4:7], wanted.vel_w, atol=1e-4)
+    fastest = np.linalg.norm(wanted.vel_w, axis=1).max()
+    assert plan["flights"][0]["top_speed"] == pytest.approx(fastest)
+
+
+def test_an_earlier_plan_goes_and_what_is_not_of_it_stays(tmp_path):
+    folder = tmp_path / "plan"
+    plan = planning.write_plan(folder, [Trajectory("hover", 3.0), Trajectory("punches", 3.0)], [])
+    own, outside, file = folder / "own.parquet", tmp_path / "outside.csv", folder / "plan.json"
+    own.write_bytes(b"a real flight")
+    outside.write_text("not the plan's to remove")
+    listed = json.loads(file.read_text())
+    listed["flights"][0]["file"] = "../outside.csv"
+    file.write_text(json.dumps(listed))
+    planning.write_plan(folder, [], [])
+    assert not file.exists() and not (folder / plan["flights"][1]["file"]).exists()
+    assert own.exists() and outside.exists()
+    file.write_text("[]")
+    assert planning.write_plan(folder, *planning.trajectories_for(SET))["flights"]
+
+
+@pytest.mark.slow
+def test_flying_the_plan_turns_the_set_into_a_name():
+    truth = with_effects(LAGGED, rotor_drag=(3e-5,))
+    rng = np.random.default_rng(5)
+
+    def flown(ways):
+        sensors, flights = simulate.SENSORS["estimator"], simulate.fly(LAGGED, truth, ways)
+        return [simulate.log_of(one, truth, sensors, rng, str(k)) for k, one in enumerate(flights)]
+
+    logs = flown([*DRAGS.blurred, *DRAGS.blurred])
+    found = diagnosis_json(diagnose(logs, LAGGED))
+    (effect,) = found["effects"]
+    assert {effect["name"], *effect["alternatives"]} >= {"rotor_drag", "linear_drag"}
+    ways, _ = planning.trajectories_for(found)
+    (effect,) = diagnosis_json(diagnose([*logs, *flown(ways)], LAGGED))["effects"]
+    assert (effect["name"], effect["alternatives"]) == ("rotor_drag", [])
+    low, high = effect["parameters"]["coefficient"]["ci95"]
+    assert low < 3e-5 < high
+
+
+def test_plans_name_catalogue_effects_and_end_in_flights():
+    for entry in planning.SEPARATIONS:
+        assert set(entry.pair) <= set(EFFECTS) and entry.pair[0] != entry.pair[1]
+        assert entry.separating and entry.blurred and entry.words
+    assert DRAGS.pair == ("linear_drag", "rotor_drag")
+    (wind,) = planning.separations_of(["frame_tilt", "constant_wind + linear_drag"])
+    assert wind.pair == ("constant_wind", "frame_tilt") and "two headings" in wind.words
+    # An unknown pair gets the flights that excite most.
+    assert planning.plan_for(["gusts", "inflow"])
+    words = planning.advice("linear_drag", "rotor_drag")
+    assert words.startswith("linear_drag from rotor_drag: ") and planning.OTHERWISE not in words
+    assert planning.OTHERWISE in planning.advice("inflow", "gyro_bias")
+
+
+FILES = sorted(example.FOLDER.glob("*.parquet"))
+
+
+def test_the_files_are_what_the_script_makes():
+    made = example.make_flights()
+    assert [path.stem for path in FILES] == [log.name for log in made]
+    for path, log in zip(FILES, made, strict=True):
+        kept = read_flight(path)
+        assert (kept.integrator, kept.step_s) == (log.integrator, log.step_s) == ("euler", 0.002)
+        for name, bits in example.BITS.items():
+            # Another machine's rounding may fall to the other side of a step.
+            both = getattr(kept, name), getattr(log, name)
+            np.testing.assert_allclose(*both, rtol=0, atol=1.01 * 2.0**-bits)
+    assert sum(path.stat().st_size for path in FILES) < 400_000
+
+
+def test_nothing_in_the_files_tells_what_is_hidden():
+    assert not set(example.HIDDEN) & set(load_vehicle(str(example.VEHICLE)).effects)
+    for path in FILES:
+        text = json.dumps(read_flight(path).about)
+        assert "com_offset" not in text and "battery" not in text

@@ -1,21 +1,33 @@
-"""What a loop's options come to, its stages, and what is refused before anything is written."""
+"""What a loop's options come to: its stages, what it refuses, measured flights, standings."""
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
+import numpy as np
 import pytest
 
+from eval.judging.statistics import bootstrap_mean
+from eval.logs.flight_log import read_flights, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from policies import shipped
 from suite.common.errors import WorkFailed
 from suite.common.stages import is_done
 from suite.common.usage import renamed
-from suite.loop import delta_action, hidden_effect, work
+from suite.delta.replay import nominal_model
+from suite.loop import delta_action, hidden_effect, measured, work
+from suite.loop.compare import policy_results
 from suite.loop.config import loop_by_content, resolve
+from suite.loop.hidden_effect import LABELS
+from suite.loop.tables import cell_grid, overall_grid
 from suite.loop.variants import DeltaModel, Variant
 from suite.loop.work import LoopRun, Quiet, plan
+from suite.train.config import PointMassConfig
 from tests.support import commands
+from tests.support.judged_cells import results_of
+from tests.support.point_mass_flights import fly
 from tests.support.vehicles import with_effects
 
 EXAMPLE = "examples/hidden.toml"
@@ -42,17 +54,13 @@ EXAMPLE = "examples/hidden.toml"
         ("--hidden-vehicle {0} --set quadrotor.mas_std=0", "Did you mean 'mass_std'"),
     ],
 )
-def test_what_cannot_be_used_is_said_before_anything_is_written(
-    line, words, tmp_path, root, capsys
-):
+def test_what_cannot_be_used_is_refused_before_any_writing(line, words, tmp_path, root, capsys):
     asked = f"loop {line.format(root / EXAMPLE)} --out"
     assert words in commands.refused(capsys, asked, tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 
-def test_a_copy_under_another_name_hides_nothing_and_a_load_on_a_line_may_be_hidden_only(
-    tmp_path, root
-):
+def test_a_copy_hides_nothing_and_a_load_on_a_line_may_be_hidden_only(tmp_path, root):
     copy = tmp_path / "copy.toml"
     text = (root / "eval" / "vehicles" / "racer5.toml").read_text(encoding="utf-8")
     copy.write_text(text.replace('name = "racer5"', 'name = "another"'), encoding="utf-8")
@@ -111,9 +119,8 @@ def test_where_files_lie_makes_no_other_loop(root, tmp_path):
     there.write_bytes(here.read_bytes())
     save_vehicle(with_effects(com_offset=((0.005, 0.0, 0.0),)), other)
     loops = [hidden_loop(hidden=path) for path in (here, there, other)]
-    assert loops[0] != loops[1]
-    contents = list(map(loop_by_content, loops))
-    assert contents[0] == contents[1] != contents[2]
+    one, same, another = map(loop_by_content, loops)
+    assert loops[0] != loops[1] and one == same != another
 
 
 def test_a_folder_called_like_something_shipped_makes_no_other_loop(tmp_path, monkeypatch):
@@ -171,20 +178,112 @@ def test_a_variant_is_two_stages_and_the_first_policy_is_trained_or_taken():
     assert run.policy(run.loop.variants[2]) == Path("out/tuned-with/policy")
     longer = Variant("longer", "judging another", "for longer", delta="other")
     variants, models = (*run.loop.variants, longer), (*run.loop.models, DeltaModel("other", ""))
-    more = plan(replace(run, loop=replace(run.loop, variants=variants, models=models)))
-    names = [stage.name for stage in more]
+    loop = replace(run.loop, variants=variants, models=models)
+    names = [stage.name for stage in plan(replace(run, loop=loop))]
     assert names.index("other") < names.index("tuned-longer") < names.index("eval-longer")
     assert len(names) == 9 + 3
 
 
 def test_flights_that_cannot_be_fitted_end_the_loop_with_advice(tmp_path, monkeypatch):
-    def none(*args):
-        raise ValueError("no window of 1.0 s in 3 flights")
-
-    monkeypatch.setattr(work, "fit_delta", none)
-    config = resolve(recipe="quick", trials=3)
-    run = LoopRun(delta_action.LOOP, config, tmp_path, Quiet())
+    error = ValueError("no window of 1.0 s in 3 flights")
+    monkeypatch.setattr(work, "fit_delta", Mock(side_effect=error))
+    run = LoopRun(delta_action.LOOP, resolve(recipe="quick", trials=3), tmp_path, Quiet())
     stage = next(stage for stage in plan(run) if stage.name == "delta")
     with pytest.raises(WorkFailed, match="no window.*--iterations"):
         stage.work(tmp_path / "delta")
     assert not is_done(tmp_path / "delta")
+
+
+def test_differences_are_of_the_same_trials_and_none_is_called_none():
+    results = results_of({"before": 10, "without": 20, "with": 30})
+    policies = policy_results(results, delta_action.REFERENCES)
+    assert [one.success.value for one in policies] == pytest.approx([0.25, 0.5, 0.75])
+    said = "75 % of 40 trials succeed: more than the same fine-tuning without it (50 %; difference"
+    assert said in delta_action.verdict(policies, 40)
+    equal = policy_results(dict.fromkeys(results, results["before"]), delta_action.REFERENCES)
+    assert "not significantly different from" in delta_action.verdict(equal, 40)
+    cell = overall_grid(equal, delta_action.REFERENCES, delta_action.LABELS, 40).rows[2][4]
+    assert cell.tone == "" and cell.text.startswith("+0 [")
+
+
+def test_bootstrap_of_a_mean_is_that_of_the_central_limit():
+    values = np.random.default_rng(3).exponential(2.0, 400)
+    found = bootstrap_mean(values)
+    assert found.value == pytest.approx(values.mean())
+    sides = np.array([found.high - found.value, found.value - found.low])
+    assert sides == pytest.approx(1.96 * values.std() / np.sqrt(len(values)), rel=0.1)
+    assert np.isnan(bootstrap_mean(np.array([]))).all()
+
+
+def test_standings_are_paired_by_trial():
+    won = {"nominal": 39, "before": 10, "control": 12, "delta": 20, "named": 36, "both": 40}
+    results, references = results_of(won), ("before", "control", "nominal")
+    stand = policy_results(results, references)
+    named = stand[4]
+    assert named.success.value == pytest.approx(0.9) and named.gates.value == pytest.approx(7.5)
+    assert [d.against for d in named.differences] == [*references]
+    assert named.differences[0].success.value == pytest.approx(26 / 40)
+    # 26 pairs, all one way: 2 / 2^26 by hand.
+    assert named.differences[0].p_value == pytest.approx(2 / 2**26)
+    assert named.by_cell["zigzag 0"].value == pytest.approx(18 / 20)
+    assert [d.against for d in stand[1].differences] == ["control", "nominal"]
+    grid = overall_grid(stand, references, LABELS, 40)
+    assert {len(row) for row in grid.rows} == {len(grid.headers)}
+    assert grid.rows[4][2].tone == "good" and grid.rows[1][2].text == ""
+    cells = cell_grid(stand, LABELS)
+    assert len(cells.rows) == 2 and cells.rows[0][5].text.startswith("90 [")
+    with pytest.raises(ValueError, match="same trials"):
+        policy_results({**results, "both": results["both"][::-1]}, ("before",))
+
+
+@pytest.fixture(scope="module")
+def logs():
+    flown = fly(nominal_model(PointMassConfig()), 3, seconds=4.0)
+    thrust = np.full_like(flown[0].time_s, 9.81)
+    return [replace(log, thrust_cmd=thrust, rate_cmd_b=log.rate_b) for log in flown]
+
+
+def test_ends_are_cut_and_noise_is_of_its_size(logs):
+    log = logs[0]
+    short = measured.cut_end(log, 0.5)
+    assert log.time_s[-1] - short.time_s[-1] == pytest.approx(0.5, abs=0.034)
+    assert len(short.pos_w) == len(short.extra["action_x"]) == len(short.time_s) < len(log.time_s)
+    shaken = measured.noisy(log, measured.Noise(), np.random.default_rng(0))
+    turn = np.einsum("nij,nik->njk", log.rot_w, shaken.rot_w)
+    angle = np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], -1)
+    assert angle.std() == pytest.approx(measured.Noise().attitude, rel=0.2)
+    assert (shaken.rate_b - log.rate_b).std() == pytest.approx(measured.Noise().gyro, rel=0.2)
+    np.testing.assert_allclose(np.linalg.norm(shaken.quat_wxyz, axis=1), 1, atol=1e-12)
+    np.testing.assert_array_equal(shaken.thrust_cmd, log.thrust_cmd)
+
+
+def test_crashed_flights_lose_their_end_and_short_ones_are_left_out(logs, tmp_path):
+    flights, out = tmp_path / "flights", tmp_path / "out"
+    rows = [{"file": None, "track": "zigzag", "difficulty": 0, "ended_by": "collision"}]
+    # The last is too short to be used.
+    flown = (*logs[:2], measured.cut_end(logs[2], logs[2].duration_s - 1.2))
+    for log, ended_by in zip(flown, ("collision", "timeout", "finished"), strict=True):
+        file = write_flight(flights / f"{ended_by}.parquet", log)
+        rows.append({**rows[0], "file": file.name, "ended_by": ended_by})
+    (flights / "flights.json").write_text(json.dumps({"flights": rows}))
+    files = measured.add_measurement_noise(flights, out, 0)
+    assert [file.name for file in files] == ["collision.parquet", "timeout.parquet"]
+    cut, whole = read_flights(files)[0]
+    lost_s = logs[0].duration_s - cut.duration_s
+    assert lost_s == pytest.approx(measured.CONTACT_MARGIN_S, abs=0.034)
+    assert whole.duration_s == logs[1].duration_s
+    noise = (whole.pos_w - logs[1].pos_w).std()
+    assert noise == pytest.approx(measured.Noise().pos, rel=0.2)
+    np.testing.assert_array_equal(whole.action_b, logs[1].action_b)
+    (flights / "flights.json").write_text(json.dumps({"flights": rows[:1]}))
+    with pytest.raises(ValueError, match="no flight in .* is 1.5 s long"):
+        measured.add_measurement_noise(flights, tmp_path / "none", 0)
+
+
+def test_the_diagnosis_gets_five_flights_or_as_many_as_are_long_enough(logs, tmp_path):
+    files = [tmp_path / f"{number}.parquet" for number in range(7)]
+    for file in files:
+        write_flight(file, logs[0])
+    assert measured.first_files(files, 1.0) == files[:5]
+    assert measured.first_files(files, 5.5 * logs[0].duration_s) == files[:6]
+    assert measured.first_files(files, 99.0 * logs[0].duration_s) == files

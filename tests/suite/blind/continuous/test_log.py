@@ -1,17 +1,155 @@
-"""What is logged: faults, noise of the stated size and colour, stamps, lost rows."""
+"""The engine of the blind cases apart from the model that fits, in time, and in what it logs."""
+
+from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import suite.blind.continuous
+from eval.flights.simulate import SENSORS
+from eval.flights.trajectory import Trajectory
+from suite.blind.continuous import timing
 from suite.blind.continuous.body import POS, QUAT, RATE, VEL, Battery
 from suite.blind.continuous.engine import fly
 from suite.blind.continuous.log import Noise, gauss_markov, log_of_flight, rotate_attitude, state_at
 from suite.blind.continuous.quadrotor import quadrotor_of
-from suite.blind.continuous.timing import Conditions, jittered_stamps, schedule
-from tests.support.vehicles import PLAIN, with_effects
+from suite.blind.continuous_flight import fly_continuous, with_loop_frequency
+from tests.suite.test_imports import imported
+from tests.support.vehicles import PLAIN, with_effects, with_lag
+
+FOLDER = Path(suite.blind.continuous.__file__).parent
+ALLOWED = ("suite.blind.continuous", "eval.vehicles.vehicle", "eval.logs.flight_log")
+"""What of the house the engine may know: its own folder, and the numbers of vehicles and logs."""
+WAYS = (
+    Trajectory("figure_eight", 0.4, speed=6.0, size=3.0, turn="wobble", height=0.5),
+    Trajectory("low", 0.4, speed=1.5, size=1.0, height=0.14),
+)
+
+
+def test_no_module_of_the_engine_imports_the_model_that_fits():
+    for path in FOLDER.glob("*.py"):
+        for name in imported(path):
+            if name.split(".")[0] in ("eval", "suite", "tracks", "policies"):
+                assert name.startswith(ALLOWED), f"{path.name} imports {name}"
+
+
+def stepped(nominal, truth, ways, conditions, step_s):
+    """Return flights with steps of at most `step_s`."""
+    rng = np.random.default_rng(3)
+    return fly_continuous(nominal, truth, ways, conditions, rng, step_s=step_s)
+
+
+@pytest.mark.parametrize("lag", [pytest.param(0.0, marks=pytest.mark.slow), 0.02])
+def test_a_finer_step_changes_a_flight_by_far_less_than_the_noise(lag):
+    drag = {"linear_drag": ((0.3, 0.2, 0.1),), "quadratic_drag": ((0.03, 0.02, 0.04),)}
+    air = {"inflow": (4e-4,), "ground_effect": (4.0, 0.0635), "blade_flapping": (1e-6,)}
+    rest = {"command_delay": (0.0123,), "battery_sag": (0.005, 0.0), "rotor_gyroscopic": (2e-5,)}
+    truth = with_effects(with_lag(PLAIN, lag), **drag, **air, **rest)
+    conditions = timing.Conditions(333.0, 97.0, 0.3, 0.0, 0.0, 0.0, 0.1)
+
+    coarse, fine = (stepped(PLAIN, truth, WAYS, conditions, step_s) for step_s in (1e-3, 5e-4))
+    rows, noise = coarse.schedule.block[:-1], SENSORS["full"]
+    assert len(rows) > 80
+    apart = np.abs(coarse.state[rows] - fine.state[fine.schedule.block[:-1]]).max(axis=(0, 1))
+    sizes = ((POS, noise.pos), (VEL, noise.vel), (QUAT, noise.attitude), (RATE, noise.gyro))
+    for part, size in sizes:
+        assert apart[part].max() < 1e-4 * size
+    assert np.abs(coarse.acc_b - fine.acc_b).max() < 1e-4 * noise.acc
+
+
+def test_the_error_falls_with_the_fourth_power_of_the_step():
+    # Without ticks in between: a loop as slow as the rows, so that steps are as long as allowed.
+    truth = with_lag(with_effects(quadratic_drag=((0.5, 0.4, 0.3),)), 0.02)
+    conditions = timing.Conditions(50.0, 50.0, 0.0, 0.0, 0.0, 0.0, 0.1)
+
+    slow = with_loop_frequency(PLAIN, 50.0)
+    runs = [stepped(slow, truth, WAYS[:1], conditions, step) for step in (2.5e-4, 4e-3, 2e-3)]
+    exact, coarse, fine = (run.state[-1, 0, VEL] for run in runs)
+    assert 12.0 < np.abs(coarse - exact).max() / np.abs(fine - exact).max() < 20.0
+
+
+STAMPS = np.array([[0.0], [0.007], [0.0125], [0.02]])
+
+
+def ticks(plan):
+    return plan.start_s[plan.is_tick[:, 0], 0]
+
+
+def test_the_loop_starts_its_period_anew_at_every_row():
+    plan = timing.schedule(STAMPS, 0.003, 0.0, step_s=0.001)
+    wanted = [0.0, 0.003, 0.006, 0.007, 0.010, 0.0125, 0.0155, 0.0185]
+    np.testing.assert_allclose(ticks(plan), wanted, atol=1e-12)
+    assert plan.length_s.max() <= 0.001 + 1e-9
+    ends = plan.start_s + plan.length_s
+    np.testing.assert_allclose(ends[:-1], plan.start_s[1:], atol=1e-12)
+    assert ends[-1, 0] == pytest.approx(0.02)
+
+
+def test_a_command_acts_from_its_stamp_on_and_a_late_one_inside_a_period():
+    at_once = timing.schedule(STAMPS, 0.003, 0.0)
+    row = np.searchsorted(STAMPS[:, 0], at_once.start_s[:, 0] + 1e-9, side="right") - 1
+    np.testing.assert_array_equal(at_once.acting[:, 0], row)
+    late = timing.schedule(STAMPS, 0.003, 0.0042)
+    changes = np.flatnonzero(np.diff(late.acting[:, 0])) + 1
+    np.testing.assert_allclose(late.start_s[changes, 0], [0.0042, 0.0112, 0.0167], atol=1e-12)
+    assert late.acting[0, 0] == -1 and not late.is_tick[changes, 0].any()
+    np.testing.assert_allclose(ticks(late), ticks(at_once), atol=1e-12)  # not moved by the delay
+
+
+def test_flights_side_by_side_keep_their_own_times():
+    rng = np.random.default_rng(2)
+    stamps = timing.jittered_stamps(rng, 3, -0.1, 0.4, 90.0, 0.3)
+    both = timing.schedule(stamps, 1 / 410.0, 0.013)
+    for flight in range(3):
+        alone = timing.schedule(stamps[:, flight : flight + 1], 1 / 410.0, 0.013)
+        moving = both.length_s[:, flight] > 0.0
+        assert not both.is_tick[~moving, flight].any(), "who waits does nothing"
+        for name in ("start_s", "length_s", "is_tick", "acting"):
+            beside = getattr(both, name)[moving, flight]
+            np.testing.assert_array_equal(beside, getattr(alone, name)[:, 0])
+        # Waiting at the end of a row, with the command that acted last.
+        idle = np.flatnonzero(~moving)
+        np.testing.assert_array_equal(both.acting[idle, flight], both.acting[idle - 1, flight])
+    np.testing.assert_array_equal(both.start_s[both.block[:-1]], stamps[:-1])
+
+
+def test_jitter_stays_within_its_share_of_a_row_but_for_the_first():
+    stamps = timing.jittered_stamps(np.random.default_rng(0), 4, -0.25, 5.0, 200.0, 0.3)
+    number = np.round(stamps * 200.0)
+    off = stamps * 200.0 - number
+    assert np.abs(off).max() <= 0.3 + 1e-9 and np.abs(off).max() > 0.29
+    np.testing.assert_array_equal(stamps[(number == 0).all(axis=1)], 0.0)
+    assert (np.diff(stamps, axis=0) > 0.4 / 200.0 - 1e-9).all()
+    assert stamps[0].max() < -0.24 and stamps[-1].min() > 5.0
+    assert np.std(off[:, 0] - off[:, 1]) > 0.1, "each flight has its own"
+    even = timing.jittered_stamps(np.random.default_rng(0), 2, 0.0, 1.0, 100.0, 0.0)
+    np.testing.assert_allclose(np.diff(even, axis=0), 0.01)
+
+
+def test_conditions_are_within_bounds_and_of_every_kind():
+    drawn = [timing.draw_conditions(np.random.default_rng(seed)) for seed in range(400)]
+    values = {name: np.array([asdict(c)[name] for c in drawn]) for name in asdict(drawn[0])}
+    for name, low, high in (
+        ("loop_hz", 200.0, 2000.0),
+        ("row_hz", 50.0, 1000.0),
+        ("jitter", 0.0, timing.JITTER),
+        ("clock_s", 0.0, timing.CLOCK_S),
+        ("dropped", 0.0, timing.DROPPED),
+        ("colour_s", *timing.COLOUR_S),
+    ):
+        assert low <= values[name].min() and values[name].max() <= high, name
+        assert values[name].min() < low + 0.1 * (high - low), name
+        assert values[name].max() > high - 0.1 * (high - low), name
+    assert timing.JITTER == 0.3 and timing.CLOCK_S == 1e-4
+    assert (values["row_hz"] <= values["loop_hz"]).all()
+    assert 0.4 < (values["coloured"] > 0.0).mean() < 0.6
+    assert 0.1 < (values["jitter"] == 0.0).mean() < 0.3
+    assert timing.draw_conditions(np.random.default_rng(7)) == drawn[7]
+
 
 NOISE = Noise(100.0, 0.002, 0.003, 0.02, 0.03, 0.3, 5.0, 0.02, 0.0)
-EVEN = Conditions(500.0, 200.0, 0.0, 0.0, 0.0, 0.0, 0.1)
+EVEN = timing.Conditions(500.0, 200.0, 0.0, 0.0, 0.0, 0.0, 0.1)
 
 
 def pilot(seen):
@@ -23,13 +161,13 @@ def pilot(seen):
 def fly_at(stamps, **step):
     start = np.zeros((1, 13))
     start[0, POS], start[0, VEL], start[0, QUAT] = [0, 0, 9], [2, 1, 0], [1, 0, 0, 0]
-    plan, battery = schedule(stamps, 0.002, 0.0, **step), Battery(16, 0.1, 0.3)
+    plan, battery = timing.schedule(stamps, 0.002, 0.0, **step), Battery(16, 0.1, 0.3)
     return fly(quadrotor_of(PLAIN), plan, start, pilot, np.random.default_rng(0), battery)
 
 
 @pytest.fixture(scope="module")
 def flown():
-    stamps = jittered_stamps(np.random.default_rng(1), 1, -0.1, 4.1, 200.0, 0.3)
+    stamps = timing.jittered_stamps(np.random.default_rng(1), 1, -0.1, 4.1, 200.0, 0.3)
     return fly_at(stamps)
 
 
@@ -53,11 +191,10 @@ def test_without_noise_rows_are_the_states_at_their_stamps(flown):
 
 
 def test_biases_are_added_and_the_flight_is_the_same(flown):
-    plain, off = logged(flown), logged(
-        flown, gyro_bias=((0.1, -0.2, 0.3),), accelerometer_bias=((1.0, 2.0, -3.0),)
-    )  # fmt: skip
-    np.testing.assert_allclose(off.rate_b - plain.rate_b, [[0.1, -0.2, 0.3]] * len(plain.time_s))
-    np.testing.assert_allclose(off.acc_b - plain.acc_b, [[1.0, 2.0, -3.0]] * len(plain.time_s))
+    gyro, acc = (0.1, -0.2, 0.3), (1.0, 2.0, -3.0)
+    plain, off = logged(flown), logged(flown, gyro_bias=(gyro,), accelerometer_bias=(acc,))
+    np.testing.assert_allclose(off.rate_b - plain.rate_b, [gyro] * len(plain.time_s))
+    np.testing.assert_allclose(off.acc_b - plain.acc_b, [acc] * len(plain.time_s))
     np.testing.assert_array_equal(off.pos_w, plain.pos_w)
 
 
@@ -72,9 +209,8 @@ def test_a_clock_offset_logs_poses_of_another_moment_and_the_rest_of_now(flown, 
     shift = (late.pos_w - plain.pos_w + offset * plain.vel_w)[10:-10]
     acceleration = np.gradient(plain.vel_w, plain.time_s, axis=0)[10:-10]
     np.testing.assert_allclose(shift, 0.5 * offset**2 * acceleration, atol=2e-5)
-    np.testing.assert_allclose(
-        (late.vel_w - plain.vel_w)[10:-10], -offset * acceleration, atol=5e-3
-    )
+    change = (late.vel_w - plain.vel_w)[10:-10]
+    np.testing.assert_allclose(change, -offset * acceleration, atol=5e-3)
 
 
 def test_states_between_the_ends_of_steps_are_those_of_a_finer_flight():
@@ -101,8 +237,7 @@ def test_noise_has_the_density_of_the_table_whatever_the_rate(flown):
 
 
 def test_coloured_noise_is_as_slow_as_stated_and_leaves_the_gyro_white(flown):
-    coloured = Conditions(500.0, 200.0, 0.0, 0.0, 0.0, 0.9, 0.05)
-    twin = logged(flown)
+    coloured, twin = timing.Conditions(500.0, 200.0, 0.0, 0.0, 0.0, 0.9, 0.05), logged(flown)
     draws = [logged(flown, np.random.default_rng(seed), coloured) for seed in range(20)]
     off = np.array([draw.pos_w - twin.pos_w for draw in draws])
     # White 0.1 of 2 x 0.002^2; coloured 0.002^2 x 0.9 / (2 x 0.05 x 100).
@@ -116,7 +251,7 @@ def test_coloured_noise_is_as_slow_as_stated_and_leaves_the_gyro_white(flown):
 
 
 def test_rows_are_dropped_with_their_commands_and_stamps_are_off_by_at_most_the_clock(flown):
-    conditions = Conditions(500.0, 200.0, 0.3, 1e-4, 0.05, 0.0, 0.1)
+    conditions = timing.Conditions(500.0, 200.0, 0.3, 1e-4, 0.05, 0.0, 0.1)
     log, all_rows = logged(flown, np.random.default_rng(4), conditions), logged(flown)
     near = np.abs(log.time_s[:, None] - all_rows.time_s).argmin(axis=1)
     off = log.time_s - all_rows.time_s[near]
@@ -126,11 +261,8 @@ def test_rows_are_dropped_with_their_commands_and_stamps_are_off_by_at_most_the_
     assert (np.diff(log.time_s) > 0.0).all() and np.isfinite(log.pos_w).all()
 
 
-def test_poses_are_lost_in_stretches_of_three_and_a_channel_that_is_not_measured_is_not_there(
-    flown,
-):
-    lossy = NOISE._replace(lost=0.06)
-    log = logged(flown, np.random.default_rng(4), noise=lossy)
+def test_poses_are_lost_in_threes_and_a_channel_that_is_not_measured_is_not_there(flown):
+    log = logged(flown, np.random.default_rng(4), noise=NOISE._replace(lost=0.06))
     gone = np.isnan(log.pos_w[:, 0])
     np.testing.assert_array_equal(gone, np.isnan(log.quat_wxyz[:, 0]))
     assert 0.03 < gone.mean() < 0.09 and np.isfinite(log.rate_b).all()

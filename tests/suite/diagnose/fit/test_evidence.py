@@ -68,8 +68,8 @@ class ThermometerSource(Source):
 
     def gap(self, found, theta):
         error = self.held.linearise(Estimate(theta, np.zeros((0, 0)))).residual
-        rms = float(np.sqrt((error**2).mean()))
         power = (error**2).mean(axis=1)
+        rms = float(np.sqrt(power.mean()))
         return Gap(power, power, {self.name: {"air": Channel(rms, 1.0)}}, 1.0)
 
     def remaining(self, found, gaps, seed):

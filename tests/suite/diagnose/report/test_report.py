@@ -1,4 +1,4 @@
-"""A diagnosis as JSON, tables and charts: what they show is what was found."""
+"""A diagnosis as JSON, tables and charts, and the first screen of its report."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -14,31 +14,25 @@ from suite.diagnose import run
 from suite.diagnose.config import Config
 from suite.diagnose.estimate.parameters import Candidate, make_space
 from suite.diagnose.evidence.moments import centred
-from suite.diagnose.report import charts, sections
+from suite.diagnose.identify.run import is_identified
+from suite.diagnose.report import charts, sections, summary
+from suite.diagnose.report import diagnosis_json as as_json
 from suite.diagnose.report.charts import series_chart
-from suite.diagnose.report.diagnosis_json import (
-    actuators_json,
-    diagnosis_json,
-    not_examined,
-    parameters_json,
-)
 from suite.diagnose.report.page import channels_grid, page
-from suite.diagnose.report.summary import NOT_IDENTIFIABLE, answer, components, in_digits
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.verdict.actuators import actuator_mismatches
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN
 from tracks.common.files import plain
-from tracks.common.grid import Grid
 
 
 @pytest.fixture(scope="module")
 def found(drag, flown):
     mismatches = actuator_mismatches(flown.logs, flown.vehicle)
-    return plain({**diagnosis_json(drag), "actuators": actuators_json(mismatches)})
+    return plain({**as_json.diagnosis_json(drag), "actuators": as_json.actuators_json(mismatches)})
 
 
-def texts(table):
+def texts(table: Any):
     return [[cell.text for cell in row] for row in table.rows]
 
 
@@ -54,35 +48,36 @@ def test_the_json_has_what_was_found(drag, found):
     assert found["verdict"] == drag.label and found["driven_by"] == "commands"
     (effect,) = found["effects"]
     assert effect["name"] == "linear_drag" and effect["gap_removed"] > 0.9
-    value = np.array(effect["parameters"]["coefficient"]["value"])
-    np.testing.assert_allclose(value, drag.main.theta[drag.main.search.indices])
-    low, high = np.array(effect["parameters"]["coefficient"]["ci95"]).T
+    coefficient, named = effect["parameters"]["coefficient"], drag.main.search.indices
+    np.testing.assert_allclose(coefficient["value"], drag.main.theta[named])
+    low, high = np.array(coefficient["ci95"]).T
     assert np.all(np.abs([0.15, 0.15, 0.05] - (low + high) / 2) < high - low)
     assert found["control"]["after"] > 1.5 * found["gap"]["after"]
     assert found["gap"]["channels"]["1 s"]["velocity"]["noise_floor"] > 0.0
 
 
 def test_each_view_names_its_own_effect_and_the_page_has_its_headline_first(by_views):
-    found = plain(diagnosis_json(by_views))
+    found = plain(as_json.diagnosis_json(by_views))
     effects = {effect["name"]: effect for effect in found["effects"]}
     drag = effects.pop("linear_drag")
-    assert drag["view"] == "force" and 0.0 < drag["gap_removed"] <= 1.0
-    span = drag["parameters"]["coefficient"]["ci95"][0]
-    assert span[0] < 0.4 < span[1]
+    low, high = drag["parameters"]["coefficient"]["ci95"][0]
+    assert drag["view"] == "force" and 0.0 < drag["gap_removed"] <= 1.0 and low < 0.4 < high
     assert effects and all(effect["view"] == "torque" for effect in effects.values())
     assert set(found["gap"]["channels"]["force"]) == {"x", "y", "z"}
-    main = found["gap"]["channels"][by_views.main.source.name]
-    whole = sum(axis["before"] ** 2 for axis in main.values()) ** 0.5
-    assert found["gap"]["before"] == pytest.approx(whole, rel=1e-9)
-    assert found["headline"].startswith(answer(found)) and "linear_drag" in answer(found)
+    assert found["headline"].startswith(summary.answer(found)) and "linear_drag" in summary.answer(
+        found
+    )
     text = html(page(by_views, found, "mass = 1", {"vehicle.toml"}))
     assert text.index(found["headline"][:40]) < text.index("data:image/png") < text.index("<table")
     assert "What was written" in text and "mass = 1" in text and "black box" in text
 
 
 def test_numbers_of_views_are_those_that_are_judged_and_the_rest_has_its_reason(by_views):
-    main, found = by_views.main, plain(diagnosis_json(by_views))
+    main, found = by_views.main, plain(as_json.diagnosis_json(by_views))
     gap, rest = found["gap"], found["unexplained"]
+    axes = gap["channels"][main.source.name].values()
+    whole = sum(axis["before"] ** 2 for axis in axes) ** 0.5
+    assert gap["before"] == pytest.approx(whole, rel=1e-9)
     # The error is that within flights; their constant offsets are apart.
     for name, theta in (("before", main.search.start.theta), ("after", main.theta)):
         data = main.source.held.residuals(theta)
@@ -94,27 +89,25 @@ def test_numbers_of_views_are_those_that_are_judged_and_the_rest_has_its_reason(
     # Share, table and reasons agree with the error and the noise floor.
     left = (gap["after"] - gap["noise_floor"]) / (gap["before"] - gap["noise_floor"])
     assert rest["share"] == pytest.approx(left) and rest["judged"] == by_views.verdict.share_left
-    held = sections.evidence_section(by_views, found).parts[-1]
-    assert isinstance(held, Grid) and texts(held)[-1][3] == f"{100 * (1 - left):.0f} %"
-    above = {one["view"] for one in rest["above_noise"]}
-    assert above == {
-        one.source.name for one in by_views.findings if one.after.rms > 1.5 * one.after.floor
-    }
+    held = texts(sections.evidence_section(by_views, found).parts[-1])
+    assert held[-1][3] == f"{100 * (1 - left):.0f} %"
+    above = [one.source.name for one in by_views.findings if one.after.rms > 1.5 * one.after.floor]
+    assert {one["view"] for one in rest["above_noise"]} == set(above)
     loud = {**rest, "where": None, "above_noise": [
         {"view": "torque", "error": 4.78, "noise_floor": 0.15, "unit": "rad/s^2",
          "reason": "that logged signals hardly predict"}]}  # fmt: skip
     words, table = sections.residual_section({**found, "unexplained": loud}).parts[:2]
     assert words == "Above the noise floor remains an error that logged signals hardly predict."
-    assert isinstance(table, Grid) and texts(table)[0][:3] == ["torque", "4.78 rad/s²", "0.15"]
+    assert texts(table)[0][:3] == ["torque", "4.78 rad/s²", "0.15"]
 
 
 def test_parts_of_the_dynamics_that_no_source_tests_are_listed(
     by_views, drag, monkeypatch, capsys, tmp_path
 ):
-    assert not_examined(drag) == []
-    assert not_examined(by_views) == ["rate loop"]
+    assert as_json.not_examined(drag) == []
+    assert as_json.not_examined(by_views) == ["rate loop"]
     force = replace(by_views, findings=by_views.findings[:1])
-    found = plain(diagnosis_json(force))
+    found = plain(as_json.diagnosis_json(force))
     assert found["not_examined"] == ["torque", "rate loop"] and found["verdict"] == "named"
     assert "torque, rate loop" in html(page(force, found, "", set()))
     # The console prints them under each verdict.
@@ -127,43 +120,44 @@ def test_parts_of_the_dynamics_that_no_source_tests_are_listed(
 def test_components_are_named_by_axis_and_shown_in_digits_that_the_interval_supports():
     entry = {"value": [0.012, 0.0004, None], "ci95": [[0.0119, 0.0121], [-0.001, 0.0018], None],
              "unit": "m"}  # fmt: skip
-    x, y, z = components({"name": "com_offset", "parameters": {"offset": entry}})
+    x, y, z = summary.components({"name": "com_offset", "parameters": {"offset": entry}})
     assert (x.label, x.texts()) == ("offset x [m]", ("0.01200", "0.01190 to 0.01210"))
     assert x.is_significant and not y.is_significant and not z.is_significant
     assert y.texts() == ("not different from 0", "-0.0010 to 0.0018")
-    assert z.texts() == (NOT_IDENTIFIABLE, "")
+    assert z.texts() == (summary.NOT_IDENTIFIABLE, "")
     small = {"value": 1.21e-6, "ci95": [1.1e-6, 1.3e-6], "unit": "kg/rad"}
-    (only,) = components({"name": "rotor_drag", "parameters": {"coefficient": small}})
+    (only,) = summary.components({"name": "rotor_drag", "parameters": {"coefficient": small}})
     assert only.texts() == ("1.21e-06", "1.10e-06 to 1.30e-06")
-    assert in_digits(1234.56, (1234.56, 1200.0, 1270.0)) == "1235"
+    assert summary.in_digits(1234.56, (1234.56, 1200.0, 1270.0)) == "1235"
 
 
 def test_a_weak_motor_has_its_number_and_the_motors_that_it_may_be():
     space = make_space(PLAIN)
     at = [i for i, entry in enumerate(space.entries) if entry.effect == "weak_motor"]
     theta, width = space.array("start"), dict.fromkeys(at, 0.01)
-    unsure = parameters_json(space, "weak_motor", [at[1]], theta, width, undecided=[at[2]])
+    unsure = as_json.parameters_json(space, "weak_motor", [at[1]], theta, width, undecided=[at[2]])
     assert (unsure["index"]["value"], unsure["index"]["ci95"]) == (2, [2, 3])
-    several = parameters_json(space, "weak_motor", [at[1], at[3]], theta, width)
+    several = as_json.parameters_json(space, "weak_motor", [at[1], at[3]], theta, width)
     assert several["index"] == {"value": [2, 4], "unit": "1", "ci95": [[2, 2], [4, 4]]}
-    labels = [one.label for one in components({"name": "weak_motor", "parameters": several})]
+    labels = [
+        one.label for one in summary.components({"name": "weak_motor", "parameters": several})
+    ]
     assert labels == ["scale 2 [1]", "scale 4 [1]"]
 
 
 def test_sections_show_the_numbers(drag, found):
-    noise = sections.noise_section(drag).parts[1]
-    assert isinstance(noise, Grid) and texts(noise)[0][0] == "position [m]"
+    assert texts(sections.noise_section(drag).parts[1])[0][0] == "position [m]"
     assert len(sections.actuators_section(found)) == 1
     assert sections.actuators_section({**found, "actuators": []}) == []
     rest = {**found, "unexplained": {"where": "a shape", "share": 0.25, "above_noise": []}}
     words = str(sections.residual_section(rest).parts[0])
     assert words.startswith("25 % of the error of rollouts") and words.endswith(": a shape.")
     assert "No structure beyond" in str(sections.residual_section(found).parts[0])
-    held = sections.evidence_section(drag, found).parts[-1]
-    assert isinstance(held, Grid) and texts(held)[-1][0] == "with the named effects"
-    tried = sections.candidates_section(drag).parts[0]
-    assert isinstance(tried, Grid) and len(tried.rows) > 10
-    assert [row[0] for row in texts(tried) if row[3] == "named"] == ["linear_drag"]
+    assert (
+        texts(sections.evidence_section(drag, found).parts[-1])[-1][0] == "with the named effects"
+    )
+    tried = texts(sections.candidates_section(drag).parts[0])
+    assert len(tried) > 10 and [row[0] for row in tried if row[3] == "named"] == ["linear_drag"]
     # A channel that no log measured is not in the table.
     none = {"before": 0.0, "after": 0.0, "noise_floor": 1e-12}
     every = found["gap"]["channels"].items()
@@ -180,9 +174,102 @@ def test_a_log_is_shown_with_duration_rate_holes_and_signals():
 
 
 def test_the_chart_shows_measured_next_to_simulated(drag, monkeypatch):
-    main = drag.main
-    series = main.source.series(main.search)
+    series = drag.main.source.series(drag.main.search)
     monkeypatch.setattr(charts, "png", lambda figure: figure.axes[0])
     axes: Any = series_chart(series)
     labels = [line.get_label() for line in axes.lines if not line.get_label().startswith("_")]
     assert labels == ["measured", *series.simulated] and len(series.simulated) == 2
+
+
+DRAG = {
+    "name": "linear_drag",
+    "alternatives": ["rotor_drag"],
+    "parameters": {"coefficient": {"value": [0.31, 0.302, 0.01], "unit": "1/s",
+                                   "ci95": [[0.3, 0.32], [0.29, 0.31], [-0.01, 0.03]]}},
+    "size": {"force": 0.8, "torque": 0.0, "drift": 0.4},
+}  # fmt: skip
+
+
+def entries(verdict, effects=(), where=None, **more):
+    base = {"verdict": verdict, "effects": list(effects), "reference": [], "negligible": []}
+    base |= {"unexplained": {"where": where, "above_noise": []}, "identified": False}
+    advice = ["linear_drag from rotor_drag: bob up and down on a circle"]
+    base["separate_with"] = advice if effects else []
+    return {**base, **more}
+
+
+def test_an_answer_has_the_effect_its_values_and_its_size_or_what_is_too_small():
+    assert summary.answer(entries("named", [DRAG])) == (
+        "Wrong or missing in the vehicle file: Drag proportional to the airspeed (linear_drag or "
+        "rotor_drag): coefficient x 0.31 1/s, coefficient y 0.302 1/s. On these flights it causes "
+        "0.8 m/s² and 0.4 m after one second (RMS). This explains the gap between simulation and "
+        "flights."
+    )
+    by_force = {**DRAG, "size": {**DRAG["size"], "drift": None}}
+    partly = summary.answer(entries("partly", [by_force]))
+    assert "causes 0.8 m/s² (RMS). This explains a part" in partly
+    changed = summary.answer(entries("named", [DRAG], reference=["a"]))
+    assert "has changed since the reference" in changed
+    small = entries("no_gap", negligible=[{"name": "torque_trim"}])
+    assert summary.answer(small).endswith("Significant but too small to matter: torque_trim.")
+
+
+def measured(verdict, after, effects=(), reason=None, floor=0.15, offset=7.9, **more):
+    gap = {"of": "error of the torque", "unit": "rad/s^2", "before": 17.3, "after": after}
+    gap |= {"noise_floor": floor, "offset": {"torque": {"after": offset, "unit": "rad/s^2"}}}
+    rest = [{"reason": reason}] if reason else []
+    more |= {"relevance": {"torque": 0.5}, "unexplained": {"where": None, "above_noise": rest}}
+    return summary.headline(entries(verdict, effects, gap=gap, **more))
+
+
+def test_a_headline_states_the_floor_the_errors_that_remain_and_offsets_that_do_not_count():
+    text = measured("named", 4.78, [DRAG], "that logged signals hardly predict")
+    assert text.endswith(
+        "This explains the gap between simulation and flights, except for an error that logged "
+        "signals hardly predict. On held-out flights the error of the torque falls from 17.3 to "
+        "4.78 rad/s² (noise floor 0.15). A constant offset of each flight remains, which does not "
+        "count as a gap: 7.9 rad/s² (torque)."
+    )
+    # An offset below the threshold of relevance does not matter.
+    assert "offset" not in measured("named", 0.16, [DRAG], offset=0.4)
+    none = measured("no_gap", 17.3, (), "that is too small to matter", offset=0.4)
+    assert none == (
+        "Simulation and flights agree, except for an error that is too small to matter. On "
+        "held-out flights the error of the torque is 17.3 rad/s² (noise floor 0.15)."
+    )
+    assert "within the measurement noise." in measured("no_gap", 17.3)
+    assert "error" not in summary.answer(entries("no_gap", reference=["a"]))
+    # The unit of rollouts is the noise floor.
+    assert "floor" not in measured("unknown", 17.3, floor=1.0)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "words"),
+    [
+        ("named", ["vehicle.toml", "do not separate linear_drag, rotor_drag", "expect no_gap"]),
+        ("partly", ["approximate", "do not separate", "suite check", "Remaining error"]),
+        ("unknown", ["suite check", "suite identify", "Remaining error", "suite delta"]),
+    ],
+)
+def test_every_verdict_says_what_to_do_next(verdict, words):
+    effects = [] if verdict == "unknown" else [DRAG]
+    steps = summary.next_steps(entries(verdict, effects, where="a swing at 1 Hz"))
+    assert all(word in step for word, step in zip(words, steps, strict=True))
+    assert " ".join(steps).count("bob up and down") == len(effects)
+
+
+def test_a_file_of_suite_identify_is_not_sent_back_to_it(tmp_path):
+    path, written = tmp_path / "mine.toml", "# From racer5 by suite identify, 2 flights (motors)\n"
+    path.write_text(written + 'name = "mine"\n')
+    assert is_identified(str(path)) and not is_identified("racer5")
+    path.write_text('name = "by suite identify"\n')
+    assert not is_identified(str(path))
+    steps = summary.next_steps(entries("unknown", identified=True))
+    assert "repeat it if the vehicle has changed" in steps[1]
+
+
+@pytest.mark.parametrize("verdict", ["no_gap", "named", "partly"])
+def test_after_a_search_for_a_change_the_file_itself_counts_as_untested(verdict):
+    steps = summary.next_steps(entries(verdict, [DRAG], reference=["old"]))
+    assert "was not tested: for that, leave out --reference" in steps[0]
+    assert "as it is" not in steps[0]

@@ -1,25 +1,23 @@
-"""The verdict and its reasons: gaps, structure in the remaining error, and wind."""
+"""The verdict and its reasons: what counts, what held-out flights confirm, what remains."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from suite.diagnose.data.windows import STATE
-from suite.diagnose.diagnose import Verdict, deciding, verdict_on
+from suite.diagnose.data.windows import SLICES, STATE
+from suite.diagnose.diagnose import Verdict, verdict_on
+from suite.diagnose.search.evaluation import NamedEffect
+from suite.diagnose.sources.examine import confirmed, relevant_part
 from suite.diagnose.sources.rollout_source import of_rollouts, structure_where
-from suite.diagnose.sources.source import Remaining
+from suite.diagnose.sources.source import TOO_SMALL, Remaining, sizes_by_effect
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.verdict import gap as gaps
+from suite.diagnose.verdict import residual_structure as structure
 from suite.diagnose.verdict.disturbances import Swing, _likelihood, _range_of, find_turbulence
-from suite.diagnose.verdict.gap import Gap, from_true_starts, gap_of, noise_floor, remaining_share
-from suite.diagnose.verdict.residual_structure import (
-    AXES,
-    DisturbanceEquations,
-    ResidualStructure,
-    ShapeScore,
-    disturbance_equations,
-    residual_structure,
-)
+from suite.diagnose.verdict.model_error import beyond_error
 
 
 def slow_errors(size=1.0):
@@ -30,51 +28,48 @@ def slow_errors(size=1.0):
 
 
 def left(p_value=0.5, coloured=0.5):
-    shapes = [ShapeScore("force with the speed", 1.0, p_value, ())]
-    return ResidualStructure(shapes, dict.fromkeys(AXES, coloured))
+    shapes = [structure.ShapeScore("force with the speed", 1.0, p_value, ())]
+    return structure.ResidualStructure(shapes, dict.fromkeys(structure.AXES, coloured))
 
 
-def finding(drag, named=True, **remaining):
-    """Return the finding of the shared diagnosis with another remaining error."""
-    left = Remaining(**{"structured": False, "share": 0.0, **remaining})
-    names = drag.main.names if named else ()
-    return replace(drag.main, names=names, remaining=left)
+SWING = Swing(1.4, (1.3, 1.5), 0.5, 1e-6)
+SWUNG = Verdict("partly", 0.1, SWING.words)
+SPEED = {"structured": True, "where": "the speed"}
+TORQUE = {"structured": True, "where": "torque y"}
+BELOW = {"share": 0.8, "explainable": 0.9, "where": "force x"}
+"""A large share of a small unexplained error, which decides nothing and is no reason."""
 
 
-def test_one_place_decides_by_names_structure_and_share(drag):
-    def label(named, tested=False, **remaining):
-        one = finding(drag, named, **remaining)
-        return verdict_on([one], named or tested, THRESHOLDS).label
-
-    some = {"structured": True, "where": "the speed"}
-    assert label(False) == "no_gap" and label(True) == "named"
-    assert label(False, tested=True) == "named", "a wind or a lag is a name as well"
-    assert label(True, share=0.3, **some) == "partly"
-    assert label(True, share=0.9, **some) == label(False, share=1.0, **some) == "unknown"
-
-
-def test_sources_that_name_something_are_judged_and_a_swing_always_remains(drag):
-    some = finding(drag, share=0.1)
-    bare = finding(drag, False, structured=True, share=0.8, where="torque x")
-    assert verdict_on([some, bare], True, THRESHOLDS) == Verdict("named", 0.1)
-    assert verdict_on([bare], False, THRESHOLDS) == Verdict("unknown", 0.8, "torque x")
-    swing = Swing(1.4, (1.3, 1.5), 0.5, 1e-6)
-    verdict = verdict_on([finding(drag, share=0.1, swing=swing)], True, THRESHOLDS)
-    assert verdict.label == "partly" and verdict.where == swing.words
-
-
-def test_only_an_error_above_the_noise_decides(drag):
-    """A large share of a small unexplained error decides nothing, and is no reason."""
-    noisy = finding(drag, share=0.8, explainable=0.9, where="force x")
-    clear = finding(drag, structured=True, share=0.2, where="torque y")
-    assert verdict_on([noisy, clear], True, THRESHOLDS) == Verdict("partly", 0.2, "torque y")
-    wrong = finding(drag, structured=True, share=0.8, where="torque y")
-    right = finding(drag, share=0.02, explainable=0.9, where="force x")
-    assert verdict_on([right, wrong], True, THRESHOLDS) == Verdict("unknown", 0.8, "torque y")
-    assert deciding([right, wrong]) == [wrong] and deciding([right]) == [right]
-    swing = Swing(1.4, (1.3, 1.5), 0.5, 1e-6)
-    verdict = verdict_on([finding(drag, share=0.1, swing=swing, where="z")], True, THRESHOLDS)
-    assert verdict.where == swing.words
+@pytest.mark.parametrize(
+    ("named", "remaining", "verdict"),
+    [
+        ([False], [{}], Verdict("no_gap", 0.0)),
+        ([True], [{}], Verdict("named", 0.0)),
+        ([True], [{"share": 0.3, **SPEED}], Verdict("partly", 0.3, "the speed")),
+        ([True], [{"share": 0.9, **SPEED}], Verdict("unknown", 0.9, "the speed")),
+        ([False], [{"share": 1.0, **SPEED}], Verdict("unknown", 1.0, "the speed")),
+        # Sources that name something are judged, and a swing always remains.
+        ([True, False], [{"share": 0.1}, {"share": 0.8, **TORQUE}], Verdict("named", 0.1)),
+        ([True], [{"share": 0.1, "swing": SWING}], SWUNG),
+        (
+            [True],
+            [{"share": 0.1, "swing": SWING, "where": "z"}],
+            Verdict("partly", 0.1, SWING.words),
+        ),
+        # Only an error above the noise decides.
+        ([True] * 2, [BELOW, {"share": 0.2, **TORQUE}], Verdict("partly", 0.2, "torque y")),
+        ([True] * 2, [BELOW, {"share": 0.8, **TORQUE}], Verdict("unknown", 0.8, "torque y")),
+    ],
+)
+def test_one_place_decides_by_names_structure_and_share(drag, named, remaining, verdict):
+    names = [drag.main.names if one else () for one in named]
+    left = [Remaining(**{"structured": False, "share": 0.0, **one}) for one in remaining]
+    pairs = zip(names, left, strict=True)
+    findings = [replace(drag.main, names=one, remaining=rest) for one, rest in pairs]
+    assert verdict_on(findings, any(named), THRESHOLDS) == verdict
+    # A wind or a lag is a name as well.
+    label = "named" if verdict.label == "no_gap" else verdict.label
+    assert verdict_on(findings, True, THRESHOLDS).label == label
 
 
 def test_structure_is_a_shape_a_colour_or_the_largest_channel():
@@ -90,13 +85,13 @@ def test_structure_is_a_shape_a_colour_or_the_largest_channel():
 
 
 def test_a_gap_has_its_interval_its_noise_floor_and_the_share_that_remains_of_it():
-    before, after, none = (Gap(np.full(8, 1.0 + above), np.zeros(8), {}) for above in (24, 6, -0.1))
+    none = np.zeros(8)
+    before, after, small = (gaps.Gap(none + score, none, {}) for score in (25.0, 7.0, 0.9))
     assert (before.rms, after.rms) == (5.0, pytest.approx(np.sqrt(7.0)))
-    assert remaining_share(before, after) == pytest.approx((7**0.5 - 1.0) / 4.0)
-    assert remaining_share(after, before) == 1.0 and remaining_share(before, none) == 0.0
-    rng = np.random.default_rng(0)
-    energies = rng.chisquare(10, 80), rng.chisquare(10, 80) + 8.0
-    before, after = (Gap(energy / 10.0, energy, {}) for energy in energies)
+    assert gaps.remaining_share(before, after) == pytest.approx((7**0.5 - 1.0) / 4.0)
+    assert gaps.remaining_share(after, before) == 1.0 and gaps.remaining_share(before, small) == 0.0
+    energies = np.random.default_rng(0).chisquare(10, (2, 80)) + [[0.0], [8.0]]
+    before, after = (gaps.Gap(energy / 10.0, energy, {}) for energy in energies)
     low, high = before.ci95(0)
     assert low < before.rms < high and high - low < 0.3
     assert before.ci95(0) == before.ci95(0) != before.ci95(1)
@@ -106,14 +101,13 @@ def test_a_gap_has_its_interval_its_noise_floor_and_the_share_that_remains_of_it
     assert not after.exceeds(before, 0.25, Thresholds(refuting_chi2=1e6))
     slope, noise = np.zeros((1, STATE, STATE)), np.zeros(STATE)
     slope[0, 0, 6], noise[[0, 6]] = 0.5, (0.3, 0.8)
-    np.testing.assert_allclose(noise_floor(slope, noise)[0, [0, 6]], [0.5, 0.8])
+    np.testing.assert_allclose(gaps.noise_floor(slope, noise)[0, [0, 6]], [0.5, 0.8])
 
 
 def test_a_diagnosis_is_measured_on_what_was_held_out(drag, found_drag, flown):
     assert drag.label == "named" and drag.flights.driven_by == "commands"
-    noise = of_rollouts(found_drag.search.last).noise
-    linear = from_true_starts(flown.model, found_drag.theta, flown.held)
-    again = gap_of(linear, flown.held, noise)
+    linear = gaps.from_true_starts(flown.model, found_drag.theta, flown.held)
+    again = gaps.gap_of(linear, flown.held, of_rollouts(found_drag.search.last).noise)
     np.testing.assert_array_equal(again.score, found_drag.after.score)
     assert found_drag.after.rms < 1.3 < found_drag.before.rms
 
@@ -122,30 +116,186 @@ def test_without_the_name_its_shape_is_left_and_a_drag_is_not_taken_for_wind(fou
     found, details = found_drag.search, found_drag.remaining.details
     evidence, bare = of_rollouts(found.last), found.estimate._replace(theta=flown.start.theta)
     windows = evidence.trusted
-    equations, with_it = (
-        disturbance_equations(flown.model, windows, evidence.whitening, one)
-        for one in (bare, found.estimate)
-    )
-    fold = np.arange(len(windows.flight)) % 5
-    with_gap = residual_structure(equations, fold)
+    given = (flown.model, windows, evidence.whitening)
+    both = (structure.disturbance_equations(*given, one) for one in (bare, found.estimate))
+    equations, with_it = both
+    with_gap = structure.residual_structure(equations, np.arange(len(windows.flight)) % 5)
     assert with_gap.shapes[0].gain > 10.0 * max(details["shapes"][0]["gain"], 1.0)
     assert min(with_gap.coloured.values()) < 1e-6 <= min(details["coloured"].values())
     assert find_turbulence(flown.model, found.estimate.theta, with_it) is None
 
 
-def test_the_likelihood_of_a_random_disturbance_peaks_at_its_size():
-    rng = np.random.default_rng(2)
-    count, size = 200, 2.0
-    hessian = np.broadcast_to(4.0 * np.eye(6), (count, 6, 6))
-    noise = 2.0 * rng.standard_normal((count, 6))
-    gradient = 4.0 * size * rng.standard_normal((count, 6)) + noise
-    equations = DisturbanceEquations(hessian, gradient, None, None)  # type: ignore[arg-type]
+def test_a_random_disturbance_has_its_size_or_none_at_the_end_of_the_tried_values():
+    rng, unit = np.random.default_rng(2), np.broadcast_to(np.eye(6), (200, 6, 6))
+    noise = 2.0 * rng.standard_normal((200, 6))
+    gradient = 4.0 * 2.0 * rng.standard_normal((200, 6)) + noise
+    equations = structure.DisturbanceEquations(4.0 * unit, gradient, None, None)  # type: ignore[arg-type]
     sizes = np.array([0.5, 1.0, 2.0, 4.0, 8.0])
-    found = _likelihood(equations, np.broadcast_to(np.eye(6), (count, 6, 6)), sizes)
-    assert sizes[found.argmax()] == size
+    assert sizes[_likelihood(equations, unit, sizes).argmax()] == 2.0
+    assert _range_of(sizes, (sizes > 0.5) & (sizes < 8.0)) == [1.0, 4.0]
+    assert _range_of(sizes, sizes > 1.0) is None
 
 
-def test_an_interval_at_the_end_of_the_tried_values_is_unknown():
-    tried = np.array([1.0, 2.0, 4.0, 8.0])
-    assert _range_of(tried, np.array([False, True, True, False])) == [2.0, 4.0]
-    assert _range_of(tried, np.array([False, False, True, True])) is None
+def spoilt(found_drag, steps):
+    """Return what was found, and a torque of so many steps that is not there."""
+    found, space = found_drag.search, found_drag.source.space
+    other = next(s.candidate for s in found.first if s.candidate.name == "torque_trim")
+    theta, at = found.estimate.theta.copy(), list(other.indices)
+    theta[at] += steps * space.array("step")[at]
+    named = (*found.named, NamedEffect(other, 0.001, 20.0))
+    last = found.last._replace(at=found.estimate._replace(theta=theta))
+    return replace(found, named=named, last=last, judged=last)
+
+
+def test_a_name_that_held_out_flights_contradict_is_withdrawn_and_no_other(found_drag):
+    """One that they cannot show stays."""
+
+    def judged(found):
+        after = found_drag.source.gap(found, found.estimate.theta)
+        return after, confirmed(found_drag.source, found, after)
+
+    _, (kept, _, _, gone) = judged(spoilt(found_drag, 1e-4))
+    assert gone == [] and "torque_trim" in [one.label for one in kept.candidates]
+    found = spoilt(found_drag, 0.2)
+    after, (kept, gap, without, gone) = judged(found)
+    assert gone == ["torque_trim"] and gap.rms < after.rms
+    labels = [one.label for one in found_drag.search.candidates]
+    assert [one.label for one in kept.candidates] == labels and set(without) == set(labels)
+    theta = found.estimate.theta
+    np.testing.assert_allclose(kept.estimate.theta[kept.indices], theta[kept.indices], rtol=0.05)
+
+
+def test_where_the_model_lacks_something_a_name_must_explain_a_share_of_the_rest(found_drag):
+    found, after = found_drag.search, found_drag.after
+    # As if the rest were so large that the gap without the drag is a fifth larger only.
+    raised = found_drag.without["linear_drag"].energy.sum() / 1.2 / after.energy.sum()
+    after = after._replace(score=raised * after.score, energy=raised * after.energy)
+    misfit = replace(of_rollouts(found.judged), misfit_is_noise=True)
+    off = replace(found, judged=found.judged._replace(evidence=misfit))
+    withdrawn = [confirmed(found_drag.source, one, after)[3] for one in (found, off)]
+    assert withdrawn == [[], ["linear_drag"]]
+
+
+def test_what_was_withdrawn_has_explained_nothing(found_drag):
+    """The verdict is then `unknown`, not `no_gap`."""
+    bare = found_drag.search.refitted(())
+    assert bare.named == ()
+    lasts = (found_drag.search.last, bare.last)
+    with_drag, without = (of_rollouts(last).slow_errors(last.block) for last in lasts)
+    assert with_drag[0].sum() / with_drag[1].sum() < 1.5
+    assert structure_where(without, structure.ResidualStructure([], {}), True) is not None
+
+
+def windows(until_s=1.0, without=()):
+    """Return three windows of 101 rows; those up to a time have all but some channel groups."""
+    row_s = np.tile(np.linspace(0.0, 1.0, 101), (3, 1))
+    seen = np.ones((3, 101, 19), bool) & (row_s <= until_s)[..., None]
+    for group in without:
+        seen[..., SLICES[group]] = False
+    found: Any = SimpleNamespace(row_s=row_s, valid=seen)
+    return found
+
+
+def pushed(acc=0.0, turn=0.0):
+    """Return the shift by a constant acceleration along x and angular acceleration about y."""
+    time = np.linspace(0.0, 1.0, 101)
+    moved = np.zeros((3, 101, 19))
+    moved[..., 0], moved[..., 6], moved[..., 10] = 0.5 * acc * time**2, acc * time, turn * time
+    return moved
+
+
+@pytest.mark.parametrize(("until_s", "without"), [(1.0, ()), (0.25, ()), (0.25, ("velocity",))])
+def test_a_constant_push_has_its_own_size_however_long_a_stretch_is_trusted(until_s, without):
+    size = gaps.rollout_size(pushed(0.08, 0.7), windows(until_s, (*without, "accelerometer")))
+    assert size.force == pytest.approx(0.08) and size.torque == pytest.approx(0.7)
+    assert size.drift == pytest.approx(0.04)
+
+
+def test_a_bias_of_the_accelerometer_counts_as_a_force_and_a_views_size_is_in_its_own_unit():
+    moved = np.zeros((3, 101, 19))
+    moved[..., 12] = 0.06
+    assert size_of(moved).force == pytest.approx(0.06)
+    assert gaps.rollout_size(moved, windows(without=("accelerometer",))).force == 0.0
+    moved = np.tile([0.3, 0.0, 0.4], (5, 1))
+    assert gaps.view_size(moved, True) == gaps.EffectSize(pytest.approx(0.5), 0.0, None)
+    assert gaps.view_size(moved, False) == gaps.EffectSize(0.0, pytest.approx(0.5), None)
+
+
+def size_of(moved):
+    return gaps.rollout_size(moved, windows())
+
+
+def test_the_upper_end_of_a_size_holds_what_the_interval_allows():
+    slope = pushed(1.0)[..., None]
+    upper = gaps.upper_size(slope, np.array([0.03]), np.array([0.01]), size_of)
+    assert upper.force == pytest.approx(0.04) and not upper.relevant(THRESHOLDS)
+    unsure = gaps.upper_size(slope, np.array([0.03]), np.array([0.03]), size_of)
+    assert unsure.relevant(THRESHOLDS), "a small effect that may be large is no finding of none"
+
+
+def test_an_effect_that_the_models_own_error_may_be_has_no_size_for_certain():
+    """A wide interval is no reason to name it: the effect may be zero."""
+    change, width, slope = np.array([0.05]), np.array([0.03]), pushed(1.0)[..., None]
+    space = SimpleNamespace(entries=[SimpleNamespace(effect="clock_offset")])
+    named = [SimpleNamespace(candidate=SimpleNamespace(name="clock_offset"))]
+    last = SimpleNamespace(evidence=SimpleNamespace(space=space))
+    found: Any = SimpleNamespace(
+        named=named, last=last, indices=[0], moved=change, half_widths=lambda: width
+    )
+
+    def upper(error):
+        ((size, upper),) = sizes_by_effect(found, slope, size_of, np.array([error])).values()
+        assert size.force == pytest.approx(0.05)
+        return upper
+
+    assert upper(0.0).force == pytest.approx(0.08)
+    assert upper(0.01).force == pytest.approx(0.07)
+    assert upper(0.04) == gaps.EffectSize(0.0, 0.0, 0.0)
+
+
+def test_one_parameter_beyond_the_models_error_is_enough():
+    change, width = np.array([0.13, -0.12, 0.06]), np.array([0.03, 0.04, 0.05])
+    assert not beyond_error(change, np.array([0.20, 0.10, 0.12]), width)
+    assert beyond_error(change, np.array([0.20, 0.07, 0.12]), width)
+    # Only all parameters together are significant: the error must explain each of them.
+    assert beyond_error(change, np.array([0.20, 0.10, 0.12]), 5.0 * width)
+    assert not beyond_error(change, np.array([0.20, 0.13, 0.12]), 5.0 * width)
+
+
+@pytest.mark.parametrize(
+    "size",
+    [gaps.EffectSize(0.05, 0, 0), gaps.EffectSize(0, 0.5, None), gaps.EffectSize(0, 0, 0.025)],
+)
+def test_one_threshold_is_enough_and_none_at_all_keeps_everything(size):
+    assert size.relevant(THRESHOLDS)
+    below = gaps.EffectSize(*(0.99 * (value or 0.0) for value in size))
+    assert not below.relevant(THRESHOLDS) and below.relevant(Thresholds(relevance=(0.0, 0.0, 0.0)))
+
+
+def test_a_gap_matters_beyond_its_noise_by_more_than_the_thresholds(found_drag):
+    def matters(error, floor, count=400, limits=THRESHOLDS):
+        held = SimpleNamespace(flight=np.zeros(count), start_s=0.25 * np.arange(count))
+        source = replace(found_drag.source, held=held, limits=limits)
+        groups = dict.fromkeys(("position", "velocity", "rates"), gaps.Channel(error, floor))
+        channels = dict.fromkeys(("0.1 s", "0.5 s", "1 s"), groups)
+        return source.is_relevant(found_drag.before._replace(channels=channels))
+
+    assert not matters(0.004, 0.001) and matters(0.04, 0.001) and not matters(0.04, 0.05)
+    assert matters(0.04, 0.04, 4), "few rollouts cannot show that it is small"
+    assert matters(0.0, 0.0, limits=Thresholds(relevance=(0.0, 0.0, 0.0)))
+
+
+def test_where_rollouts_as_given_are_near_enough_no_name_matters(found_drag):
+    source, none = found_drag.source, gaps.Channel(1e-3, 0.0)
+    channels = found_drag.before.channels.items()
+    near = found_drag.before._replace(
+        channels={horizon: dict.fromkeys(groups, none) for horizon, groups in channels}
+    )
+    held = source.held._replace(flight=np.zeros(400, int), start_s=0.25 * np.arange(400))
+    source = replace(source, held=held)
+    found, after, _, out = relevant_part(source, found_drag.search, (near, found_drag.after))
+    assert found.named == () and after is near
+    ((name, size),) = out
+    assert name == "linear_drag" and size.force > 0.05
+    rest = source.remaining(found, (near, near), 0)
+    assert not rest.structured and rest.reason == TOO_SMALL

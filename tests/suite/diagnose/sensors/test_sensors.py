@@ -1,7 +1,5 @@
 """Sensors identified from estimates that a known model made."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -15,9 +13,9 @@ from eval.logs.flight_log import FlightLog, write_flight
 from eval.sensors.interface import Draws, View
 from eval.sensors.sensors_file import load_sensors, sensor_set
 from suite.common.console import Console
-from suite.diagnose.sensors import identify
+from suite.diagnose.sensors import colour, identify
 from suite.diagnose.sensors.clock import Clock, clock_of, on_gyro_clock
-from suite.diagnose.sensors.colour import Series
+from suite.diagnose.sensors.colour import Series, fit_colour
 from suite.diagnose.sensors.errors import errors_of
 from suite.diagnose.sensors.identify import fit_sensors, held_out, identify_sensors, parameters_of
 from tracks.geometry.camera import Camera
@@ -34,6 +32,8 @@ TRUE = {
     "velocity_scale": 0.05,
 }
 DELAY_S = 0.06
+GROUPS = (("pos_w", "pos", "xyz"), ("vel_w", "vel", "xyz"), ("rot_w", "quat", "wxyz"))
+"""Parts of an estimate: as the sensors see it, as it is logged, and their axes."""
 
 
 def flown(
@@ -70,17 +70,13 @@ def flown(
         now = draws(sensor.observation.normal)
         view, memory = sensors.sense(models, memory, view, now, STEP_S, camera)
         seen.append(view)
-    seen_pos, seen_rot, seen_vel = (
-        np.stack([getattr(view, name) for view in seen[: count - 1]])
-        for name in ("pos_w", "rot_w", "vel_w")
-    )
     rows, logs = slice(lead, len(time_s) - 1), []
     for k, number in enumerate(numbers):
-        estimate = {
-            **{f"est_pos_{a}": seen_pos[:, k, i] for i, a in enumerate("xyz")},
-            **{f"est_vel_{a}": seen_vel[:, k, i] for i, a in enumerate("xyz")},
-            **{f"est_quat_{a}": rot_to_quat(seen_rot[:, k])[:, i] for i, a in enumerate("wxyz")},
-        }
+        estimate = {}
+        for view_name, name, axes in GROUPS:
+            part = np.stack([getattr(view, view_name)[k] for view in seen[: count - 1]])
+            part = rot_to_quat(part) if name == "quat" else part
+            estimate |= {f"est_{name}_{a}": part[:, i] for i, a in enumerate(axes)}
         log = FlightLog(
             f"flight{number}", time_s[rows], pos_w[rows, k], rot_to_quat(rot_w[rows, k]),
             vel_w[rows, k], rate_b[rows, k], np.full(count - 1, 9.81), rate_b[rows, k],
@@ -103,10 +99,8 @@ def test_the_true_parameters_are_within_the_intervals():
     # One in twenty of the intervals may miss.
     assert len(missed) <= 0.05 * len(true) + 2, missed
     assert "delay.state" not in missed
-    delay = found["delay.state"][0]
-    assert delay.high - delay.low < 0.02
-    noise = found["measured_state.velocity_z"][0]
-    assert noise.high / noise.low < 1.5
+    delay, noise = (found[name][0] for name in ("delay.state", "measured_state.velocity_z"))
+    assert delay.high - delay.low < 0.02 and noise.high / noise.low < 1.5
 
 
 @pytest.mark.slow
@@ -121,8 +115,7 @@ def test_a_drift_and_a_tilt_by_neglected_drag_are_found_where_they_are():
     none = {"position_x": 0.0, "position_y": 0.0}
     drifting = flown(range(20, 22), 0.0, position_drift=0.05, **none)
     drift = fit_sensors(drifting).axes["position_x"].drift
-    assert drift.low <= 0.05 <= drift.high
-    assert drift.value > 0.02
+    assert drift.low <= 0.05 <= drift.high and drift.value > 0.02
     assert not fitted().tilt.drag.value
     tilt = fit_sensors(flown(range(30, 36), drag=0.4)).tilt
     assert tilt.drag.value == pytest.approx(0.4, abs=0.01)
@@ -139,41 +132,88 @@ def test_a_wandering_clock_is_found_by_the_gyro_and_leaves_no_errors():
     found = clock_of(off)
     error_s = found.shift_s - np.interp(found.time_s, log.time_s, true_s)
     assert np.sqrt((error_s**2).mean()) < 0.01
-    rms = [
-        np.sqrt(np.nanvar(errors_of(one, DELAY_S).value[:, :3]))
-        for one in (log, off, on_gyro_clock(off, found))
-    ]
-    assert rms[1] > 2.0 * rms[0]
-    assert rms[2] < 1.1 * rms[0]
+    logs = (log, off, on_gyro_clock(off, found))
+    rms = [np.sqrt(np.nanvar(errors_of(one, DELAY_S).value[:, :3])) for one in logs]
+    assert rms[1] > 2.0 * rms[0] and rms[2] < 1.1 * rms[0]
 
 
 def test_the_file_that_is_written_reads_back_with_what_was_found(tmp_path):
+    file = tmp_path / "mine.toml"
     for number, log in enumerate(flights()[:2]):
         write_flight(tmp_path / f"{number}.parquet", log)
-    result = identify_sensors([tmp_path], tmp_path / "mine.toml", Console())
-    read = load_sensors(tmp_path / "mine.toml")
-    told = result["parameters"]["measured_state.velocity_z"]["value"]
-    assert read.models["measured_state"].velocity_z == pytest.approx(told, rel=1e-3)
-    delay_s = result["parameters"]["delay.state"]["value"]
+    found, read = identify_sensors([tmp_path], file, Console())["parameters"], load_sensors(file)
+    noise, delay_s = (found[k]["value"] for k in ("measured_state.velocity_z", "delay.state"))
+    assert read.models["measured_state"].velocity_z == pytest.approx(noise, rel=1e-3)
     assert read.ages.state_s == pytest.approx(delay_s, rel=1e-3)
-    assert "95 % intervals" in (tmp_path / "mine.toml").read_text()
+    assert "95 % intervals" in file.read_text()
 
 
 def test_a_log_without_an_estimate_or_a_reference_is_refused(tmp_path):
     log = flights()[0]
-    write_flight(tmp_path / "bare.parquet", replace(log, extra={}))
-    with pytest.raises(ValueError, match=r"bare.parquet: no on-board estimate.*est_vel_x"):
-        identify_sensors([tmp_path], tmp_path / "mine.toml", Console())
+    bare = replace(log, extra={})
     lost = replace(log, pos_w=np.full_like(log.pos_w, np.nan), about={"partial": ["pos"]})
-    write_flight(tmp_path / "bare.parquet", lost)
-    with pytest.raises(ValueError, match="column pos_x: no reference for the estimate"):
-        identify_sensors([tmp_path], tmp_path / "mine.toml", Console())
+    for one, words in (
+        (bare, r"bare.parquet: no on-board estimate.*est_vel_x"),
+        (lost, "column pos_x: no reference for the estimate"),
+    ):
+        write_flight(tmp_path / "bare.parquet", one)
+        with pytest.raises(ValueError, match=words):
+            identify_sensors([tmp_path], tmp_path / "mine.toml", Console())
 
 
 def test_the_correlation_of_logs_with_other_rates_is_compared_at_equal_lags():
     fine = np.convolve(np.random.default_rng(1).normal(size=40_000), np.ones(30), "valid")
     lag_s = 0.02 * np.arange(10)
-    at_100_hz, at_50_hz = Series(fine, 0.0 * fine, 0.01), Series(fine[::2], 0.0 * fine[::2], 0.02)
-    np.testing.assert_allclose(
-        identify._autocorrelation([at_100_hz, at_50_hz], lag_s), 1.0 - lag_s / 0.3, atol=0.05
-    )
+    both = [Series(fine[::k], 0.0 * fine[::k], 0.01 * k) for k in (1, 2)]  # 100 Hz and 50 Hz
+    found = identify._autocorrelation(both, lag_s)
+    np.testing.assert_allclose(found, 1.0 - lag_s / 0.3, atol=0.05)
+
+
+SD, LASTS_S, DRIFT, SPEED, SPAN_S, ROWS = 0.03, 0.2, 0.05, 3.0, 60.0, 600
+
+
+def exact(flights, lag_s):
+    """Return two stretches with the expected variogram; None: variance about a flight's mean.
+
+    The noise decays with `LASTS_S` (its mean: Taylor 1921). A walk W(t) of the variance d a second
+    has the variogram d l / 2, and about its mean over D the variance d D / 6.
+    """
+    per_s, ratio = DRIFT**2 * SPEED, LASTS_S / SPAN_S
+    if lag_s is None:
+        of_mean = 2.0 * ratio * (1.0 - ratio * (1.0 - np.exp(-1.0 / ratio)))
+        value = np.array([SD**2 * (1.0 - of_mean) + per_s * SPAN_S / 6.0])
+    else:
+        value = SD**2 * (1.0 - np.exp(-lag_s / LASTS_S)) + 0.5 * per_s * lag_s
+    half = np.full((2, len(value)), 0.5)
+    return colour._Variograms(2.0 * half * value, half, np.full((2, 1), SPEED), np.arange(2))
+
+
+def test_a_drift_and_the_noise_around_it_have_their_true_sizes(monkeypatch):
+    monkeypatch.setattr(colour, "_variograms", exact)
+    flight = Series(np.zeros(ROWS), np.full(ROWS, SPEED), SPAN_S / ROWS)
+    found = fit_colour([flight, flight])
+    assert found is not None
+    fitted = found.noise.value, found.lasts_s.value, found.drift.value
+    # At the shortest lag of the drift's fit, 2 s, exp(-10) of the noise is still correlated.
+    assert fitted == pytest.approx((SD, LASTS_S, DRIFT), rel=1e-3)
+
+
+def test_a_drift_of_flights_is_significant_and_within_its_interval():
+    rng, count, step_s = np.random.default_rng(3), 60, 0.1
+    steps = DRIFT * np.sqrt(SPEED * step_s) * rng.normal(size=(count, 4, ROWS))
+    values = SD * rng.normal(size=steps.shape) + steps.cumsum(axis=2)
+    speed, found = np.full(ROWS, SPEED), []
+    for each in values:
+        found.append(colour._drift([Series(value, speed, step_s) for value in each]))
+    assert sum(drift.low > 0.0 for drift in found) > 0.6 * count
+    assert sum(drift.low <= DRIFT <= drift.high for drift in found) > 0.85 * count
+    assert np.median([drift.value for drift in found]) == pytest.approx(DRIFT, rel=0.1)
+
+
+def test_rows_without_a_velocity_are_not_rows_at_rest():
+    speed = np.full(ROWS, SPEED)
+    speed[50:90] = np.nan
+    value = np.where(np.isnan(speed), np.nan, np.random.default_rng(5).normal(size=ROWS))
+    found = colour._variograms([Series(value, speed, 0.1)], np.array([1.0]))
+    assert found is not None
+    np.testing.assert_allclose(found.speed, SPEED)

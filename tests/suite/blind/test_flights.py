@@ -1,24 +1,31 @@
-"""Flights in continuous time, and the logs that are written of them."""
+"""Flights in continuous time and in RotorPy, and the logs that are written of them."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from eval.flights.follow import FlightFailed
-from eval.flights.simulate import SENSORS
+from eval.flights.simulate import SENSORS, fly
 from eval.flights.trajectory import Trajectory
+from eval.quadrotor.plant import Motion
 from suite.blind.continuous.body import POS, QUAT
 from suite.blind.continuous.engine import Rows
 from suite.blind.continuous.timing import Conditions
 from suite.blind.continuous_flight import _Pilot, fly_continuous, logs_of, with_loop_frequency
 from suite.blind.outside import KINDS
+from suite.blind.rotorpy_flight import check_effects, fly_rotorpy, hub_damping
+from tests.support.log_tables import assert_same
 from tests.support.vehicles import PLAIN, with_effects, with_lag
+from tracks.geometry.rotation import to_world
 
 LAGGED = with_lag(PLAIN, 0.02)
 WAYS = (
     Trajectory("figure_eight", 0.6, speed=4.0, size=2.0, turn="wobble"),
     Trajectory("climb", 0.5, speed=2.0, size=1.5),
 )
+SHORT = (Trajectory("figure_eight", 0.4, speed=2.0), Trajectory("hover", 0.2))
 CONDITIONS = Conditions(733.0, 90.0, 0.3, 1e-4, 0.01, 0.7, 0.05)
 
 
@@ -36,8 +43,7 @@ def fifth():
 def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(fifth):
     (_, first), (_, again), (_, other) = fifth, run(5), run(6)
     for one, two in zip(first, again, strict=True):
-        for name in ("time_s", "pos_w", "quat_wxyz", "vel_w", "rate_b", "thrust_cmd", "acc_b"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+        assert_same(one, two)
     assert first[0].time_s[3] != other[0].time_s[3] and first[0].pos_w[3, 0] != other[0].pos_w[3, 0]
 
 
@@ -92,3 +98,47 @@ def test_a_flight_is_not_checked_after_its_end():
     assert np.isfinite(pilot(after)[0]).all()
     with pytest.raises(FlightFailed, match="flight 2"):
         pilot(before)
+
+
+def test_an_effect_that_rotorpy_does_not_have_as_it_is_is_refused():
+    check_effects(with_effects(rotor_drag=(1e-5,)))
+    with pytest.raises(ValueError, match="effects.linear_drag: RotorPy does not have it; allowed:"):
+        check_effects(with_effects(linear_drag=((0.1, 0.1, 0.1),)))
+
+
+def test_flights_side_by_side_are_each_as_if_alone_and_move_as_their_accelerometers_say():
+    pytest.importorskip("rotorpy")
+    truth = with_effects(LAGGED, rotor_drag=(4e-4,))
+    short = [replace(way, duration_s=0.5 * way.duration_s) for way in SHORT]
+    eight, hover = fly_rotorpy(LAGGED, truth, short, 100.0)
+    assert (len(eight.time_s), len(hover.time_s), eight.period) == (100, 50, 5)
+    assert eight.integrator is None
+    (alone,) = fly_rotorpy(LAGGED, truth, short[1:], 100.0)
+    np.testing.assert_allclose(alone.motion.pos_w, hover.motion.pos_w, atol=1e-9)
+    felt_w = to_world(eight.motion.rot_w, eight.acc_b) - [0.0, 0.0, 9.81]
+    between = 0.5 * (felt_w[1:-1] + felt_w[2:])
+    moved = np.diff(eight.motion.vel_w, axis=0)[1:] / eight.dt
+    np.testing.assert_allclose(moved, between, atol=2e-3)
+
+
+def test_without_air_it_flies_as_mujoco_does_and_into_the_ground_it_fails():
+    pytest.importorskip("rotorpy")
+    (here,) = fly(LAGGED, LAGGED, SHORT[:1])
+    (there,) = fly_rotorpy(LAGGED, LAGGED, SHORT[:1], 100.0)
+    off = Motion(*(np.abs(a - b).max() for a, b in zip(here.motion, there.motion, strict=True)))
+    assert off.pos_w < 1e-3 and off.vel_w < 3e-3 and off.rate_b < 0.03
+    with pytest.raises(FlightFailed, match=r"flight 1 failed at \d\.\d\d s"):
+        fly_rotorpy(LAGGED, LAGGED, [Trajectory("hover", 0.3, height=0.0)], 100.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "plane"), [("rotor_drag", (1.0, 1.0, 0.0)), ("inflow", (0.0, 0.0, 1.0))]
+)
+def test_torque_of_hubs_in_a_turning_body(name, plane):
+    place, drag = np.asarray(PLAIN.rotors.position), 2e-6
+    speed = np.sqrt(PLAIN.mass * 9.81 / 4 / PLAIN.rotors.thrust_coefficient)
+    rate_b = np.array([0.7, -1.1, 2.0])
+    force = -drag * speed * np.cross(rate_b, place) * plane
+    torque = np.cross(place, force).sum(axis=0)
+    found = hub_damping([{"name": name, "parameters": {"coefficient": drag}}], PLAIN)
+    np.testing.assert_allclose(-found * rate_b * PLAIN.inertia, torque, rtol=1e-3, atol=1e-9)
