@@ -1,11 +1,15 @@
-"""Checks of a vehicle file for implausible parameters, and of a policy's camera."""
+"""Checks of a vehicle file for implausible parameters, of a policy's camera, and of mixed logs."""
 
 from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.logs.faults.finding import Finding
+from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 
 ARM_M = (0.012, 1.5)
@@ -75,3 +79,20 @@ def check_camera(policy_fov: tuple[float, float] | None, vehicle: Vehicle | None
         return [Finding("ok", "camera", figures)]
     fix = "camera.fov_deg of the vehicle file, or crop the image"
     return [Finding("doubt", "camera", figures, "camera_fov", here[0] / policy_fov[0], 0.97, fix)]
+
+
+def check_same_vehicle(logs: Sequence[FlightLog]) -> list[tuple[Finding, str]]:
+    """Return a finding, with the log's name, on each log of another vehicle than most others.
+
+    Only names in the metadata (`vehicle`) are compared; a log without one is not checked.
+    """
+    named = [(log.name, str(log.about["vehicle"])) for log in logs if log.about.get("vehicle")]
+    found = []
+    for usual, count in Counter(vehicle for _, vehicle in named).most_common(1):
+        for name, vehicle in named:
+            if vehicle != usual:
+                text = f"is of vehicle {vehicle!r}; {count} of {len(named)} logs are of {usual!r}"
+                fix = "give only the logs of one vehicle"
+                finding = Finding("doubt", "log", text, "vehicle_mixed", None, 0.95, fix)
+                found.append((finding, name))
+    return found
