@@ -45,7 +45,8 @@ def test_bad_options_are_code_2_in_one_line(tmp_path, capsys):
     log = made.write_usd(tmp_path / "log00", span=(0, 3))
     for options, reason in (
         ("--out flight.txt", "--out is 'flight.txt'"),
-        ("--rate 0", "--rate is 0"),
+        ("--rate 1", "--rate is 1"),
+        ("--motor-poles 13", "even number"),
         ("--full-thrust -3", "--full-thrust is -3"),
         ("--start 5 --end 2", "0 <= start < end"),
         ("--pose-map m.toml", "--pose, which is not given"),
