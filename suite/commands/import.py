@@ -120,7 +120,7 @@ def _check(config: Config) -> None:
     if config.end is not None and config.end <= config.start:
         raise ValueError(f"--start {config.start:g} --end {config.end}: 0 <= start < end, in s")
     if (config.motor_poles or 0) % 2:
-        raise ValueError(f"--motor-poles {config.motor_poles}: a motor has an even number")
+        raise ValueError(f"--motor-poles {config.motor_poles}: the number of magnets is even")
     if config.pose_map is not None and config.pose is None:
         raise ValueError("--pose-map describes the file of --pose, which is not given")
     check_no_input(config.out, [config.file, config.pose], "--out")

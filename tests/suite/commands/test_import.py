@@ -46,7 +46,7 @@ def test_bad_options_are_code_2_in_one_line(tmp_path, capsys):
     for options, reason in (
         ("--out flight.txt", "--out is 'flight.txt'"),
         ("--rate 1", "--rate is 1"),
-        ("--motor-poles 13", "even number"),
+        ("--motor-poles 13", "magnets is even"),
         ("--full-thrust -3", "--full-thrust is -3"),
         ("--start 5 --end 2", "0 <= start < end"),
         ("--pose-map m.toml", "--pose, which is not given"),
