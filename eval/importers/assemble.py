@@ -7,6 +7,8 @@ resample to common rows, convert the commands, and check these. Each check retur
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from eval.importers.checks.airborne import airborne
@@ -104,6 +106,7 @@ def assemble(
         if signal not in ("time", *recording.signals) and steps != "drop":
             text = f"--read {signal}={steps} is not used: the log has no {signal}"
             findings.append(Finding("note", "file", text))
+    findings += _unused_options(recording.signals, format, options)
     _require_signals(recording, options.partial, findings)
     # Checks of the frames of position, attitude and gyro.
     coarse = row_times(recording, COARSE_HZ, 0.0, None)
@@ -164,6 +167,22 @@ def assemble(
         about["findings"] = [finding._asdict() for finding in findings]
     log = log_from_columns(columns, about, recording.name)
     return log, tuple(findings)
+
+
+def _unused_options(signals: Collection[str], format: str, options: ImportOptions) -> list[Finding]:
+    """Return a note on each number of `options` that a log with these signals does not need."""
+    has_throttle = "throttle" in signals and "cmd_thrust" not in signals
+    has_erpm = format == "betaflight" and "motor" in signals
+    numbers = (
+        ("--mass", options.mass, KEPT + "cmd_force" in signals, "thrust in N"),
+        ("--full-thrust", options.full_thrust, has_throttle, "normalised thrust only"),
+        ("--motor-poles", options.motor_poles, has_erpm, "Betaflight's eRPM"),
+    )
+    return [
+        Finding("note", "file", f"{flag} is not used: it is for a log with {what}")
+        for flag, number, is_used, what in numbers
+        if number is not None and not is_used
+    ]
 
 
 def _require_signals(recording: Recording, partial: bool, findings: list[Finding]) -> None:

@@ -126,13 +126,23 @@ def row_times(
         step /= parts
     stride = max(1, int(np.ceil(1.0 / (rate_hz * step) - 0.01)))
     valid = (times >= within[0]) & (times <= within[1])
-    time_s = times[valid & (times >= origin_s + start_s) & (times <= last_allowed)][::stride]
+    inside = times[valid & (times >= origin_s + start_s) & (times <= last_allowed)]
+    time_s = inside[::stride]
     if len(time_s) < 2:
         if valid.any():
-            reason = (
-                f"no row between --start and --end; rows are from {times[valid][0] - origin_s:.1f} "
-                f"to {times[valid][-1] - origin_s:.1f} s, counted from the file's first sample"
-            )
+            first_s, last_s = times[valid][[0, -1]] - origin_s
+            if len(inside) < 2 <= valid.sum():
+                reason = (
+                    f"no two rows between --start and --end; rows are from {first_s:.4g} to "
+                    f"{last_s:.4g} s, counted from the file's first sample"
+                )
+            elif valid.sum() < 2:
+                reason = "only 1 row; two or more are needed"
+            else:
+                reason = (
+                    f"the log lasts {last_s - first_s:.2g} s; if it is longer, correct the unit of "
+                    "its time: unit in [time] of the mapping, or --read time=ms, us or ns"
+                )
         else:
             spans = ", ".join(
                 f"{name} from {s.time_s[0]:.3f} to {s.time_s[-1]:.3f} s"

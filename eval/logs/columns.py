@@ -235,7 +235,9 @@ def as_numbers(values: np.ndarray, column: str, name: str) -> np.ndarray:
             if text is not None and text != "":
                 numbers[k] = float(text)
         except (TypeError, ValueError):
-            raise FlightLogError(name, column, k + 1, f"{value!r} is not a number") from None
+            hint = "; delete a row of units below the names" if k == 0 else ""
+            reason = f"{value!r} is not a number{hint}"
+            raise FlightLogError(name, column, k + 1, reason) from None
     return numbers
 
 
@@ -245,8 +247,9 @@ def _check_time(time: np.ndarray, row_number: np.ndarray, name: str) -> None:
         k = back[0] + 1
         reason = f"{time[k]:.9g} s does not come after {time[k - 1]:.9g} s; time must increase"
         raise FlightLogError(name, "time", int(row_number[k]), reason)
-    if time[-1] - time[0] < DURATION_MIN:
-        reason = f"{time[-1] - time[0]:.3g} s of flight; at least {DURATION_MIN:g} s is needed"
+    if (duration := time[-1] - time[0]) < DURATION_MIN:
+        reason = f"{duration:.3g} s of flight; at least {DURATION_MIN:g} s is needed"
+        reason += "; `time` should be in seconds" if duration < 0.1 * DURATION_MIN else ""
         raise FlightLogError(name, "time", int(row_number[-1]), reason)
 
 

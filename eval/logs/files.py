@@ -40,6 +40,11 @@ OTHERS = {
     "and describe it by --pose-map",
 }
 """First cell of other programs' tables that cannot be read directly -> what to do."""
+OTHER_MARKS = ";\t"
+"""Marks that separate the columns of tables that are not read."""
+NO_COMMAS = (
+    "the first line has no commas; separate the columns by commas, and write decimals with a point"
+)
 NOT_CSV = "neither a Parquet file nor CSV in UTF-8"
 
 
@@ -226,9 +231,8 @@ def _csv_header(path: Path) -> tuple[list[str], int]:
     finally:
         csv.field_size_limit(usual_limit)
     names = [name.strip() for name in lines[0]] if lines else []
-    if len(names) == 1 and any(mark in names[0] for mark in ";\t"):
-        reason = "the first line has no commas; separate the columns by commas"
-        raise FlightLogError(str(path), None, None, reason)
+    if len(names) == 1 and any(mark in names[0] for mark in OTHER_MARKS):
+        raise FlightLogError(str(path), None, None, NO_COMMAS)
     for start, advice in OTHERS.items():
         if names and names[0] == start:
             raise FlightLogError(str(path), None, None, advice)

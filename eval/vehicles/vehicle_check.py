@@ -73,8 +73,14 @@ def _check_rotors(vehicle: Vehicle) -> None:
             f"{list(rotors.spin)}: these rotors cannot produce roll, pitch and yaw independently; "
             "rotors at opposite corners usually spin in the same direction"
         )
-    hover = np.linalg.solve(matrix, [vehicle.mass * GRAVITY, 0.0, 0.0, 0.0])
-    if hover.min() <= 0.0:
+    if sum(rotors.spin):
+        raise ValueError(
+            f"rotors.spin = {list(rotors.spin)}: two rotors must spin in each direction, so that "
+            "all of them push up in hover; rotors at opposite corners usually spin alike"
+        )
+    weight = vehicle.mass * GRAVITY
+    hover = np.linalg.solve(matrix, [weight, 0.0, 0.0, 0.0])
+    if hover.min() <= 1e-6 * weight:  # by rounding, a rotor without thrust has one of either sign
         raise ValueError(
             f"rotors.position = {[list(hub) for hub in rotors.position]}: the origin (centre of "
             "mass) must be between the rotors, so that all of them push up in hover"

@@ -46,7 +46,7 @@ class Config(Command):
     """Nominal mass [kg], for a log with thrust in N. Without it that of --vehicle."""
     motor_poles: Advanced[Annotated[int, Range(2, 1000)] | None] = None
     """Number of magnets in a motor, for Betaflight's eRPM. Without it that of the log, or 14."""
-    rate: Advanced[Annotated[float, Range(1.0, 10_000.0)]] = 250.0
+    rate: Advanced[Annotated[float, Range(5.0, 10_000.0)]] = 250.0
     """Largest number of rows per second."""
     start: Advanced[Annotated[float, Range(0.0, 1e9)]] = 0.0
     """Leave out earlier samples [s after the file's first sample]."""
@@ -119,6 +119,8 @@ def _check(config: Config) -> None:
         raise ValueError(f"--out is {str(config.out)!r}; its ending must be .parquet or .csv")
     if config.end is not None and config.end <= config.start:
         raise ValueError(f"--start {config.start:g} --end {config.end}: 0 <= start < end, in s")
+    if (config.motor_poles or 0) % 2:
+        raise ValueError(f"--motor-poles {config.motor_poles}: the number of magnets is even")
     if config.pose_map is not None and config.pose is None:
         raise ValueError("--pose-map describes the file of --pose, which is not given")
     check_no_input(config.out, [config.file, config.pose], "--out")

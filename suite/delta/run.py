@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 
 from eval.logs.faults.check import kept_lines
+from eval.logs.faults.finding import line
+from eval.logs.faults.vehicle import check_same_vehicle
 from eval.logs.flight_log import FlightLog, read_flights
 from policies.formats.checkpoint import save_arrays
 from policies.formats.policy_file import DELTA
@@ -122,7 +124,8 @@ def fit_delta(
     # Read the flights, and hold some of them out.
     logs, warnings = read_flights(flight_files(paths))
     logs, short = long_enough(logs, config.horizon_s)
-    for warning in [*warnings, *short, *kept_lines(logs)]:
+    mixed = [f"{name}: {line(finding)}" for finding, name in check_same_vehicle(logs)]
+    for warning in [*warnings, *short, *kept_lines(logs), *mixed]:
         console.note(f"warning: {warning}")
     groups = split(logs, config.held_out, config.seed)
     description = describe_dynamics(dynamics)

@@ -61,6 +61,7 @@ def check_flight_files(
         with_fixes,
     )
     from eval.logs.faults.finding import Finding, finding_lines
+    from eval.logs.faults.vehicle import check_same_vehicle
     from eval.logs.flight_log import read_flights, write_flight
     from eval.quadrotor.vehicle_file import load_vehicle
     from suite.delta.run import flight_files
@@ -79,6 +80,7 @@ def check_flight_files(
     logs, warnings = read_flights(files, partial=True, limits=False) if files else ([], [])
     for warning in warnings:
         console.note(f"warning: {warning}")
+    all_findings += check_same_vehicle(logs)
     written = []
     for log in logs:
         findings, readings = check_log(log, context, out is not None)

@@ -58,8 +58,7 @@ def collect(
         warning. `as_flown` is `AS_FLOWN` if that file is written, else null.
 
     Raises:
-        ValueError: if a setting of `collection` cannot be used, or `out` holds the flights of
-            another collection.
+        ValueError: if a setting of `collection` cannot be used, or `out` holds other flights.
     """
     from eval.judging.judge import check_records
     from eval.judging.results import Journal
@@ -84,6 +83,7 @@ def collect(
     identity = without_paths(settings)
     # Rows of flights that exist, then of the missing ones.
     rows = _existing_rows(out, identity)
+    _refuse_other_logs(out, trial_set)
     with Journal(out / JOURNAL, identity) as journal:
         as_flown = _write_vehicle(collection, trial_set.vehicle, out, console)
         rows |= {t: row for t, r in journal.done.items() if (row := _row(out, r)) is not None}
@@ -212,6 +212,17 @@ def _write_log(
         console.note(f"warning: no log of this flight: {error}")
         return None
     return name
+
+
+def _refuse_other_logs(out: Path, trial_set: TrialSet) -> None:
+    """Refuse a folder with logs of other commands: a diagnosis would mix them with these."""
+    names = {log_name(t.track, t.difficulty, t.seed) for t in trial_set.trials}
+    logs = sorted(file.name for end in ("parquet", "csv") for file in out.glob(f"*.{end}"))
+    if others := [name for name in logs if name not in names]:
+        raise ValueError(
+            f"{out} holds other flight logs ({others[0]} and so on), which suite diagnose would "
+            "mix with the new ones; give another --out"
+        )
 
 
 def _existing_rows(out: Path, identity: dict[str, Any]) -> dict[TrialSpec, Row]:

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording
 from eval.logs.columns import FlightLogError
-from eval.logs.files import read_head
+from eval.logs.files import NO_COMMAS, OTHER_MARKS, first_line, read_head
 from tracks.common.names import Registry
 
 
@@ -69,6 +69,8 @@ def detect(path: Path, options: ImportOptions) -> str:
     head = read_head(path)
     candidates = sorted(FORMATS.items(), key=lambda item: getattr(item[1], "ASKED_LAST", False))
     reason = "of no known format; name it with --format, and a table's columns with --map"
+    if b"\0" not in head and any(mark.encode() in first_line(head) for mark in OTHER_MARKS):
+        reason = NO_COMMAS  # a table with commas is recognised below
     for name, format in candidates:
         try:
             if format.detect(head, options):

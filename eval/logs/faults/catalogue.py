@@ -62,9 +62,10 @@ FAULTS: dict[str, tuple[str, str]] = {
         "the mass in the vehicle file is a multiple of the true one",
         "hover for two seconds",
     ),
-    "vehicle_arms": ("the rotors' places are in mm", ""),
+    "vehicle_arms": ("the rotors' places are in cm or mm", ""),
     "vehicle_inertia": ("the inertia is another vehicle's or in another unit", ""),
     "vehicle_thrust": ("thrust-to-weight is implausible", ""),
+    "vehicle_mixed": ("the logs are of several vehicles", ""),
     "camera_fov": ("the policy saw with another camera", ""),
     "file": ("the file is damaged, or of another kind", "log again"),
 }

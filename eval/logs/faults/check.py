@@ -28,7 +28,7 @@ from eval.logs.faults.pose import Rows, check_pose, fit_pose_readings
 from eval.logs.faults.reading import Readings, read_rows, readings_in
 from eval.logs.faults.sensors import check_accelerometer_bias, check_barometer, check_voltage
 from eval.logs.faults.vectors import check_accelerometer, check_gyro, check_velocity
-from eval.logs.faults.vehicle import LIFT, check_camera, check_vehicle_numbers
+from eval.logs.faults.vehicle import LIFT, check_camera, check_same_vehicle, check_vehicle_numbers
 from eval.logs.flight_log import FlightLog, columns_from_log, log_from_columns
 from eval.vehicles.vehicle import Vehicle
 from tracks.common.names import unknown_name
@@ -215,6 +215,7 @@ def check_before_diagnosis(
     found: list[tuple[Finding, str | None]] = [(f, None) for f in check_files(against)]
     for log in logs:
         found += [(finding, log.name) for finding in check_log(log, against)[0]]
+    found += check_same_vehicle(logs)
     stops = [(f, name) for f, name in found if f.is_open and f.fault not in accept]
     if stops:
         lines = [f"{name or 'the vehicle file'}: {line(f)}" for f, name in stops]

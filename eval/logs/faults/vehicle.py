@@ -1,11 +1,15 @@
-"""Checks of a vehicle file for implausible parameters, and of a policy's camera."""
+"""Checks of a vehicle file for implausible parameters, of a policy's camera, and of mixed logs."""
 
 from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.logs.faults.finding import Finding
+from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 
 ARM_M = (0.012, 1.5)
@@ -26,26 +30,40 @@ def check_vehicle_numbers(vehicle: Vehicle) -> list[Finding]:
     arm = float(np.mean(np.hypot(hubs[:, 0], hubs[:, 1])))
     if not ARM_M[0] <= arm <= ARM_M[1]:
         text = f"rotors are {arm:.3g} m from the middle; usual are {ARM_M[0]:g} to {ARM_M[1]:g}"
-        fix = "rotors.position in m" + (": divide by 1000" if arm / 1000.0 >= ARM_M[0] else "")
+        # Positions in cm or mm: prefer the unit by which the inertia is usual as well.
+        units = [k for k in (100, 1000) if ARM_M[0] <= arm / k <= ARM_M[1]]
+        units = [k for k in units if _is_round(_gyration(vehicle, arm / k))] or units
+        divisors = " or ".join(map(str, units))
+        fix = "rotors.position in m" + (f": divide by {divisors}" if units else "")
         found.append(Finding("doubt", "vehicle", text, "vehicle_arms", arm, 0.97, fix))
-        # Positions in mm would make the inertia below implausible as well: one finding is enough.
-        arm = arm / 1000.0 if arm > ARM_M[1] else arm
+        # The wrong arm would make the inertia below unusual too: one finding is enough.
+        arm = arm / units[0] if units else arm
     lift = vehicle.full_thrust / GRAVITY
     if not LIFT[0] <= lift <= LIFT[1]:
         text = f"full thrust is {lift:.3g} times the weight; usual are {LIFT[0]:g} to {LIFT[1]:g}"
         rpm = lift / (60.0 / (2.0 * np.pi)) ** 2
         fix = "rotors.speed_max in rad/s" + (", not rpm" if LIFT[0] <= rpm <= LIFT[1] else "")
         found.append(Finding("doubt", "vehicle", text, "vehicle_thrust", lift, 0.95, fix))
-    gyration = [j / (vehicle.mass * arm**2) for j in vehicle.inertia[:2]]
-    worst = max(gyration, key=lambda r: abs(np.log(r / np.sqrt(ROUND[0] * ROUND[1]))))
-    if not ROUND[0] <= worst <= ROUND[1]:
+    gyration = _gyration(vehicle, arm)
+    if not _is_round(gyration):
         text = (
-            f"inertia about x or y is {worst:.3g} times mass x arm^2; from {ROUND[0]:g} to "
+            f"inertia about x or y is {gyration:.3g} times mass x arm^2; from {ROUND[0]:g} to "
             f"{ROUND[1]:g} is usual"
         )
-        fix = "inertia in kg m^2, of this vehicle"
-        found.append(Finding("doubt", "vehicle", text, "vehicle_inertia", worst, 0.93, fix))
+        fix = "inertia in kg m^2, of this vehicle, or rotors.position in m"
+        found.append(Finding("doubt", "vehicle", text, "vehicle_inertia", gyration, 0.93, fix))
     return found or [Finding("ok", "vehicle", f"full thrust is {lift:.3g} times the weight")]
+
+
+def _gyration(vehicle: Vehicle, arm: float) -> float:
+    """Return the inertia about x or y over mass times `arm` [m] squared; the less usual of both."""
+    ratios = [j / (vehicle.mass * arm**2) for j in vehicle.inertia[:2]]
+    return max(ratios, key=lambda r: abs(np.log(r / np.sqrt(ROUND[0] * ROUND[1]))))
+
+
+def _is_round(gyration: float) -> bool:
+    """Return whether such a ratio of `_gyration` is usual."""
+    return ROUND[0] <= gyration <= ROUND[1]
 
 
 def check_camera(policy_fov: tuple[float, float] | None, vehicle: Vehicle | None) -> list[Finding]:
@@ -61,3 +79,20 @@ def check_camera(policy_fov: tuple[float, float] | None, vehicle: Vehicle | None
         return [Finding("ok", "camera", figures)]
     fix = "camera.fov_deg of the vehicle file, or crop the image"
     return [Finding("doubt", "camera", figures, "camera_fov", here[0] / policy_fov[0], 0.97, fix)]
+
+
+def check_same_vehicle(logs: Sequence[FlightLog]) -> list[tuple[Finding, str]]:
+    """Return a finding, with the log's name, on each log of another vehicle than most others.
+
+    Only names in the metadata (`vehicle`) are compared; a log without one is not checked.
+    """
+    named = [(log.name, str(log.about["vehicle"])) for log in logs if log.about.get("vehicle")]
+    found = []
+    for usual, count in Counter(vehicle for _, vehicle in named).most_common(1):
+        for name, vehicle in named:
+            if vehicle != usual:
+                text = f"is of vehicle {vehicle!r}; {count} of {len(named)} logs are of {usual!r}"
+                fix = "give only the logs of one vehicle"
+                finding = Finding("doubt", "log", text, "vehicle_mixed", None, 0.95, fix)
+                found.append((finding, name))
+    return found

@@ -157,7 +157,9 @@ def test_start_and_end_cut_more_than_the_time_on_the_ground():
     assert any("before take-off and the" in f.evidence for f in findings)
     assert log.rotor_speed is not None and log.rotor_speed.min() > 400.0
     assert log.duration_s == pytest.approx(1.2, abs=0.05)
-    with pytest.raises(FlightLogError, match="no row between --start and --end; .* first sample"):
+    with pytest.raises(
+        FlightLogError, match="no two rows between --start and --end; .* first sample"
+    ):
         assemble(Recording("log", parts), "made", replace(asked, start_s=50.0, end_s=60.0))
     kept, _ = assemble(Recording("log", parts), "made", replace(asked, trim=False))
     assert kept.duration_s == pytest.approx(1.5, abs=0.02)

@@ -14,8 +14,9 @@ from eval.importers.formats import table
 from eval.importers.mapping_file import MIXERS, Column, LogMap, map_file, read_map, shipped_maps
 from eval.importers.options import ImportOptions
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.reading import parse_readings
 from tests.support import known_flight
-from tests.support.imported import TRUE, near, same_flight, text
+from tests.support.imported import TRUE, flight, near, same_flight, text, write
 from tests.support.vehicles import PLAIN
 
 POSE = 'pos = {column = "p"}\nquat = {column = "q", order = "xyzw"}\n'
@@ -315,7 +316,27 @@ def test_text_among_numbers_is_refused_with_its_row(tmp_path):
     path = tmp_path / "log.csv"
     rows = [f"{k / 100},0,0,1,1,0,0,0,0,{'broken' if k == 7 else 0},0" for k in range(200)]
     path.write_text("\n".join([NAMES, *rows]) + "\n")
-    with pytest.raises(FlightLogError, match=r"column rate_y, row 8: 'broken' is not a number"):
+    with pytest.raises(FlightLogError, match=r"column rate_y, row 8: 'broken' is not a number$"):
+        import_log(path)
+    path.write_text("\n".join([NAMES, NAMES, *rows[8:]]))
+    with pytest.raises(FlightLogError, match="row 1: 'time' is not a number; delete a row of unit"):
+        import_log(path)
+    for mark in ";\t":
+        path.write_text("\n".join([NAMES, *rows]).replace(",", mark))
+        with pytest.raises(FlightLogError, match="no commas; separate the columns by commas"):
+            import_log(path)
+
+
+def test_a_wrong_unit_of_the_time_is_named_and_unused_options_get_a_note(tmp_path):
+    path = write(tmp_path / "log.csv", flight(end=12.0))
+    for unit, reason in (("us", "lasts 1.2e-05 s; if .* --read time="), ("ms", "be in seconds")):
+        with pytest.raises(FlightLogError, match=reason):
+            import_log(path, None, ImportOptions(read=parse_readings([f"time={unit}"])))
+    given = ImportOptions(mass=1.0, motor_poles=14, full_thrust=30.0)
+    notes = [one.evidence for one in import_log(path, None, given).findings]
+    assert sum("is not used: it is for a log with" in note for note in notes) == 3
+    write(path, {name: values[:1] for name, values in flight().items()})
+    with pytest.raises(FlightLogError, match="only 1 row"):
         import_log(path)
 
 

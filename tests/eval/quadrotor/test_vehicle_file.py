@@ -75,6 +75,8 @@ REFUSED = [
     ("inertia", [0.001, 0.001, 0.003], "inertia.*sum of the other two"),
     ("rotors.spin", [1, 1, -1, 2], r"rotors\.spin.*1 .*or -1"),
     ("rotors.spin", [1, 1, 1, 1], "independently"),
+    ("rotors.spin", [1, 1, 1, -1], r"rotors\.spin = .*two rotors must spin in each"),
+    ("rotors.spin", [1, 1, -1, 1], r"rotors\.spin = .*two rotors must spin in each"),
     ("rotors.position", [[0.2, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [0.2, 0.1, 0]], "between"),
     ("rotors.speed_max", 1000.0, "too weak to hover with mass = 0.75 kg; a rotor"),
     ("mass", 750.0, r"too weak to hover with mass = 750 kg; a mass in grams\?"),

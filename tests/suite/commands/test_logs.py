@@ -113,6 +113,14 @@ def test_what_an_import_left_open_is_repeated_and_findings_of_earlier_versions_a
     assert findings_of({"findings": [old, *odd]}) == (Finding("doubt", "attitude", "39 % off"),)
 
 
+def test_logs_of_several_vehicles_are_named(tmp_path, capsys, flight):
+    flight(1.0, about={"vehicle": "a"}).rename(tmp_path / "first.parquet")
+    flight(1.0, about={"vehicle": "b"})
+    found = answer(capsys, "check", tmp_path)["findings"]
+    (mixed,) = (one for one in found if one["fault"] == "vehicle_mixed")
+    assert mixed["flight"].endswith("flight.parquet") and "of vehicle 'b'" in mixed["evidence"]
+
+
 def test_no_log_is_overwritten_by_its_correction_or_by_that_of_another(tmp_path, capsys, flight):
     first, second = flight(1.0), tmp_path / "b/flight.parquet"
     second.parent.mkdir()
@@ -161,7 +169,8 @@ def test_bad_options_are_code_2_in_one_line(tmp_path, capsys):
     log = made.write_usd(tmp_path / "log00", span=(0, 3))
     for options, reason in (
         ("--out flight.txt", "--out is 'flight.txt'"),
-        ("--rate 0", "--rate is 0"),
+        ("--rate 1", "--rate is 1"),
+        ("--motor-poles 13", "magnets is even"),
         ("--full-thrust -3", "--full-thrust is -3"),
         ("--start 5 --end 2", "0 <= start < end"),
         ("--pose-map m.toml", "--pose, which is not given"),

@@ -143,11 +143,13 @@ def test_flights_without_what_a_fit_needs_are_refused(tmp_path, dynamics, missin
         given = {"thrust_cmd": np.full_like(log.time_s, 9.81), "rate_cmd_b": log.rate_b}
         if missing == "cmd_thrust":
             given = {"rotor_speed": np.full((len(log.time_s), 4), 900.0)}
-        write_flight(tmp_path / f"{i}.parquet", replace(log, extra=extra, about=kept, **given))
+        about = {**kept, "vehicle": f"drone {i}"}
+        write_flight(tmp_path / f"{i}.parquet", replace(log, extra=extra, about=about, **given))
     with pytest.raises(ValueError, match=r"record (longer )?flights with suite collect"):
         fit_delta(FitConfig(), dynamics, [tmp_path], tmp_path / "out", Console())
     # A log that an earlier step does not refuse repeats the open findings of its import.
-    assert missing != "cmd_thrust" or "6 motors turn" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert missing != "cmd_thrust" or ("6 motors turn" in said and "vehicle_mixed" in said)
 
 
 @pytest.fixture(scope="module")

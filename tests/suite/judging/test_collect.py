@@ -38,6 +38,8 @@ def test_collect_writes_logs_that_read_back_and_goes_on(pilots, tmp_path, monkey
     flown = cut_short(monkeypatch)
     assert answer(capfd, *args)["flights"] == found["flights"]
     assert [trial.seed for trial in flown] == [8]
+    shutil.copy(logs[0], out / "other.parquet")
+    assert "other.parquet" in refused(capfd, *args)
 
 
 def test_flights_of_another_course_or_code_are_not_taken_for_its_own(

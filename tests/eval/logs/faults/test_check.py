@@ -52,6 +52,20 @@ def test_a_copy_of_a_flight_is_refused(tmp_path):
     check_before_diagnosis([log, unknown, moved], CheckContext(), list(FAULTS))
 
 
+def test_logs_of_two_vehicles_are_refused_and_a_log_without_a_name_is_not():
+    flights = [fly(PLAIN, seed, duration_s=3.0) for seed in range(3)]
+    logs = [
+        replace(log, name=f"{k}.csv", about={"vehicle": "other" if k == 2 else "mine"})
+        for k, log in enumerate(flights)
+    ]
+    with pytest.raises(ValueError, match="of vehicle 'other'; 2 of 3 logs are of 'mine'") as error:
+        check_before_diagnosis(logs, CheckContext())
+    assert logs[2].name in str(error.value) and "--accept vehicle_mixed" in str(error.value)
+    records = check_before_diagnosis(logs, CheckContext(), ["vehicle_mixed"])
+    assert [r["flight"] for r in records if r["fault"] == "vehicle_mixed"] == [logs[2].name]
+    check_before_diagnosis([*logs[:2], replace(logs[2], about={})], CheckContext())
+
+
 def test_the_rate_of_slow_commands_is_that_of_their_own_rows():
     log = fly(PLAIN, 0, duration_s=3.0)
     has_command = np.arange(len(log.time_s)) % 5 == 0

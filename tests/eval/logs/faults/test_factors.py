@@ -11,6 +11,7 @@ from eval.logs.faults.drive.motor_map import check_motor_map
 from eval.logs.faults.drive.motors import check_lift, check_motors
 from eval.logs.faults.relation import match
 from eval.logs.faults.vectors import check_gyro, check_velocity
+from eval.logs.faults.vehicle import check_vehicle_numbers
 from eval.vehicles.vehicle import MotorMap, command_of_thrust
 from tests.support.vehicles import PLAIN
 
@@ -55,6 +56,20 @@ def test_without_a_gyro_order_and_spin_are_not_identifiable():
     assert [(one.fault, one.status) for one in found] == [
         (fault, "not identifiable") for fault in ("motor_order", "motor_spin")
     ]
+
+
+@pytest.mark.parametrize(
+    ("unit", "inertia", "divisor"), [(100, 1, "100"), (1000, 1, "1000"), (1000, 10, "100 or 1000")]
+)
+def test_arms_in_cm_or_mm_are_converted_by_the_divisor_that_fits_the_inertia(
+    unit, inertia, divisor
+):
+    hubs = tuple((unit * x, unit * y, unit * z) for x, y, z in PLAIN.rotors.position)
+    moments = tuple(inertia * moment for moment in PLAIN.inertia)
+    wrong = replace(PLAIN, inertia=moments, rotors=replace(PLAIN.rotors, position=hubs))
+    (finding,) = check_vehicle_numbers(wrong)
+    assert finding.fault == "vehicle_arms"
+    assert finding.fix == f"rotors.position in m: divide by {divisor}"
 
 
 def thrust(factor, vehicle=PLAIN):
