@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 import eval.judging.judge
@@ -16,7 +17,7 @@ from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.worlds.trial import TrialSpec
 from policies import shipped
 from policies.policy import load_policy
-from policies.spec import PolicyError
+from policies.spec import PolicyError, PolicySpec
 from suite.cli import parse
 from suite.judging import flying
 from suite.judging.flying import Manner, manners, policy_labels, workers_for
@@ -46,9 +47,30 @@ def test_policies_have_the_name_of_their_run_or_are_told_apart_and_none_flies_tw
     assert load_policy(tmp_path / "mine" / "policy").name == "mine"
 
 
-def test_a_policy_object_that_lacks_a_method_is_refused_by_name():
+def test_an_object_that_is_no_policy_or_whose_act_returns_something_else_is_refused_by_name():
     with pytest.raises(ValueError, match=r"has no name, start, act; a policy object has"):
         suite.evaluate_policy(SimpleNamespace(spec=None))  # type: ignore[arg-type]
+    whole: Any = {"name": "mine", "spec": PolicySpec(), "start": lambda n: None, "act": None}
+    for wrong, said in (
+        ({}, "its act is None, not a method"),
+        ({"name": None}, "its name is None, not a text"),
+        ({"spec": {}}, r"its spec is \{\}, not a policies.spec.PolicySpec"),
+        ({"start": 0}, "its start is 0, not a method"),
+    ):
+        members: Any = SimpleNamespace(**{**whole, **wrong})
+        with pytest.raises(ValueError, match=said):
+            suite.evaluate_policy(members)
+        with pytest.raises(ValueError, match=said):
+            eval.judging.judge.fly(members, [TrialSpec("zigzag", 0, 0)], load_vehicle("reference"))
+    for returned, said in (
+        (lambda n: np.zeros((n, 3)), "ndarray"),
+        (lambda n: (np.zeros((n, 3)), None, None), "3 values"),
+    ):
+        act = lambda hidden, state, *rest, made=returned: made(len(state))  # noqa: E731
+        members = SimpleNamespace(**{**whole, "act": act})
+        for trials in (2, 3):
+            with pytest.raises(ValueError, match=rf"act returned {said}.* tuple \(action, hidden"):
+                suite.evaluate_policy(members, track="zigzag", difficulty=0, trials=trials)
 
 
 def test_a_track_file_is_flown_once_a_seed_and_once_where_nothing_acts_by_chance(pilots, tmp_path):
