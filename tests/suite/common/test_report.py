@@ -51,5 +51,6 @@ def test_levels_and_tracks():
             parse_levels(text)
     assert parse_tracks("all") == ["zigzag", "circular", "ellipse"]
     assert parse_tracks("ellipse,my/course.toml") == ["ellipse", "my/course.toml"]
+    assert parse_tracks("a.toml,k/../a.toml, zigzag,zigzag") == ["a.toml", "zigzag"]
     with pytest.raises(ValueError, match="Did you mean 'zigzag'"):
         parse_tracks("ellipse,zigzg")

@@ -85,6 +85,8 @@ def test_a_track_file_is_flown_once_a_seed_and_once_where_nothing_acts_by_chance
     trials, notes = (getattr(read_trial_set(asked), name) for name in ("trials", "notes"))
     assert [trial.seed for trial in trials if trial.track == YARD] == [0] and len(trials) == 4
     assert len(notes) == 1 and "flown once, not 3 times" in notes[0]
+    (note,) = read_trial_set(replace(asked, track=YARD, difficulty="0,5", trials=1)).notes
+    assert "has no levels, so --difficulty does not change it" in note
     gusts = tmp_path / "gusts.toml"
     save_vehicle(with_effects(load_vehicle("reference"), gusts=(1.0, 5.0)), gusts, "for a test")
     for course in (

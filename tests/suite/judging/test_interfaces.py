@@ -22,7 +22,7 @@ from suite.commands import check
 from suite.common.console import Quiet
 from suite.diagnose.example import flights as example
 from suite.judging import checking
-from suite.judging.trials import _in_millimetres
+from suite.judging.trials import _in_millimetres, _too_small
 from tests.support.courses import straight
 from tracks.families import FAMILIES
 
@@ -41,6 +41,10 @@ def test_a_start_that_touches_the_ground_is_refused_and_a_track_in_millimetres_r
     gates = gates._replace(opening_g=1000 * gates.opening_g)
     large = replace(track, scene=track.scene._replace(gates=gates))
     assert "millimetres" in _in_millimetres("here", large)[0]
+    assert _too_small("here", track, vehicle) == []
+    small = gates._replace(opening_g=gates.opening_g * [1e-3, 1e-5])
+    narrow = replace(track, scene=track.scene._replace(gates=small))
+    assert "here: gate 0 is" in _too_small("here", narrow, vehicle)[0]
 
 
 def test_modules_in_the_working_folder_do_not_stand_for_ours_or_pythons(tmp_path, root):
