@@ -93,7 +93,7 @@ def verify_rows(policy: BlockPolicy, where: str) -> BlockPolicy:
     """
     rng = np.random.default_rng(0)
     n = policy.block
-    state, image, hidden = _random_block(policy, rng)
+    state, image, hidden = random_block(policy, rng)
     first = policy.model(state, image, hidden)
     expected = ((n, policy.spec.action.size), (n, *policy.hidden_shape))
     for name, value, shape in zip(("action", "hidden"), first, expected, strict=True):
@@ -142,7 +142,7 @@ def for_one_row(policy: BlockPolicy) -> BlockPolicy:
     The policy is returned unchanged if its model refuses one row or gives different outputs for it.
     Rounding differs from the rounding in a block, so the judge does not use this function.
     """
-    inputs = _random_block(policy, np.random.default_rng(0))
+    inputs = random_block(policy, np.random.default_rng(0))
     in_block = policy.model(*inputs)
     try:
         single = policy.model(*(x[:1] for x in inputs))
@@ -156,7 +156,7 @@ def for_one_row(policy: BlockPolicy) -> BlockPolicy:
     return dataclasses.replace(policy, block=1, rows=1) if equal else policy
 
 
-def _random_block(
+def random_block(
     policy: BlockPolicy, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a block of random (state, image, hidden)."""

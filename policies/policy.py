@@ -6,6 +6,7 @@ policies in simulation and scores them, uses policies through this protocol only
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,6 +15,7 @@ import numpy as np
 from policies import shipped
 from policies.spec import PolicyError, PolicySpec
 from tracks.common.names import closest, unknown_name
+from tracks.input.ranges import shown
 
 Hidden = Any
 """Hidden state (memory) of a policy for n trials; only the policy reads it."""
@@ -63,6 +65,52 @@ class Policy(Protocol):
             acceleration in current body axes [m/s^2]), and the new hidden state.
         """
         ...
+
+
+MEMBERS: dict[str, tuple[Any, str]] = {
+    "name": (str, "a text"),
+    "spec": (PolicySpec, "a policies.spec.PolicySpec"),
+    "start": (Callable, "a method"),
+    "act": (Callable, "a method"),
+}
+"""Member of a policy -> its type, and the type's name in messages."""
+
+
+def check_policy(policy: object) -> None:
+    """Refuse an object that is no policy.
+
+    Raises:
+        ValueError: naming its missing or wrong members.
+    """
+    about = (
+        "a policy object has name, spec, start(n) and act(hidden, state, image, fresh): "
+        "docs/policies.md"
+    )
+    if missing := [name for name in MEMBERS if not hasattr(policy, name)]:
+        raise ValueError(f"policy {shown(policy)} has no {', '.join(missing)}; {about}")
+    for name, (kind, text) in MEMBERS.items():
+        value = getattr(policy, name)
+        if not isinstance(value, kind):
+            raise ValueError(
+                f"policy {shown(policy)}: its {name} is {shown(value)}, not {text}; {about}"
+            )
+
+
+def checked_act(
+    policy: Policy, hidden: Hidden, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
+) -> tuple[np.ndarray, Hidden]:
+    """Return what `Policy.act` returns; its actions are unchecked.
+
+    Raises:
+        ValueError: where that is not a tuple of two.
+    """
+    output = policy.act(hidden, state, image, fresh)
+    if not isinstance(output, tuple) or len(output) != 2:
+        kind = f"{len(output)} values" if isinstance(output, tuple) else type(output).__name__
+        raise ValueError(
+            f"policy {policy.name!r}: act returned {kind}, expected the tuple (action, hidden)"
+        )
+    return output
 
 
 def load_policy(name_or_path: str | Path, trust: bool = False) -> Policy:

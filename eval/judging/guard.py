@@ -13,7 +13,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.vehicles.vehicle import Vehicle
-from policies.policy import Hidden, Policy
+from policies.policy import Hidden, Policy, checked_act
 from policies.spec import ActionSpec, NoAnswer
 
 
@@ -107,11 +107,11 @@ def call_policy(
         last_b: (N, size) last flown actions in SI units; at the start, `first_action`.
 
     Raises:
-        ValueError: where the output is not an array of actions.
+        ValueError: where the output is not an array of actions and a hidden state.
     """
     start_s = time.perf_counter()
     try:
-        output, next_hidden = policy.act(hidden, state, image, fresh)
+        output, next_hidden = checked_act(policy, hidden, state, image, fresh)
     except NoAnswer:
         none = np.zeros(len(last_b), bool)
         return Guarded(last_b, none, none, ~none, np.full(len(last_b), np.nan)), hidden

@@ -38,7 +38,7 @@ from eval.worlds.trial import (
     track_of,
 )
 from policies.observation import View, observe
-from policies.policy import Policy
+from policies.policy import Policy, check_policy
 from tracks.common.work import Workers, run_pieces, usable_cores, worker_count
 from tracks.families import check_family
 from tracks.track import Track
@@ -120,8 +120,8 @@ def fly(
         tracks: custom tracks by their names in `trials`; other names are families.
 
     Raises:
-        ValueError: for an unknown simulator or track, a policy faster than the physics, or a policy
-            whose outputs are not actions.
+        ValueError: for an unknown simulator or track, an object that is no policy, a policy faster
+            than the physics, or one whose outputs are not actions.
         WorkerDied: where a worker process died twice with the same piece.
     """
     options = options or JudgeOptions()
@@ -176,7 +176,7 @@ def pieces_of(
 
 def _is_policy(policy: object) -> bool:
     """Return whether this is a policy, and not a function or class that makes one."""
-    return hasattr(policy, "act") and not isinstance(policy, type)
+    return not callable(policy) or (hasattr(policy, "act") and not isinstance(policy, type))
 
 
 def _workers(task: Task, trials: int) -> Workers:
@@ -195,6 +195,7 @@ def _workers(task: Task, trials: int) -> Workers:
 def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
     """Fly numbered trials in this process, and yield each one when it ends."""
     policy = task.policy if _is_policy(task.policy) else task.policy()
+    check_policy(policy)
     options = task.options
     if task.world == REFERENCE:
         frequency = task.vehicle.controller.frequency

@@ -15,7 +15,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from policies.policy import Hidden, Policy
+from policies.policy import Hidden, Policy, checked_act
 from policies.spec import PolicyError, PolicySpec
 from tracks.geometry.camera import pixel_rays_b
 from tracks.input.ranges import Range
@@ -104,7 +104,7 @@ class Monitored:
         self, hidden: Hidden, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
     ) -> tuple[np.ndarray, Hidden]:
         """Return the policy's actions (n, 3), limited or replaced where necessary."""
-        action, hidden = self.policy.act(hidden, state, image, fresh)
+        action, hidden = checked_act(self.policy, hidden, state, image, fresh)
         seen = seen_of(self.spec, state, image)
         action_b = limited(self.limits, np.asarray(action, float), seen)
         action_b, replaced = last_moment(self.limits, action_b, seen, 1.0 / self.spec.rate_hz)

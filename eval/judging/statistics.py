@@ -218,8 +218,9 @@ def over_seeds(
     for group in groups:
         if group.ndim != 2 or min(group.shape) < 2 or group.shape[1] != trial_count:
             raise ValueError(
-                f"values are {[each.shape for each in groups]}; expected (seeds, trials), two or "
-                "more of each, and the same trials"
+                "an interval over training seeds needs two or more seeds of each method and two or "
+                "more trials, the same for all; given are "
+                + " and ".join(f"{len(each)} seeds of {each.shape[1]} trials" for each in groups)
             )
     signs = (1.0, -1.0)[: len(groups)]
     value = sum(sign * group.mean() for sign, group in zip(signs, groups, strict=True))

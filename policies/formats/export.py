@@ -79,7 +79,8 @@ def export_module(
 
     The module is exported in evaluation mode, with a free batch size, by torch's TorchScript
     exporter, which needs no further package. The judge (the part of the suite that flies and scores
-    policies) refuses files that it cannot run, so the new file is loaded once as a test.
+    policies) refuses files that it cannot run, so the file is loaded once as a test before it
+    replaces one at `path`.
 
     Args:
         module: the module. Its `forward` takes (state, image) or (state, image, hidden), float32
@@ -92,12 +93,17 @@ def export_module(
         `path`.
 
     Raises:
-        PolicyError: where torch cannot export it, or the judge refuses the file.
+        PolicyError: for a path with another ending, and where torch cannot export the module, the
+            judge refuses the file, or the actions are not finite.
     """
+    if Path(path).suffix != ".onnx":
+        raise PolicyError(f"{path}: the name of a module's file must end in .onnx")
+    import numpy as np
     import onnx
     import torch
 
-    from policies.policy import load_policy
+    from policies.block_policy import random_block
+    from policies.formats.onnx_file import load_onnx
 
     spec = (
         trained_under
@@ -131,7 +137,16 @@ def export_module(
     onnx.helper.set_model_props(proto, {contract.KEY: policy_contract.text})
     with replacing_file(path) as temporary:
         temporary.write_bytes(proto.SerializeToString())
-    load_policy(path)
+        try:
+            loaded = load_onnx(temporary)
+        except PolicyError as error:
+            raise PolicyError(str(error).replace(str(temporary), str(path))) from None
+        action, _ = loaded.model(*random_block(loaded, np.random.default_rng(0)))
+        if not np.isfinite(action).all(axis=1).any():
+            raise PolicyError(
+                f"{path}: the module's actions are NaN or infinite; check its weights and its "
+                "normalisation"
+            )
     return Path(path)
 
 

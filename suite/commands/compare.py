@@ -34,7 +34,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     With several runs on one side of --against, the means over the training seeds are compared.
 
     Raises:
-        ValueError: for too few runs, or runs under different conditions.
+        ValueError: for too few runs, a run given twice, or runs under different conditions.
     """
     from suite.judging.comparing import (
         compare_runs,
@@ -43,6 +43,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         version_notes,
     )
 
+    seen = set[Path]()
+    for folder in (*config.runs, *config.against):
+        if folder.resolve() in seen:
+            raise ValueError(f"{folder} is given twice; give each run once")
+        seen.add(folder.resolve())
     runs = [run for folder in config.runs for run in read_runs(folder)]
     others = [run for folder in config.against for run in read_runs(folder)]
     if len(runs) < 2 and not (runs and others):

@@ -15,7 +15,7 @@ import tyro
 from suite.common.console import Console
 from suite.common.options import Command
 from suite.common.usage import first_paragraph
-from suite.judging.trials import is_track_file, parse_levels
+from suite.judging.trials import NO_LEVELS, is_track_file, parse_levels
 from tracks.input.ranges import Seed
 
 
@@ -49,13 +49,14 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         from tracks.formats.custom import load_track
 
         tracks = [load_track(Path(config.track))]
+        if config.difficulty != Config.difficulty:
+            console.note(NO_LEVELS)
     else:
         check_family(config.track)
         levels = parse_levels(config.difficulty)
         tracks = [make_track(config.track, level, config.seed) for level in levels]
     for track in tracks:
-        name = Path(track.family).stem
-        picture = config.out / f"{name}-{track.level}-{track.seed}.png"
+        picture = config.out / f"{Path(config.track).stem}-{track.level}-{track.seed}.png"
         write_picture(picture, track)
         # `names` has the gate or obstacle that each solid belongs to.
         gates, solids = len(track.scene.gates.center_w), len(set(track.names))

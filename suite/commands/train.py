@@ -16,7 +16,7 @@ from suite.common.options import Advanced, Command
 from suite.common.running.hosts import ProcessOptions, connect, read_member
 from suite.common.startup import use_device
 from suite.train.config import TrainConfig
-from suite.train.overrides import check_phases, phase_configs, with_changes
+from suite.train.overrides import PREFIX, check_owned, check_phases, phase_configs, with_changes
 from suite.train.recipes import finetune, named_recipe, with_iterations, with_model, with_sensors
 from tracks.common.files import check_no_input, plain
 from tracks.input.ranges import Iterations, Range, Seed
@@ -88,9 +88,20 @@ def resolve(config: Config) -> TrainConfig:
     Later steps override earlier ones: recipe, model, fine-tuning, sensors, iterations, changes.
 
     Raises:
-        ValueError: with what is allowed, for an unknown recipe, setting or vehicle, or a vehicle
-            for a recipe that trains the point mass.
+        ValueError: with what is allowed, for an unknown recipe, setting or vehicle, a setting given
+            twice, or a vehicle for a recipe that trains the point mass.
     """
+    options = (
+        ("episode.batch", "--num-envs", config.num_envs),
+        ("optimizer.rate", "--lr", config.lr),
+        ("optimizer.iterations", "--iterations", config.iterations),
+        ("seed", "--seed", config.seed or None),
+    )
+    given = [option for option in options if option[2] is not None]
+    check_owned(
+        [change for change in config.set if not change.strip().startswith(PREFIX)],
+        {path: f"leave out {name} or this change" for path, name, _ in given},
+    )
     run = replace(named_recipe(config.recipe), seed=config.seed)
     run = with_model(run, config.model, config.vehicle)
     if config.finetune:
@@ -101,8 +112,7 @@ def resolve(config: Config) -> TrainConfig:
         run = with_sensors(run, config.sensors)
     if config.iterations is not None:
         run = with_iterations(run, config.iterations)
-    options = {"episode.batch": config.num_envs, "optimizer.rate": config.lr}
-    changes = [f"{path}={value}" for path, value in options.items() if value is not None]
+    changes = [f"{path}={value}" for path, _, value in options[:2] if value is not None]
     run = with_changes(run, [*changes, *config.set])
     check_phases(run)
     return run

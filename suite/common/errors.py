@@ -84,6 +84,8 @@ def _explain_os(error: OSError) -> tuple[int, str] | None:
     if error.errno in _DISK_FULL:
         hint = "free some space or give another --out; finished work is kept"
         return FAILED, f"the disk is full{file}; {hint}"
+    if isinstance(error, FileExistsError) and error.filename:
+        return UNUSABLE, f"a folder is needed, but a file exists{file}; give another --out"
     if isinstance(error, (*_NO_SUCH_INPUT, PermissionError)) or error.errno in _BAD_PATH:
         return UNUSABLE, f"{(error.strerror or 'cannot be used').lower()}{file}"
     if error.errno and error.errno not in _BUGS:

@@ -36,6 +36,8 @@ class Run(NamedTuple):
     """Versions of the suite and of MuJoCo, which may change results."""
     manner: str
     """End of the policy's label that says how it flew, such as "@0.5+monitor"; see `Manner`."""
+    digest: str | None = None
+    """SHA-256 of the policy's files; None if the evaluation does not record it."""
 
 
 def read_runs(folder: Path) -> list[Run]:
@@ -60,6 +62,8 @@ def read_runs(folder: Path) -> list[Run]:
     names = list(dict.fromkeys(row.policy for row in results))
     flown = manners(judged.get("speed") or (), bool(judged.get("monitor")))
     endings = sorted((manner.label("") for manner in flown), key=len, reverse=True)
+    # The rows of each manner have the policies in their order in the summary.
+    digests = [policy.get("sha256") for policy in summary.get("policies") or [{}]]
     return [
         Run(
             f"{folder}" if len(names) == 1 else f"{folder}: {name}",
@@ -67,8 +71,9 @@ def read_runs(folder: Path) -> list[Run]:
             conditions,
             versions,
             next((ending for ending in endings if name.endswith(ending)), ""),
+            digests[number % len(digests)],
         )
-        for name in names
+        for number, name in enumerate(names)
     ]
 
 
@@ -155,17 +160,23 @@ def compare_seeds(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, 
     are any, is subtracted.
 
     Raises:
-        ValueError: if conditions or trials differ, or a method has only one seed, or several
-            commanded speeds or the monitor in some of its runs.
+        ValueError: if conditions or trials differ, or there is one trial, or a method has one seed,
+            the same policy twice, several commanded speeds or the monitor in some of its runs.
     """
     for run in (*runs[1:], *others):
         refuse_other_conditions(runs[0], run)
     for group in (runs, others):
-        for run in group[1:]:
+        policies: dict[str, Run] = {}
+        for run in group:
             if run.manner != group[0].manner:
                 raise ValueError(
                     f"{group[0].name} and {run.name}: are no training seeds of one method, because "
                     "their --speed or --monitor differ; run suite eval for each of them alone"
+                )
+            if run.digest and (first := policies.setdefault(run.digest, run)) is not run:
+                raise ValueError(
+                    f"{first.name} and {run.name}: have the same policy, which is one training "
+                    "seed; give a policy of another seed"
                 )
     trials = list(runs[0].rows)
     # Successes of each method, (seeds, trials).

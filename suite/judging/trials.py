@@ -7,6 +7,7 @@ a family, which draws it from the seed, or a file. `read_trial_set` reads all th
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
@@ -27,6 +28,10 @@ LEVELS = tuple(range(10))
 GATE_MOST_M, TRACK_MOST_M = 50.0, 5000.0
 """Largest plausible width of a gate and size of a track [m]. Above them a note asks whether the
 file is in millimetres."""
+
+
+NO_LEVELS = "a track from a file has no levels, so --difficulty does not change it"
+"""Note if a level is given for a track from a file."""
 
 
 def parse_levels(text: str) -> list[int]:
@@ -67,11 +72,13 @@ def parse_tracks(text: str) -> list[str]:
 
     if text.strip() == "all":
         return list(JUDGED)
-    names = [part.strip() for part in text.split(",")]
-    for name in names:
+    tracks: dict[str, str] = {}
+    for name in map(str.strip, text.split(",")):
         if not is_track_file(name):
             check_family(name)
-    return list(dict.fromkeys(names))
+        # Two paths of one file are one track, which has the first of these names.
+        tracks.setdefault(os.path.realpath(name) if is_track_file(name) else name, name)
+    return list(tracks.values())
 
 
 def is_track_file(name: str) -> bool:
@@ -175,9 +182,11 @@ def read_trial_set(
             f"sensors {sensors.name!r}: the IMU has no effect, because only an estimator "
             "(gate_filter) uses it"
         )
+    if levels != [0] and options.difficulty != type(options).difficulty:
+        notes += [f"{name}: {NO_LEVELS}" for name in tracks]
     for name, custom in tracks.items():
         refuse_start_contact(name, custom, vehicle)
-        notes += _in_millimetres(name, custom)
+        notes += [*_in_millimetres(name, custom), *_too_small(name, custom, vehicle)]
     trials = trial_list(names, levels, options.trials, options.seed, once)
     simulator_differences = differences(options.simulator, vehicle)
     return TrialSet(trials, tracks, vehicle, sensors, simulator_differences, notes)
@@ -193,6 +202,21 @@ def _in_millimetres(name: str, track: Track) -> list[str]:
     return [
         f"{name}: its largest gate is {opening:g} m wide and its gates are up to {extent:g} m "
         "apart; is the file in millimetres? Lengths are in metres: divide them by 1000"
+    ]
+
+
+def _too_small(name: str, track: Track, vehicle: Vehicle) -> list[str]:
+    """Return a note if the vehicle's body is larger than the opening of a gate."""
+    import numpy as np
+
+    # Width and height (N, 2) of the gates, and of the body; the vehicle may fly rolled by 90 deg.
+    openings = np.ptp(track.scene.gates.opening_g, axis=1)
+    body = 2 * np.sort(vehicle.body.half_size[1:])
+    small = np.flatnonzero((np.sort(openings) <= body).any(axis=1))
+    return [
+        f"{name}: gate {gate} is {openings[gate][0]:g} x {openings[gate][1]:g} m, too small for "
+        f"the body of {vehicle.name!r} ({body[1]:g} x {body[0]:g} m)"
+        for gate in small[:1]
     ]
 
 

@@ -237,8 +237,13 @@ def with_changes(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
     """
     # A run's record does not depend on the order of changes of different settings.
     changes = sorted((change.strip() for change in changes), key=_path)
+    given = set[tuple[int, str]]()
     for change in changes:
         _check_phase(change, len(config.phases))
+        number, rest = _phase_of(change)
+        if (setting := (int(number or 0), _path(rest))) in given:
+            raise ValueError(f"--set {shown(change)}: {setting[1]} is given twice; give it once")
+        given.add(setting)
     in_all_phases = [change for change in changes if not change.startswith(PREFIX)]
     in_all_phases = [*_same_seconds(config, in_all_phases), *in_all_phases]
     # These replace the recipe's own changes in its phases, but not the user's.

@@ -207,7 +207,17 @@ def test_a_module_flies_in_evaluation_mode_with_the_contract_it_was_exported_wit
 def test_an_export_that_does_not_fit_its_contract_is_refused(tmp_path):
     with pytest.raises(PolicyError, match="output 'action' is float32 .*4"):
         export_module(Module(size=4), tmp_path / "it.onnx", PolicySpec())
-    export_module(Module(), tmp_path / "it.onnx", PolicySpec())
+    path = export_module(Module(), tmp_path / "it.onnx", PolicySpec())
+    good, unusable = path.read_bytes(), Module(norm=True)
+    torch.nn.init.constant_(unusable.norm.weight, torch.nan)
+    for module, name, said in (
+        (Module(size=4), "it.onnx", f"{path}: output 'action'"),
+        (unusable, "it.onnx", f"{path}: the module's actions are NaN or infinite"),
+        (Module(), "it.pt", "must end in .onnx"),
+    ):
+        with pytest.raises(PolicyError, match=said):
+            export_module(module, tmp_path / name, PolicySpec())
+        assert path.read_bytes() == good and os.listdir(tmp_path) == ["it.onnx"]
     proto = onnx.load(tmp_path / "it.onnx")
     ctbr = contract_of(PolicySpec(action=ActionSpec("ctbr")))
     onnx.helper.set_model_props(proto, {KEY: ctbr.text})

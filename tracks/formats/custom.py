@@ -38,6 +38,11 @@ _RESERVED = (
     *(f"rotor_{number} {part}" for number in range(1, 5) for part in ("arm", "disk")),
 )
 """Names that other geoms of the suite's MuJoCo models have."""
+_GATE_KEYS = (
+    *("center", "yaw_deg", "pitch_deg", "roll_deg", "quat_wxyz", "width", "height", "radius"),
+    *("corners", "polygon", "frame_width", "frame_depth"),
+)
+"""All keys of a gate."""
 _ROUNDING = 0.01
 """Share by which a mesh may be thinner than `LEAST_M`, because of rounding."""
 _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -149,6 +154,7 @@ def _gates(tables: list[Table]) -> Gates:
     """Return the gates of the tables [[gates]]; all openings get the same number of corners."""
     rows, openings = [], []
     for table in tables:
+        table.expect(_GATE_KEYS)
         center, rot = _place(table, "center"), rotation(table)
         opening = _opening(table)
         width = _length(table, "frame_width", 0.2)

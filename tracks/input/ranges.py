@@ -69,10 +69,11 @@ def check_ranges(config: Any, where: str = "", options: bool = False) -> None:
     for path, value, allowed in ranged(config):
         name = f"--{path[-1].replace('_', '-')}" if options else where + ".".join(path)
         ends = value if isinstance(value, tuple) else (value,)
+        text = " ".join(map(shown, ends)) if options else shown(value)
         if not all(allowed.holds(end) for end in ends):
-            raise ValueError(f"{name} is {shown(value)}, allowed is {allowed}")
+            raise ValueError(f"{name} is {text}, allowed is {allowed}")
         if allowed.ordered and list(ends) != sorted(ends):
-            raise ValueError(f"{name} is {shown(value)}; give the lower end of the range first")
+            raise ValueError(f"{name} is {text}; give the lower end of the range first")
 
 
 def ranged(config: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any, Range]]:

@@ -107,7 +107,8 @@ def four_gate_recipe(config: FourGateOptions) -> TrainConfig:
     from suite.train.recipes import named_recipe, with_iterations
 
     owned = {"episode.batch": "give --worlds", "optimizer.iterations": "give --iterations"}
-    check_owned(config.set, {**owned, "episode.gates": f"all fly {GATES}, as in the paper"})
+    owned |= {"seed": "give --training-seeds", "episode.gates": f"all fly {GATES}, as in the paper"}
+    check_owned(config.set, owned)
     base = with_iterations(with_changes(named_recipe(config.recipe), config.set), config.iterations)
     if base.phases:
         raise ValueError(

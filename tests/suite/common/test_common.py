@@ -75,6 +75,7 @@ def test_levels_and_tracks():
             parse_levels(text)
     assert parse_tracks("all") == ["zigzag", "circular", "ellipse"]
     assert parse_tracks("ellipse,my/course.toml") == ["ellipse", "my/course.toml"]
+    assert parse_tracks("a.toml,k/../a.toml, zigzag,zigzag") == ["a.toml", "zigzag"]
     with pytest.raises(ValueError, match="Did you mean 'zigzag'"):
         parse_tracks("ellipse,zigzg")
 
@@ -143,6 +144,8 @@ def test_what_the_system_refuses_is_one_line_with_the_file_and_a_mistake_of_ours
         assert code == (UNUSABLE if name in usage else FAILED) and "runs/x" in said, name
         assert name == "ENOSPC" or os.strerror(number).lower() in said
     assert explain(OSError(errno.EBADF, "Bad file descriptor")) is None
+    code, said = explain(FileExistsError(errno.EEXIST, "File exists", "runs/x")) or (None, "")
+    assert code == UNUSABLE and "a file exists: runs/x; give another --out" in said
 
 
 @pytest.mark.parametrize(

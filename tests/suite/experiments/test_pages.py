@@ -269,6 +269,8 @@ def test_every_experiment_is_listed_and_has_help_for_every_option(capsys):
         ("ablation --seed 0", "--seed 0 is one of --training-seeds"),
         ("ablation --only field@0.41", "Did you mean 'field 0.4'?"),
         ("ablation --set episode.batch=9", "this command sets episode.batch; give --worlds"),
+        ("ablation --set seed=9", "this command sets seed; give --training-seeds"),
+        ("ablation --set loss.jerk=1 loss.jerk=2", "'loss.jerk=2': loss.jerk is given twice"),
         ("ablation --set loss.field_gain=0", "loss.field_gain is 0, allowed is a number above"),
         ("ablation --worlds 5", "episode.batch is 5, allowed are multiples of episode.shards (2)"),
         ("ablation --recipe race-small", "--recipe race-small has 3 phases, allowed is a recipe"),

@@ -56,13 +56,15 @@ def test_the_interval_of_a_small_layout_is_that_of_its_mean_squares_and_one_seed
     half = student.ppf(0.975, degrees) * sqrt(variance)
     assert (found.high - found.low) / 2 == pytest.approx(half, rel=0.03)
     for values in ((np.ones((1, 5)),), (np.ones((2, 5)), np.ones((2, 4)))):
-        with pytest.raises(ValueError, match="two or more of each"):
+        with pytest.raises(ValueError, match="two or more seeds of each method and two"):
             over_seeds(*values)
 
 
-def run_of(folder, successes, judged=None, policy="ours", **digests):
+def run_of(folder, successes, judged=None, policy="ours", weights=None, **digests):
     rows = [result(seed, bool(success), policy) for seed, success in enumerate(successes)]
     summary = {"judged": judged or Evaluation(), "sha256": {"vehicle": "a", **digests}}
+    if weights:
+        summary["policies"] = [{"sha256": weights}]
     write_results(folder, rows, table_markdown="", summary=summary, seed=0)
     return folder
 
@@ -137,6 +139,26 @@ def test_two_methods_are_compared_over_their_seeds(tmp_path):
     for others, low in (((), wilson(60, 60).low), ([same, same], paired.low)):
         found = compare_seeds([same, same], others)["mean"]
         assert found.low == pytest.approx(low) and found.low < found.value - 0.05
+
+
+def test_a_run_or_a_policy_that_is_given_twice_and_one_trial_are_refused(tmp_path):
+    runs = [
+        run_of(tmp_path / str(index), [True] * trials, weights=weights)
+        for index, (weights, trials) in enumerate(
+            (("x", 2), ("x", 2), ("y", 2), ("x", 1), ("y", 1))
+        )
+    ]
+    (tmp_path / "link").symlink_to(runs[0])
+    for other in (runs[0], runs[1] / "../0", tmp_path / "link"):
+        for config in (compare.Config((runs[0], other)), compare.Config((runs[0],), (other,))):
+            with pytest.raises(ValueError, match=f"{other} is given twice"):
+                compare.run(config, Quiet())
+    with pytest.raises(ValueError, match="have the same policy, which is one training seed"):
+        compare.run(compare.Config(tuple(runs[:2]), seeds=True), Quiet())
+    compare.run(compare.Config(tuple(runs[:2])), Quiet())
+    compare.run(compare.Config((runs[0], runs[2]), seeds=True), Quiet())
+    with pytest.raises(ValueError, match="given are 2 seeds of 1 trials"):
+        compare.run(compare.Config(tuple(runs[3:]), seeds=True), Quiet())
 
 
 SPEEDS = Evaluation(speed=(0.5, 1.0), monitor=True)

@@ -34,7 +34,7 @@ from suite.judging import checking, flying
 from suite.judging.content import PolicyContent, policy_digest
 from suite.judging.flying import Manner, manners, policy_labels, workers_for
 from suite.judging.requests import Collection, Evaluation
-from suite.judging.trials import _in_millimetres, read_trial_set, trial_list
+from suite.judging.trials import _in_millimetres, _too_small, read_trial_set, trial_list
 from tests.support.commands import evaluate, refused
 from tests.support.courses import IN_CONTACT, straight
 from tests.support.engines import STAND_IN
@@ -61,9 +61,30 @@ def test_policies_have_the_name_of_their_run_or_are_told_apart_and_none_flies_tw
     assert load_policy(tmp_path / "mine" / "policy").name == "mine"
 
 
-def test_a_policy_object_that_lacks_a_method_is_refused_by_name():
+def test_an_object_that_is_no_policy_or_whose_act_returns_something_else_is_refused_by_name():
     with pytest.raises(ValueError, match=r"has no name, start, act; a policy object has"):
         suite.evaluate_policy(SimpleNamespace(spec=None))  # type: ignore[arg-type]
+    whole: Any = {"name": "mine", "spec": PolicySpec(), "start": lambda n: None, "act": None}
+    for wrong, said in (
+        ({}, "its act is None, not a method"),
+        ({"name": None}, "its name is None, not a text"),
+        ({"spec": {}}, r"its spec is \{\}, not a policies.spec.PolicySpec"),
+        ({"start": 0}, "its start is 0, not a method"),
+    ):
+        members: Any = SimpleNamespace(**{**whole, **wrong})
+        with pytest.raises(ValueError, match=said):
+            suite.evaluate_policy(members)
+        with pytest.raises(ValueError, match=said):
+            eval.judging.judge.fly(members, [TrialSpec("zigzag", 0, 0)], load_vehicle("reference"))
+    for returned, said in (
+        (lambda n: np.zeros((n, 3)), "ndarray"),
+        (lambda n: (np.zeros((n, 3)), None, None), "3 values"),
+    ):
+        act = lambda hidden, state, *rest, made=returned: made(len(state))  # noqa: E731
+        members = SimpleNamespace(**{**whole, "act": act})
+        for trials in (2, 3):
+            with pytest.raises(ValueError, match=rf"act returned {said}.* tuple \(action, hidden"):
+                suite.evaluate_policy(members, track="zigzag", difficulty=0, trials=trials)
 
 
 def test_a_track_file_is_flown_once_a_seed_and_once_where_nothing_acts_by_chance(pilots, tmp_path):
@@ -78,6 +99,8 @@ def test_a_track_file_is_flown_once_a_seed_and_once_where_nothing_acts_by_chance
     trials, notes = (getattr(read_trial_set(asked), name) for name in ("trials", "notes"))
     assert [trial.seed for trial in trials if trial.track == YARD] == [0] and len(trials) == 4
     assert len(notes) == 1 and "flown once, not 3 times" in notes[0]
+    (note,) = read_trial_set(replace(asked, track=YARD, difficulty="0,5", trials=1)).notes
+    assert "has no levels, so --difficulty does not change it" in note
     gusts = tmp_path / "gusts.toml"
     save_vehicle(with_effects(load_vehicle("reference"), gusts=(1.0, 5.0)), gusts, "for a test")
     for course in (
@@ -274,13 +297,19 @@ def onnx_file(folder):
 FLIGHT = min(path.name for path in example.FOLDER.glob("*.parquet"))
 
 
-def test_a_track_in_millimetres_is_reported():
+def test_a_track_in_millimetres_or_with_gates_smaller_than_the_body_is_reported():
     track = straight()
     assert _in_millimetres("here", track) == []
     gates = track.scene.gates._replace(center_w=1000 * track.scene.gates.center_w)
     gates = gates._replace(opening_g=1000 * gates.opening_g)
     large = replace(track, scene=track.scene._replace(gates=gates))
     assert "millimetres" in _in_millimetres("here", large)[0]
+    vehicle = load_vehicle("reference")
+    assert _too_small("here", track, vehicle) == []
+    gates = track.scene.gates
+    small = gates._replace(opening_g=gates.opening_g * [1e-3, 1e-5])
+    narrow = replace(track, scene=track.scene._replace(gates=small))
+    assert "here: gate 0 is" in _too_small("here", narrow, vehicle)[0]
 
 
 def test_modules_in_the_working_folder_do_not_stand_for_ours_or_pythons(tmp_path, root):

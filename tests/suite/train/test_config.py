@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 
+from suite.commands.train import Config, resolve
 from suite.common.console import Console
 from suite.train import losses
 from suite.train.config import Phase, TrainConfig, check
@@ -96,6 +97,21 @@ def test_wrong_settings_are_refused_by_name(change, words):
     with pytest.raises(ValueError) as error:
         with_changes(TrainConfig(), [change])
     assert words in str(error.value) and change in str(error.value)
+
+
+def test_a_setting_that_is_given_twice_is_refused():
+    for path in ("loss.progress", "phases.2.loss.jerk"):
+        again = f"{path} = 2"
+        with pytest.raises(ValueError, match=f"'{again}': loss.* is given twice; give it once"):
+            with_changes(RUN, [f"{path}=1", again])
+    options = {"optimizer.rate": "lr", "episode.batch": "num_envs"}
+    options |= {"optimizer.iterations": "iterations", "seed": "seed"}
+    for path, option in options.items():
+        change, name = f"{path}=8", option.replace("_", "-")
+        resolve(Config(recipe="quick", set=(change,)))
+        with pytest.raises(ValueError, match=f"this command sets {path}; leave out --{name} or"):
+            resolve(Config(recipe="quick", set=(change,), **{option: 8}))
+    resolve(Config(lr=1e-3, set=("phases.2.optimizer.rate=1e-4",)))
 
 
 def test_spreads_go_with_the_size_of_the_vehicle_that_is_asked_for():
