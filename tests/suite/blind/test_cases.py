@@ -13,15 +13,14 @@ from eval.flights.simulate import SENSORS, fly, log_of
 from eval.flights.trajectory import Trajectory
 from eval.logs.flight_log import read_flight
 from suite.blind import build as module
+from suite.blind import make, simulators
 from suite.blind.build import build
 from suite.blind.cases import DRAWERS, MULTIPLES, SETS, Case, draw_cases, draw_continuous_cases
 from suite.blind.continuous.timing import draw_conditions
-from suite.blind.make import open_answers
 from suite.blind.oracle import information as oracle
 from suite.blind.oracle import strength
 from suite.blind.outside import KINDS as OUTSIDE
 from suite.blind.outside import changed_values, draw_change
-from suite.blind.simulators import simulator_for
 from tests.support.blind import SINGLE
 from tests.support.ways import BARE, bare_flights
 from tracks.common.files import plain
@@ -168,7 +167,7 @@ def test_a_case_is_the_same_to_the_bit_and_its_seed_matters(made_set, monkeypatc
     first, again = build(SINGLE), made_set / "cases" / "case_001" / "flight_1.parquet"
     np.testing.assert_array_equal(first.logs[0].pos_w, read_flight(again).pos_w)
     assert (first.logs[0].integrator, first.logs[0].step_s) == ("euler", 0.002)
-    stored = open_answers(made_set)["case_001"]
+    stored = make.open_answers(made_set)["case_001"]
     (effect,), (kept,) = plain(first.answer)["effects"], stored.pop("effects")
     assert {"kind", "verdict"} <= set(stored) and stored["verdict"] == "named"
     assert all(kept[key] == effect[key] for key in ("name", "parameters", "multiple"))
@@ -241,8 +240,8 @@ def test_a_continuous_cases_vehicle_has_the_loop_that_its_seed_draws(monkeypatch
     assert nominal == first.nominal and list(named) == ["linear_drag"]
     jumps = [np.diff(log.vel_w, 2, axis=0).std() for log in (exact, first.logs[0])]
     assert jumps[0] < 0.1 * jumps[1]
-    simulator = simulator_for(CONTINUOUS, np.random.default_rng(3))
+    simulator = simulators.simulator_for(CONTINUOUS, np.random.default_rng(3))
     drawn = draw_conditions(np.random.default_rng(3))
     assert simulator.conditions["row_hz"] == drawn.row_hz
     assert simulator.nominal.controller.frequency == drawn.loop_hz
-    assert not simulator_for(SINGLE, np.random.default_rng()).conditions
+    assert not simulators.simulator_for(SINGLE, np.random.default_rng()).conditions

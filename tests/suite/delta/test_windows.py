@@ -16,12 +16,11 @@ from policies.formats.policy_file import load_delta
 from policies.networks import delta_network
 from policies.spec import PolicySpec
 from suite.common.console import Console
-from suite.delta import quadrotor
+from suite.delta import quadrotor, run
 from suite.delta import windows as module
 from suite.delta.fit import FitConfig, window_errors
 from suite.delta.quadrotor import cut_quadrotor_windows, replay_quadrotor, row_period
 from suite.delta.replay import PointMassModel, nominal_model, replay_point_mass
-from suite.delta.run import fit_delta
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from suite.train.dynamics import point_mass
 from tests.support.broken_logs import rows
@@ -280,7 +279,7 @@ def test_a_fit_cuts_the_error_and_says_what_it_corrects(logs, tmp_path, monkeypa
         write_flight(tmp_path / "logs" / log.name.replace(" ", "-"), log)
     config = FitConfig(horizon_s=0.5, iterations=30, batch=32, rate=1e-2, held_out=0.5)
     quad = QuadrotorConfig(BARE, physics_hz=100.0)
-    result = fit_delta(config, quad, [tmp_path / "logs"], tmp_path / "out", Console())
+    result = run.fit_delta(config, quad, [tmp_path / "logs"], tmp_path / "out", Console())
     assert result.errors["without"].position_m > 0.05
     assert result.errors["delta_action"].position_m < 0.6 * result.errors["without"].position_m
     stored = load_delta(tmp_path / "out" / "delta")

@@ -9,7 +9,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from eval.judging.statistics import bootstrap_mean
 from eval.logs.flight_log import read_flights, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from policies import shipped
@@ -204,15 +203,6 @@ def test_differences_are_of_the_same_trials_and_none_is_called_none():
     assert "not significantly different from" in delta_action.verdict(equal, 40)
     cell = overall_grid(equal, delta_action.REFERENCES, delta_action.LABELS, 40).rows[2][4]
     assert cell.tone == "" and cell.text.startswith("+0 [")
-
-
-def test_bootstrap_of_a_mean_is_that_of_the_central_limit():
-    values = np.random.default_rng(3).exponential(2.0, 400)
-    found = bootstrap_mean(values)
-    assert found.value == pytest.approx(values.mean())
-    sides = np.array([found.high - found.value, found.value - found.low])
-    assert sides == pytest.approx(1.96 * values.std() / np.sqrt(len(values)), rel=0.1)
-    assert np.isnan(bootstrap_mean(np.array([]))).all()
 
 
 def test_standings_are_paired_by_trial():

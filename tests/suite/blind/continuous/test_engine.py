@@ -12,16 +12,14 @@ from eval.quadrotor.forces import wind_and_flow, wrench_on
 from eval.quadrotor.plant import Motion, accelerations, make_plant, unpack_command
 from eval.quadrotor.rotors import steady
 from eval.quadrotor.stepper import wanted_speed
-from suite.blind.continuous.air import FORCES, THRUSTS, TORQUES, Wind
+from suite.blind.continuous import air, engine, timing
 from suite.blind.continuous.body import POS, QUAT, RATE, VEL, Battery, Body
-from suite.blind.continuous.engine import fly
 from suite.blind.continuous.quadrotor import CONSTANTS, commanded_speeds, quadrotor_of
-from suite.blind.continuous.timing import schedule
 from tests.support.vehicles import PLAIN, drawn_effects, with_effects, with_lag
 
 FLIGHTS = 20
 OF_THE_LOOP = ("motor_lag", "command_delay", "rate_gain")
-ACTING = (*CONSTANTS, *THRUSTS, *FORCES, *TORQUES, "constant_wind")
+ACTING = (*CONSTANTS, *air.THRUSTS, *air.FORCES, *air.TORQUES, "constant_wind")
 ACTING = [name for name in ACTING if name not in OF_THE_LOOP]
 """Effects on a body whose rotor speeds are given."""
 
@@ -44,7 +42,7 @@ def test_a_body_accelerates_as_the_catalogue_says(names, by_time):
     first, speed, asked = rng.uniform(500.0, 2000.0, (3, FLIGHTS, 4))
     time_s, length_s = rng.uniform(0.0, 60.0, (FLIGHTS, 1)), np.full((FLIGHTS, 1), 0.01)
     quadrotor = quadrotor_of(vehicle)
-    wind = Wind(quadrotor.effects, FLIGHTS, rng)
+    wind = air.Wind(quadrotor.effects, FLIGHTS, rng)
     body = Body(quadrotor, wind, Battery(16.0, 0.1, 0.3), np.full((FLIGHTS, 1), 4e6))
     body.begin_row(0.0 * time_s, first)
     spin_up = (asked - speed) / length_s
@@ -67,12 +65,12 @@ def test_a_body_accelerates_as_the_catalogue_says(names, by_time):
 def test_a_battery_is_full_until_the_first_row():
     sag = SimpleNamespace(rate=0.01, per_volt=0.0)
     at = SimpleNamespace(time_s=np.array([[-1.0], [4.0]]), fallen_v=0.0)
-    thrust = THRUSTS["battery_sag"](sag, at, np.ones((2, 4)))  # type: ignore[arg-type]
+    thrust = air.THRUSTS["battery_sag"](sag, at, np.ones((2, 4)))  # type: ignore[arg-type]
     np.testing.assert_allclose(thrust, [[1.0] * 4, [0.96] * 4])
 
 
 def wind_of(flights, **effects):
-    return Wind(dict(with_effects(**effects).effects), flights, np.random.default_rng(1))
+    return air.Wind(dict(with_effects(**effects).effects), flights, np.random.default_rng(1))
 
 
 def test_without_wind_the_air_is_still_and_a_steady_wind_does_not_change():
@@ -159,8 +157,8 @@ def flown(vehicle, stamps, commands, speed=(0.0, 0.0, 0.0), push=None, loop_s=0.
         command = np.array([commands[min(seen.number, len(commands) - 1)]], dtype=float)
         return command, command
 
-    plan = schedule(stamps, loop_s, quadrotor.delay, step_s)
-    return fly(quadrotor, plan, start, pilot, np.random.default_rng(0), BATTERY, push)
+    plan = timing.schedule(stamps, loop_s, quadrotor.delay, step_s)
+    return engine.fly(quadrotor, plan, start, pilot, np.random.default_rng(0), BATTERY, push)
 
 
 def test_a_rotors_lag_is_that_of_first_order():

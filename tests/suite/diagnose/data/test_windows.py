@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.diagnose.data import sampling, steps
-from suite.diagnose.data.hold_out import choose_held_out
+from suite.diagnose.data import hold_out, sampling, steps
 from suite.diagnose.data.noise import noise_of, rotor_noise
 from suite.diagnose.data.windows import BURN_IN_S, LENGTH_S, SLICES, STEPS, cut, take
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
@@ -295,11 +294,11 @@ def test_what_one_flight_alone_identifies_is_fitted_and_of_a_single_one_the_end_
     windows, _ = cut(logs, PLAIN, False)
     information = np.ones((len(windows.flight), 2))
     information[windows.flight != 2, 1] = 1e-3
-    fitted, names = choose_held_out(logs, windows.flight, windows.start_s, information)
+    fitted, names = hold_out.choose_held_out(logs, windows.flight, windows.start_s, information)
     assert names == ["flight_1"] and set(windows.flight[fitted]) == {0, 2}
     windows, _ = cut([log], PLAIN, False)
     alike = np.ones((len(windows.flight), 1))
-    fitted, names = choose_held_out([log], windows.flight, windows.start_s, alike)
+    fitted, names = hold_out.choose_held_out([log], windows.flight, windows.start_s, alike)
     assert fitted.any() and not fitted[-1]
     assert names == [f"flight_0 from {windows.start_s[~fitted].min():.1f} s"]
 
@@ -308,7 +307,7 @@ def test_what_one_flight_alone_identifies_is_fitted_and_of_a_single_one_the_end_
 def test_windows_in_a_part_of_a_single_log_are_split_where_they_are(log, begin_s):
     start_s = begin_s + np.arange(0.0, 15.0, 0.5)
     long = replace(log, time_s=60.0 * np.linspace(0.0, 1.0, len(log.time_s)))
-    fitted, _ = choose_held_out([long], 0 * start_s, start_s, np.ones((len(start_s), 1)))
+    fitted, _ = hold_out.choose_held_out([long], 0 * start_s, start_s, np.ones((len(start_s), 1)))
     assert fitted.mean() == pytest.approx(THRESHOLDS.lone_fitted_share, abs=0.05)
 
 

@@ -80,8 +80,7 @@ def test_slopes_are_those_of_small_changes_and_a_disturbance_pushes_the_windows(
     model, windows, linear = linearised
     begin = rollouts.start_estimate(model, windows)
     index = model.space.layout.index(("linear_drag", "coefficient", 0))
-    step = np.zeros(model.size)
-    step[index] = 1e-4
+    step = 1e-4 * (np.arange(model.size) == index)
     ends = [model.residual(begin.theta + s * step, begin.free, windows) for s in (-1, 1)]
     slope = (ends[0] - ends[1]) / 2e-4
     np.testing.assert_allclose(linear.slope[..., index], slope, atol=1e-4)
@@ -101,26 +100,25 @@ def test_what_the_start_explains_is_projected_out(linearised):
     sigma = np.where(windows.valid.any(axis=(0, 1)), 0.01, np.nan)
     whitening = make_whitening(linear, colour.Noise(sigma, {}), windows)
     moved = np.random.default_rng(0).standard_normal((len(windows.flight), STATE))
-    slope = linear.start_slope
-    by_start = np.einsum("wnck,wk->wnc", slope, moved)
+    by_start = np.einsum("wnck,wk->wnc", linear.start_slope, moved)
     start_only = linear._replace(residual=by_start, offset=0.0 * linear.offset)
     block = block_of(whitening, start_only, range(3), windows)
     assert np.abs(block.residual).max() < 1e-6 * np.abs(by_start * whitening.weight).max()
     np.testing.assert_allclose(block.free[:, :STATE], moved, atol=1e-6)
     assert (whitening.slow_freedom >= -1e-9).all()
-    energy = []
-    for seed in range(10):
+
+    def energy(seed):
         noise = np.random.default_rng(seed).standard_normal(linear.residual.shape)
         white = linear._replace(residual=np.nan_to_num(sigma) * noise)
-        rest = block_of(whitening, white, (), windows).residual
-        energy.append(slow_energy(whitening, rest).sum())
+        return slow_energy(whitening, block_of(whitening, white, (), windows).residual).sum()
+
     # Noise alone gives one for each degree of freedom that the start leaves.
-    assert np.mean(energy) == pytest.approx(whitening.slow_freedom.sum(), rel=0.05)
+    mean = np.mean([energy(seed) for seed in range(10)])
+    assert mean == pytest.approx(whitening.slow_freedom.sum(), rel=0.05)
 
 
 def test_columns_that_depend_on_each_other_are_made_orthonormal_too():
-    rng = np.random.default_rng(0)
-    matrix = rng.standard_normal((3, 40, 4))
+    matrix = np.random.default_rng(0).standard_normal((3, 40, 4))
     for tall in (matrix, matrix[..., [0, 1, 2, 2]] + 1e-9 * matrix):
         base, upper = orthonormal(tall, 1e-5)
         np.testing.assert_allclose(base @ upper, tall, atol=1e-9)

@@ -7,12 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from suite.diagnose.identify.body import fit_force, fit_torque, force_unknowns, torque_unknowns
-from suite.diagnose.identify.drive import DrivenVehicle
+from suite.diagnose.identify import body, drive, flapping, loop
 from suite.diagnose.identify.fit import Fitted, KnownNumbers, NoWholeWindow, Rows, Unknown, fit
-from suite.diagnose.identify.flapping import flapping_of, perturbed_vehicles
 from suite.diagnose.identify.grid import LEANING, ROTOR_NOISE, STEP_S, FlightGrid
-from suite.diagnose.identify.loop import air_torque_unknowns, coupling_unknowns, loop_rates
 from tests.support import identified as known
 from tests.support import real_flights
 from tests.support.vehicles import PLAIN
@@ -120,13 +117,13 @@ def test_the_thrust_is_what_path_and_gravity_need_in_fast_windows_with_an_attitu
     """Of a flight that accelerates by 2 m/s^2 along x, its rotors at 1000 rad/s."""
     time_s, felt = STEP_S * np.arange(500), np.hypot(9.81, 2.0)
     turn = Rotation.from_euler("y", np.arctan2(2.0, 9.81)).as_matrix()
-    rot_w, driven = np.broadcast_to(turn, (500, 3, 3)), DrivenVehicle(PLAIN, "rotors")
+    rot_w, driven = np.broadcast_to(turn, (500, 3, 3)), drive.DrivenVehicle(PLAIN, "rotors")
 
     def fitted(name, speed=0.0):
         vel_w = np.outer(time_s, [2.0, 0.0, 0.0]) + [speed - 1.0, 0.0, 0.0]
         signals = {"vel_w": vel_w, "rotor_speed": np.full((500, 4), 1000.0), name: rot_w}
-        unknowns = force_unknowns(driven, False, leaning=name == LEANING)[:1]
-        return fit_force([FlightGrid("made", time_s, signals)], driven, unknowns, LAGS)
+        unknowns = body.force_unknowns(driven, False, leaning=name == LEANING)[:1]
+        return body.fit_force([FlightGrid("made", time_s, signals)], driven, unknowns, LAGS)
 
     by_rotors = 4e6 * PLAIN.rotors.thrust_coefficient / PLAIN.mass
     for name in ("rot_w", LEANING):
@@ -142,14 +139,14 @@ def rolled(noise, **limits):
     true = 1100.0 + 40.0 * swing[:, None] * np.sign(np.asarray(PLAIN.rotors.position)[:, 1])
     grid = FlightGrid("made", STEP_S * np.arange(count), {"rotor_speed": true})
     true_inertia = (2.0 * PLAIN.inertia[0], *PLAIN.inertia[1:])
-    driven = DrivenVehicle(replace(PLAIN, inertia=true_inertia), "rotors")
+    driven = drive.DrivenVehicle(replace(PLAIN, inertia=true_inertia), "rotors")
     _, turn_b = driven.at(LAGS).accelerations(grid, grid.rows(False))
     rate_b = STEP_S * (np.cumsum(turn_b, axis=0) - 0.5 * turn_b)
     drawn = noise * rng.standard_normal((2, count, 4))
     signals = {"rotor_speed": true + drawn[0], ROTOR_NOISE: drawn[1], "rate_b": rate_b}
-    unknowns = [torque_unknowns("rotors", 0.0, 0.0)[0]._replace(**limits)]
+    unknowns = [body.torque_unknowns("rotors", 0.0, 0.0)[0]._replace(**limits)]
     grid = grid._replace(signals=signals)
-    return fit_torque([grid], DrivenVehicle(PLAIN, "rotors"), unknowns, LAGS)
+    return body.fit_torque([grid], drive.DrivenVehicle(PLAIN, "rotors"), unknowns, LAGS)
 
 
 def test_noise_of_the_rotor_speeds_widens_the_interval_and_makes_no_body_heavier():
@@ -166,7 +163,7 @@ def test_noise_of_the_rotor_speeds_widens_the_interval_and_makes_no_body_heavier
 def test_flapping_is_within_its_interval_and_none_without_what_it_needs():
     true, flights = 4e-7, real_flights.flights
     blown = flights(3, 5, 5.0, blade_flapping=(true,))
-    entry = flapping_of(blown, real_flights.VEHICLE)
+    entry = flapping.flapping_of(blown, real_flights.VEHICLE)
     assert entry is not None and entry.key == "effects.blade_flapping.coefficient"
     ((low, high),), (value,) = entry.ci95, entry.value
     assert value == pytest.approx(true, rel=0.1)
@@ -176,7 +173,7 @@ def test_flapping_is_within_its_interval_and_none_without_what_it_needs():
     bare = [replace(log, rotor_speed=None, thrust_cmd=hover) for log in blown]
     without = flights(3, 6, 3.0)
     for logs in (level, bare, without):
-        assert flapping_of(logs, real_flights.VEHICLE) is None
+        assert flapping.flapping_of(logs, real_flights.VEHICLE) is None
 
 
 def fit_of(names, covariance):
@@ -189,8 +186,8 @@ def test_motors_are_off_by_their_covariance_and_inertia_by_its_own():
     start, covariance = known.start(), [[4e-4, 0, -1e-4], [0, 0.1, 0], [-1e-4, 0, 9e-4]]
     force = fit_of(("thrust", "drag_x", "curve"), covariance)
     torque = fit_of(("inertia_x", "inertia_y"), np.diag([0.01, 0.0004]))
-    driven = DrivenVehicle(start, "pwm", usual_command=0.5, usual_volts=15.0)
-    found = perturbed_vehicles(start, driven, force, torque)
+    driven = drive.DrivenVehicle(start, "pwm", usual_command=0.5, usual_volts=15.0)
+    found = flapping.perturbed_vehicles(start, driven, force, torque)
     assert len(found) == 4
     hover = [v.motors.thrust[0] * 0.5 + v.motors.thrust[1] * 0.25 for v in found[:2] if v.motors]
     off = np.log(np.array(hover) / sum(driven.usual_thrust))
@@ -200,7 +197,7 @@ def test_motors_are_off_by_their_covariance_and_inertia_by_its_own():
     assert all(v.motors == start.motors for v in found[2:])
 
 
-COUPLED = {unknown.name: unknown.start for unknown in coupling_unknowns(PLAIN)}
+COUPLED = {unknown.name: unknown.start for unknown in loop.coupling_unknowns(PLAIN)}
 
 
 def test_the_loop_follows_its_equations_integrated_by_another_method():
@@ -223,7 +220,7 @@ def test_the_loop_follows_its_equations_integrated_by_another_method():
     command = np.stack([wanted(t) for t in time_s])
     flight = FlightGrid("made", time_s, {"rate_cmd_b": command})
     # The command is joined here, not held: `delayed` takes it for half a step later.
-    rate = loop_rates(flight, fast, {"lag": lag_s, "late": lag_s - 0.5 * STEP_S, **COUPLED})
+    rate = loop.loop_rates(flight, fast, {"lag": lag_s, "late": lag_s - 0.5 * STEP_S, **COUPLED})
     # The plain linear loop is 0.085 rad/s off.
     assert np.abs(rate - exact)[200:].max() < 0.02
 
@@ -236,9 +233,9 @@ def test_moving_air_turns_by_its_torque_over_the_gain():
     vel_w = np.where(np.arange(400)[:, None] < 100, 0.0, [-2.0, -3.0, 0.0])
     bare = FlightGrid("made", time_s, {"rate_cmd_b": still})
     flight = bare._replace(signals={"rate_cmd_b": still, "vel_w": vel_w, "rot_w": rot_w})
-    assert [one.name for one in air_torque_unknowns([flight])] == ["air_x", "air_y"]
+    assert [one.name for one in loop.air_torque_unknowns([flight])] == ["air_x", "air_y"]
     numbers = {"lag": 0.03, "late": 0.03, **COUPLED, "air_x": 0.5, "air_y": 0.4}
-    rate = loop_rates(flight, PLAIN, numbers)
+    rate = loop.loop_rates(flight, PLAIN, numbers)
     gain = PLAIN.controller.rate_gain
     np.testing.assert_allclose(rate[-1], [0.5 * 2.0 / gain[0], 0.4 * 3.0 / gain[1], 0.0], rtol=1e-3)
-    assert air_torque_unknowns([flight, bare]) == []
+    assert loop.air_torque_unknowns([flight, bare]) == []

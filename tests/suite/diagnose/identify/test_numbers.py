@@ -230,8 +230,8 @@ def test_what_one_fit_leaves_and_another_identifies_is_identified():
     assert [line.split(":")[0] for line in not_identified(fitted, given)] == ["command_delay"]
 
 
-FORCE, TORQUE = found("thrust", "drag_x"), found("inertia_x", "late")
-COMPLETE = {"force": FORCE, "torque": TORQUE, "loop": found("gain_x")}
+COMPLETE = {"force": found("thrust", "drag_x"), "loop": found("gain_x")}
+COMPLETE |= {"torque": found("inertia_x", "late")}
 
 
 @pytest.mark.parametrize(
@@ -252,12 +252,6 @@ def test_what_has_no_column_or_never_both_is_reported(drive, without, broken, li
     fitted = {name: fit for name, fit in COMPLETE.items() if name != without}
     lines = not_attempted(flights, PLAIN, drive, fitted, [], [broken])
     assert lines == [] if line is None else any(re.match(line, text) for text in lines), lines
-
-
-def test_a_firmwares_loop_is_not_fitted():
-    firmware = replace(PLAIN, controller=replace(PLAIN.controller, kind="px4"))
-    (line,) = not_attempted([], firmware, "rotors", {"force": FORCE, "torque": TORQUE}, [])
-    assert line == "the rate loop: settings of a px4 loop are not fitted"
 
 
 def test_parts_that_do_not_exist_and_nothing_but_parts_to_leave_are_refused(tmp_path):

@@ -64,9 +64,8 @@ def test_each_view_names_its_own_effect_and_the_page_has_its_headline_first(by_v
     assert drag["view"] == "force" and 0.0 < drag["gap_removed"] <= 1.0 and low < 0.4 < high
     assert effects and all(effect["view"] == "torque" for effect in effects.values())
     assert set(found["gap"]["channels"]["force"]) == {"x", "y", "z"}
-    assert found["headline"].startswith(summary.answer(found)) and "linear_drag" in summary.answer(
-        found
-    )
+    answer = summary.answer(found)
+    assert found["headline"].startswith(answer) and "linear_drag" in answer
     text = html(page(by_views, found, "mass = 1", {"vehicle.toml"}))
     assert text.index(found["headline"][:40]) < text.index("data:image/png") < text.index("<table")
     assert "What was written" in text and "mass = 1" in text and "black box" in text
@@ -93,24 +92,22 @@ def test_numbers_of_views_are_those_that_are_judged_and_the_rest_has_its_reason(
     assert held[-1][3] == f"{100 * (1 - left):.0f} %"
     above = [one.source.name for one in by_views.findings if one.after.rms > 1.5 * one.after.floor]
     assert {one["view"] for one in rest["above_noise"]} == set(above)
-    loud = {**rest, "where": None, "above_noise": [
-        {"view": "torque", "error": 4.78, "noise_floor": 0.15, "unit": "rad/s^2",
-         "reason": "that logged signals hardly predict"}]}  # fmt: skip
+    torque = {"view": "torque", "error": 4.78, "noise_floor": 0.15, "unit": "rad/s^2"}
+    torque["reason"] = "that logged signals hardly predict"
+    loud = {**rest, "where": None, "above_noise": [torque]}
     words, table = sections.residual_section({**found, "unexplained": loud}).parts[:2]
     assert words == "Above the noise floor remains an error that logged signals hardly predict."
     assert texts(table)[0][:3] == ["torque", "4.78 rad/s²", "0.15"]
 
 
-def test_parts_of_the_dynamics_that_no_source_tests_are_listed(
-    by_views, drag, monkeypatch, capsys, tmp_path
-):
+def test_what_no_source_tests_is_listed(by_views, drag, monkeypatch, capsys, tmp_path):
+    """On the page and, under each verdict, on the console."""
     assert as_json.not_examined(drag) == []
     assert as_json.not_examined(by_views) == ["rate loop"]
     force = replace(by_views, findings=by_views.findings[:1])
     found = plain(as_json.diagnosis_json(force))
     assert found["not_examined"] == ["torque", "rate loop"] and found["verdict"] == "named"
     assert "torque, rate loop" in html(page(force, found, "", set()))
-    # The console prints them under each verdict.
     monkeypatch.setattr(run, "diagnose_files", lambda *_: {**found, "warnings": []})
     command(Config(flights=(tmp_path,), vehicle="v", out=tmp_path), Console())
     said = capsys.readouterr().out
@@ -139,10 +136,8 @@ def test_a_weak_motor_has_its_number_and_the_motors_that_it_may_be():
     assert (unsure["index"]["value"], unsure["index"]["ci95"]) == (2, [2, 3])
     several = as_json.parameters_json(space, "weak_motor", [at[1], at[3]], theta, width)
     assert several["index"] == {"value": [2, 4], "unit": "1", "ci95": [[2, 2], [4, 4]]}
-    labels = [
-        one.label for one in summary.components({"name": "weak_motor", "parameters": several})
-    ]
-    assert labels == ["scale 2 [1]", "scale 4 [1]"]
+    shown = summary.components({"name": "weak_motor", "parameters": several})
+    assert [one.label for one in shown] == ["scale 2 [1]", "scale 4 [1]"]
 
 
 def test_sections_show_the_numbers(drag, found):
@@ -153,9 +148,8 @@ def test_sections_show_the_numbers(drag, found):
     words = str(sections.residual_section(rest).parts[0])
     assert words.startswith("25 % of the error of rollouts") and words.endswith(": a shape.")
     assert "No structure beyond" in str(sections.residual_section(found).parts[0])
-    assert (
-        texts(sections.evidence_section(drag, found).parts[-1])[-1][0] == "with the named effects"
-    )
+    held = texts(sections.evidence_section(drag, found).parts[-1])
+    assert held[-1][0] == "with the named effects"
     tried = texts(sections.candidates_section(drag).parts[0])
     assert len(tried) > 10 and [row[0] for row in tried if row[3] == "named"] == ["linear_drag"]
     # A channel that no log measured is not in the table.

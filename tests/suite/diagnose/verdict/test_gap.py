@@ -94,18 +94,16 @@ def test_a_shape_that_grows_with_the_models_error_is_left_out_and_one_that_stays
     unit = np.zeros((2, 2, 6, 2))
     unit[..., 0, 0], unit[..., 5, 1] = [[1.0, 2.0], [3.0, 1.0]], [[2.0, 1.0], [1.0, 3.0]]
     unit = unit.reshape(2, 12, 2)
+    library = structure.ShapeLibrary(unit, ())
     hessian, names = np.tile(100.0 * np.eye(12), (2, 1, 1)), ("force", "torque")
 
     def of(error, physics):
         gradient = (hessian @ unit @ np.array([error, physics])[..., None])[..., 0]
-        return structure.DisturbanceEquations(
-            hessian, gradient, None, structure.ShapeLibrary(unit, ())
-        )
+        return structure.DisturbanceEquations(hessian, gradient, None, library)
 
     fine, coarse = of(0.3, 0.2), of(0.9, 0.21)
-    found = structure.ResidualStructure(
-        [structure.ShapeScore(n, 9.0, 5e-4, (k,)) for k, n in enumerate(names)], {}
-    )
+    shapes = [structure.ShapeScore(n, 9.0, 5e-4, (k,)) for k, n in enumerate(names)]
+    found = structure.ResidualStructure(shapes, {})
     for share, kept in ((0.5, ["torque"]), (0.1, ["force", "torque"])):
         left = structure.beyond_model_error(found, fine, coarse, share)
         assert [shape.label for shape in left.shapes] == kept
@@ -131,9 +129,8 @@ def test_lag_and_delay_are_estimated_separately(lag, delay):
     logs = fly_all([truth] * 2, range(2), duration_s=3.0, motors=True)
     (found,) = actuators.actuator_mismatches(logs, LAGGED)
     assert found.commanded_by == "nominal rate loop"
-    accuracy = 2e-3 if delay else 1e-3
-    assert found.time_constant == pytest.approx(lag, abs=accuracy)
-    assert found.delay == pytest.approx(delay, abs=accuracy)
+    both, accuracy = (found.time_constant, found.delay), 2e-3 if delay else 1e-3
+    assert both == pytest.approx((lag, delay), abs=accuracy)
     if delay:
         assert found.rms > 2.0 * found.rms_fitted
     else:
@@ -157,18 +154,16 @@ def test_a_rotor_that_does_not_reach_its_speed_is_seen_also_by_logged_motor_comm
 
 def test_logs_without_speeds_give_no_mismatch_and_speeds_of_another_controller_are_its_own(log):
     assert actuators.actuator_mismatches([with_speeds(log, None)], LAGGED) == []
-    speed = np.array(log.rotor_speed)
-    speed[::20] = np.nan
-    speed[5:60] = np.nan
-    assert len(actuators.actuator_mismatches([with_speeds(log, speed)], LAGGED)) <= 1
-    assert actuators.actuator_mismatches([with_speeds(log, np.nan * speed)], LAGGED) == []
+    row = np.arange(len(log.time_s))[:, None]
+    holes = np.where((row % 20 == 0) | ((row >= 5) & (row < 60)), np.nan, log.rotor_speed)
+    assert len(actuators.actuator_mismatches([with_speeds(log, holes)], LAGGED)) <= 1
+    assert actuators.actuator_mismatches([with_speeds(log, np.nan * log.rotor_speed)], LAGGED) == []
     other = with_speeds(log, np.roll(log.rotor_speed, 1, axis=1))
     assert actuators.flown_by_other_controller([other], LAGGED)
     assert not actuators.flown_by_other_controller([with_speeds(log, None)], LAGGED)
-    moved = with_effects(LAGGED, com_offset=((0.006, -0.004, 0.0),))
-    assert not actuators.flown_by_other_controller(
-        [fly(moved, 0, duration_s=2.0, motors=True)], LAGGED
-    )
+    truth = with_effects(LAGGED, com_offset=((0.006, -0.004, 0.0),))
+    moved = fly(truth, 0, duration_s=2.0, motors=True)
+    assert not actuators.flown_by_other_controller([moved], LAGGED)
 
 
 def test_columns_and_rate_loop_decide_what_can_be_the_input(log):

@@ -51,11 +51,7 @@ BELOW = {"share": 0.8, "explainable": 0.9, "where": "force x"}
         # Sources that name something are judged, and a swing always remains.
         ([True, False], [{"share": 0.1}, {"share": 0.8, **TORQUE}], Verdict("named", 0.1)),
         ([True], [{"share": 0.1, "swing": SWING}], SWUNG),
-        (
-            [True],
-            [{"share": 0.1, "swing": SWING, "where": "z"}],
-            Verdict("partly", 0.1, SWING.words),
-        ),
+        ([True], [{"share": 0.1, "swing": SWING, "where": "z"}], SWUNG),
         # Only an error above the noise decides.
         ([True] * 2, [BELOW, {"share": 0.2, **TORQUE}], Verdict("partly", 0.2, "torque y")),
         ([True] * 2, [BELOW, {"share": 0.8, **TORQUE}], Verdict("unknown", 0.8, "torque y")),

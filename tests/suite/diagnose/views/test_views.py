@@ -21,9 +21,6 @@ from tests.support.diagnosis_flights import fly_all
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import with_effects
 
-FALL = 0.08
-"""Of the battery's voltage [V/s]."""
-
 
 def found_in(logs, vehicle=VEHICLE, view=None):
     """Return what is named, with what could stand in its place, and the diagnosis."""
@@ -54,10 +51,8 @@ def test_a_thrust_that_the_force_view_excludes_is_contradicted(by_views, scale, 
     theta = space.array("start")
     theta[list(one.indices)] = scale
     evidence, at = force.judged.evidence, force.estimate._replace(theta=theta)
-    block = evidence.linearise(at, one.indices)
-    here = Evaluation(evidence, at, block)
-    named = (NamedEffect(one, 0.001, 1.0),)
-    torque = replace(force, named=named, last=here, judged=here)
+    here = Evaluation(evidence, at, evidence.linearise(at, one.indices))
+    torque = replace(force, named=(NamedEffect(one, 0.001, 1.0),), last=here, judged=here)
     assert [name for name, _ in contradicted(force, torque)] == [one] * count
 
 
@@ -77,19 +72,29 @@ def test_a_drag_of_the_file_makes_way_for_what_rotors_do_and_none_stands_for_ano
 def test_an_inertia_is_named_though_the_trim_of_each_flight_is_larger():
     logs = flights(4, seed=9, speed=4.0, inertia_scale=((0.8, 0.8, 0.8),))
     names, found = found_in(logs)
+    before, after = found.main.before, found.main.after
     assert set(names) == {"inertia_scale"}
     assert found.vehicle.effects["inertia_scale"].scale == pytest.approx((0.8, 0.8, 0.8), abs=0.02)
-    assert found.main.after.total > found.main.before.total  # with the flights' trims
-    assert found.main.after.rms < found.main.before.rms  # without them
-    assert found.main.after.energy.sum() < found.main.before.energy.sum()
+    # With the flights' trims, and without them.
+    assert after.total > before.total and after.rms < before.rms
+    assert after.energy.sum() < before.energy.sum()
 
 
 @pytest.mark.slow
-def test_a_slow_effect_is_no_noise_with_a_memory_however_long_the_flights():
-    _, found = found_in(flights(4, seed=6, duration_s=20.0, battery_sag=(0.004, 0.0)))
+@pytest.mark.parametrize(("rate", "duration_s", "fall"), [(0.004, 20.0, 0.0), (0.006, 12.0, 0.08)])
+def test_a_battery_that_sags_is_named_with_its_size(rate, duration_s, fall):
+    """By its voltage where that falls [V/s]; a slow effect is no noise with a memory."""
+    logs = flights(4, seed=6, duration_s=duration_s, battery_sag=(rate, 0.0))
+    if fall:
+        logs = [replace(log, voltage=16.8 - fall * (log.time_s - log.time_s[0])) for log in logs]
+    names, found = found_in(logs)
     ((_, name),) = found.named
-    assert name.candidate.name == "battery_sag" and 0.8 < name.share < 1.0
-    assert found.vehicle.effects["battery_sag"].rate == pytest.approx(0.004, rel=0.05)
+    assert set(names) == {"battery_sag"} and (fall == 0.0 or found.label == "named")
+    sag = found.vehicle.effects["battery_sag"]
+    if fall:
+        assert sag.per_volt == pytest.approx(rate / fall, rel=0.1)
+    else:
+        assert 0.8 < name.share < 1.0 and sag.rate == pytest.approx(rate, rel=0.05)
 
 
 def test_an_attitude_alone_shows_the_torque_as_finely_as_a_gyro():
@@ -100,10 +105,9 @@ def test_an_attitude_alone_shows_the_torque_as_finely_as_a_gyro():
 
 
 def test_a_black_box_explains_what_depends_on_the_motion_and_no_noise(by_views):
-    force = by_views.findings[0].search
-    fitted = force.last.evidence.flights
-    inputs = np.concatenate([inputs_of(flight) for flight in fitted])
-    flight = force.last.block.data.flight
+    last = by_views.findings[0].search.last
+    inputs = np.concatenate([inputs_of(flight) for flight in last.evidence.flights])
+    flight = last.block.data.flight
     noise = np.random.default_rng(0).standard_normal((len(flight), 3))
     said = inputs @ fit_black_box(inputs, noise, flight)
     assert closed_share(noise, noise - said, flight).max() < 0.2
@@ -116,8 +120,6 @@ def test_a_black_box_explains_what_depends_on_the_motion_and_no_noise(by_views):
 SIDE = (0.25, 0.45, 0.1)
 """A drag that is not the same along x and y, so that a heading changes what a wind does."""
 SLOW = {"speed": 1.5, "noise": 3.0, "linear_drag": (SIDE,)}
-
-
 WIND = {**SLOW, "constant_wind": ((1.5, -2.0, 0.0),)}
 
 
@@ -153,17 +155,6 @@ def pushed(extra, seed, duration_s=6.0):
     """Return flights with an acceleration that no effect of the catalogue makes."""
     seeds, extras = range(seed, seed + 4), [extra] * 4
     return fly_all([VEHICLE] * 4, seeds, duration_s, 3.0, motors=True, extras=extras)
-
-
-@pytest.mark.slow
-def test_a_battery_that_sags_with_its_voltage_is_named_with_its_size():
-    logs = [
-        replace(log, voltage=16.8 - FALL * (log.time_s - log.time_s[0]))
-        for log in flights(4, seed=6, duration_s=12.0, battery_sag=(0.006, 0.0))
-    ]
-    names, found = found_in(logs)
-    assert found.label == "named" and set(names) == {"battery_sag"}
-    assert found.vehicle.effects["battery_sag"].per_volt == pytest.approx(0.006 / FALL, rel=0.1)
 
 
 def drag_to_one_side(motion, t):
