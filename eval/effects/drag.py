@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from eval.effects.interface import Array, Effect, Flow, Parameter, along_z, per_axis
 from tracks.geometry.rotation import cross
 
@@ -104,6 +106,10 @@ class HubDrag(NamedTuple):
     """(...,) c: drag along body z, per speed of the hub and rotor speed [kg/rad]."""
 
 
+IN_PLANE, ALONG_Z = np.array([1.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+"""Body axes in the rotor plane, and across it."""
+
+
 def hub_drag_force(values: HubDrag, flow: Flow) -> Array:
     """Return the sum of the rotors' drags (..., 3) [N]."""
     return _hub_drags(values, flow).sum(axis=-2)
@@ -116,9 +122,9 @@ def hub_drag_torque(values: HubDrag, flow: Flow) -> Array:
 
 def _hub_drags(values: HubDrag, flow: Flow) -> Array:
     """Return the drag of each rotor, -Omega_i diag(k, k, c) (v_b + w x r_i) (..., 4, 3) [N]."""
-    arm_b, xp = flow.constants.rotor_position_b, flow.rate_b.__array_namespace__()
-    hub_vel_b = flow.air_vel_b[..., None, :] + cross(flow.rate_b[..., None, :], arm_b)
-    per_speed = xp.stack([values.in_plane, values.in_plane, values.axial], axis=-1)
+    turning_b = cross(flow.rate_b[..., None, :], flow.constants.rotor_position_b)
+    hub_vel_b = flow.air_vel_b[..., None, :] + turning_b
+    per_speed = per_axis(values.in_plane) * IN_PLANE + per_axis(values.axial) * ALONG_Z
     return -flow.rotor_speed[..., None] * per_speed[..., None, :] * hub_vel_b
 
 

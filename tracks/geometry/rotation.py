@@ -31,10 +31,11 @@ def to_local(rot_w: Array, vector_w: Array) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """Return a x b (..., 3); `numpy.cross` is several times slower on small arrays."""
-    xp = a.__array_namespace__()
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
-    return xp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+    parts = [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]
+    # Of one numpy and one JAX array the product is one of JAX.
+    return parts[0].__array_namespace__().stack(parts, axis=-1)
 
 
 def quat_to_rot(quat_wxyz: Array) -> Array:
