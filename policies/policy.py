@@ -76,7 +76,7 @@ MEMBERS: dict[str, tuple[Any, str]] = {
 """Member of a policy -> its type, and the type's name in messages."""
 
 
-def check_policy(policy: object) -> None:
+def check_is_policy(policy: object) -> None:
     """Refuse an object that is no policy.
 
     Raises:

@@ -91,13 +91,13 @@ def evaluate_policy(
         ValueError: for an argument that cannot be used, before the first flight.
     """
     from eval.judging.judge import JudgeOptions, fly
-    from policies.policy import check_policy, load_policy
+    from policies.policy import check_is_policy, load_policy
     from suite.judging.flying import policy_for_workers
     from suite.judging.requests import Evaluation
     from suite.judging.trials import read_trial_set
 
     loaded = load_policy(policy) if isinstance(policy, str | Path) else policy
-    check_policy(loaded)
+    check_is_policy(loaded)
     given: dict[str, Any] = {"track": track, "vehicle": vehicle}
     sources = {name: str(each) for name, each in given.items() if isinstance(each, str | Path)}
     objects = {name: each for name, each in given.items() if name not in sources}

@@ -70,11 +70,11 @@ def apply_log_faults(effects: Mapping[str, Values], log: Mapping[str, Array]) ->
 def time_shifted(time_s: Array, series: Array, offset: Array) -> Array:
     """Return `series` (T, K) at the times `time_s` (T,) - `offset` [s].
 
-    It is interpolated, and at the ends extrapolated, by the cubic polynomial through the four
-    nearest rows (Lagrange), or through fewer if there are fewer.
+    Between rows it is the cubic polynomial through the four nearest ones (Lagrange), or through
+    fewer if there are fewer. Beyond the ends it is the line through the first or last two rows.
     """
     xp = time_s.__array_namespace__()
-    source_s, count = time_s - offset, min(4, len(time_s))
+    count, source_s = min(4, len(time_s)), xp.clip(time_s - offset, time_s[0], time_s[-1])
     before = xp.searchsorted(time_s, source_s, side="right") - count // 2
     rows = xp.clip(before, 0, len(time_s) - count)[:, None] + xp.arange(count)
     at_s, shifted = time_s[rows], 0.0
@@ -84,7 +84,9 @@ def time_shifted(time_s: Array, series: Array, offset: Array) -> Array:
         for j in others:
             weight = weight * (source_s - at_s[:, j]) / (at_s[:, k] - at_s[:, j])
         shifted = shifted + weight[:, None] * series[rows[:, k]]
-    return shifted
+    beyond_s = (time_s - offset - source_s)[:, None]
+    slopes = xp.diff(series, axis=0) / xp.diff(time_s)[:, None]
+    return shifted + beyond_s * xp.where(beyond_s < 0.0, slopes[0], slopes[-1])
 
 
 def _delayed_poses(log: Mapping[str, Array], delay: Array) -> dict[str, Array]:

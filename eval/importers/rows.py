@@ -131,13 +131,13 @@ def row_times(
     if len(time_s) < 2:
         if valid.any():
             first_s, last_s = times[valid][[0, -1]] - origin_s
-            if len(inside) < 2 <= valid.sum():
+            if valid.sum() < 2:
+                reason = "only 1 row; two or more are needed"
+            elif len(inside) < valid.sum():
                 reason = (
                     f"no two rows between --start and --end; rows are from {first_s:.4g} to "
                     f"{last_s:.4g} s, counted from the file's first sample"
                 )
-            elif valid.sum() < 2:
-                reason = "only 1 row; two or more are needed"
             else:
                 reason = (
                     f"the log lasts {last_s - first_s:.2g} s; if it is longer, correct the unit of "

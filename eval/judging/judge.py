@@ -38,7 +38,7 @@ from eval.worlds.trial import (
     track_of,
 )
 from policies.observation import View, observe
-from policies.policy import Policy, check_policy
+from policies.policy import Policy, check_is_policy
 from tracks.common.work import Workers, run_pieces, usable_cores, worker_count
 from tracks.families import check_family
 from tracks.track import Track
@@ -195,7 +195,7 @@ def _workers(task: Task, trials: int) -> Workers:
 def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
     """Fly numbered trials in this process, and yield each one when it ends."""
     policy = task.policy if _is_policy(task.policy) else task.policy()
-    check_policy(policy)
+    check_is_policy(policy)
     options = task.options
     if task.world == REFERENCE:
         frequency = task.vehicle.controller.frequency

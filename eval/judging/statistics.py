@@ -216,7 +216,7 @@ def over_seeds(
     groups = [np.asarray(group, float) for group in (first, second) if group is not None]
     trial_count = groups[0].shape[1]
     for group in groups:
-        if group.ndim != 2 or min(group.shape) < 2 or group.shape[1] != trial_count:
+        if min(group.shape) < 2 or group.shape[1] != trial_count:
             raise ValueError(
                 "an interval over training seeds needs two or more seeds of each method and two or "
                 "more trials, the same for all; given are "

@@ -235,7 +235,7 @@ def as_numbers(values: np.ndarray, column: str, name: str) -> np.ndarray:
             if text is not None and text != "":
                 numbers[k] = float(text)
         except (TypeError, ValueError):
-            hint = "; delete a row of units below the names" if k == 0 else ""
+            hint = "; if this row has the units, delete it" if k == 0 else ""
             reason = f"{value!r} is not a number{hint}"
             raise FlightLogError(name, column, k + 1, reason) from None
     return numbers

@@ -75,8 +75,8 @@ def _check_rotors(vehicle: Vehicle) -> None:
         )
     if sum(rotors.spin):
         raise ValueError(
-            f"rotors.spin = {list(rotors.spin)}: two rotors must spin in each direction, so that "
-            "all of them push up in hover; rotors at opposite corners usually spin alike"
+            f"rotors.spin = {list(rotors.spin)}: two rotors must spin in each direction; "
+            "rotors at opposite corners usually spin alike"
         )
     weight = vehicle.mass * GRAVITY
     hover = np.linalg.solve(matrix, [weight, 0.0, 0.0, 0.0])

@@ -80,7 +80,7 @@ def rotorpy_parameters(vehicle: Vehicle) -> dict[str, Any]:
     parameters["k_z"] += float(values[AT_HUB].axial)
     if AT_HOVER in effects:
         # RotorPy's drag is a coefficient times the sum of the rotor speeds times the airspeed.
-        drag = mass * values[AT_HOVER].coefficient / (4.0 * _hover_speed(parameters))
+        drag = mass * values[AT_HOVER].coefficient / (4.0 * hover_speed(parameters))
         drag_x, drag_y, drag_z = (float(c) for c in drag)
         parameters["k_d"] += 0.5 * (drag_x + drag_y)
         parameters["k_z"] += drag_z
@@ -98,7 +98,7 @@ def _max_rotor_speed(vehicle: Vehicle) -> float:
     return max(speed_max, float(motor_speed(vehicle, np.asarray(1.0))))
 
 
-def _hover_speed(parameters: Mapping[str, Any]) -> float:
+def hover_speed(parameters: Mapping[str, Any]) -> float:
     """Return the speed of each rotor at hover [rad/s]."""
     return float(np.sqrt(parameters["mass"] * GRAVITY / (4.0 * parameters["k_eta"])))
 
@@ -124,26 +124,13 @@ def as_flown(vehicle: Vehicle) -> Vehicle:
     return replace(vehicle, name=f"{vehicle.name}, as RotorPy flies it", effects=effects)
 
 
-def damping_at_hover(parameters: Mapping[str, Any]) -> np.ndarray:
-    """Return the damping (3,) of rotations by the rotors' drag at their hubs, at hover [1/s].
-
-    A rotor at r with the speed W has the force -W diag(k_d, k_d, k_z) (w x r) if the body turns at
-    w. Its torque about the body's axes is divided by the inertia.
-    """
-    x2, y2, z2 = (np.array(list(parameters["rotor_pos"].values())) ** 2).sum(axis=0)
-    drag, lift = parameters["k_d"], parameters["k_z"]
-    torque = np.array([lift * y2 + drag * z2, lift * x2 + drag * z2, drag * (x2 + y2)])
-    inertia = np.array([parameters[name] for name in ("Ixx", "Iyy", "Izz")])
-    return _hover_speed(parameters) * torque / inertia
-
-
 def differences(vehicle: Vehicle) -> list[str]:
     """Return a sentence for each deviation of RotorPy's model from `vehicle`."""
     deviations = []
     if AT_HOVER in vehicle.effects:
         deviations.append(
-            f"{AT_HOVER}: RotorPy's drag is proportional to the rotors' speed (ours: rotor_drag, "
-            "inflow); flown as that, with the same force at hover's rotor speed"
+            f"{AT_HOVER}: RotorPy's drag is proportional to the rotors' speed (ours: {AT_HUB}); "
+            "flown as that, with the same force at hover's rotor speed"
         )
         coefficient = np.asarray(vehicle.effects[AT_HOVER].coefficient)
         if coefficient[0] != coefficient[1]:

@@ -94,7 +94,7 @@ def export_module(
 
     Raises:
         PolicyError: for a path with another ending, and where torch cannot export the module, the
-            judge refuses the file, or the actions are not finite.
+            judge refuses the file, or no action is finite.
     """
     if Path(path).suffix != ".onnx":
         raise PolicyError(f"{path}: the name of a module's file must end in .onnx")

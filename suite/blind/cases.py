@@ -87,14 +87,16 @@ def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:
 def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
     """Return the RotorPy set: single effects at both multiples, pairs of effects, and nulls.
 
-    The effects are those that RotorPy can simulate. Arguments and errors are those of `draw_cases`.
+    The effects are those that RotorPy can simulate and a diagnosis may name. Arguments and errors
+    are those of `draw_cases`.
     """
     rng = np.random.default_rng([seed, 1])
+    effects = [name for name in ROTORPY_EFFECTS if name in nameable_effects()]
     drawn: list[tuple[str, tuple[str, ...], float]] = [
-        ("single", (name,), m) for m in MULTIPLES for name in ROTORPY_EFFECTS
+        ("single", (name,), m) for m in MULTIPLES for name in effects
     ]
     for _ in range(ROTORPY_COUNTS["pair"]):
-        first, second = (str(name) for name in rng.choice(ROTORPY_EFFECTS, 2, replace=False))
+        first, second = (str(name) for name in rng.choice(effects, 2, replace=False))
         drawn.append(("pair", (first, second), MULTIPLES[1]))
     drawn += [("null", (), 0.0)] * ROTORPY_COUNTS["null"]
     # Keep the first ones of each kind in a random order, as many as its share.

@@ -27,7 +27,7 @@ from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
 from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle, with_effects
 from eval.worlds.rotorpy import Multirotor, StepInput
-from eval.worlds.rotorpy_vehicle import ROTORPY_EFFECTS, damping_at_hover, rotorpy_parameters
+from eval.worlds.rotorpy_vehicle import ROTORPY_EFFECTS, hover_speed, rotorpy_parameters
 from tracks.geometry.rotation import quat_to_rot
 
 DAMPING = "angular_damping"
@@ -121,6 +121,19 @@ def hub_damping(effects: Sequence[Mapping[str, Any]], vehicle: Vehicle) -> np.nd
         if effect["name"] in ("rotor_drag", "inflow")
     }
     return damping_at_hover(rotorpy_parameters(with_effects(vehicle, drags)))
+
+
+def damping_at_hover(parameters: Mapping[str, Any]) -> np.ndarray:
+    """Return the damping (3,) of rotations by the rotors' drag at their hubs, at hover [1/s].
+
+    A rotor at r with the speed W has the force -W diag(k_d, k_d, k_z) (w x r) if the body turns at
+    w. Its torque about the body's axes is divided by the inertia.
+    """
+    x2, y2, z2 = (np.array(list(parameters["rotor_pos"].values())) ** 2).sum(axis=0)
+    drag, lift = parameters["k_d"], parameters["k_z"]
+    torque = np.array([lift * y2 + drag * z2, lift * x2 + drag * z2, drag * (x2 + y2)])
+    inertia = np.array([parameters[name] for name in ("Ixx", "Iyy", "Izz")])
+    return hover_speed(parameters) * torque / inertia
 
 
 def is_hub_damping(effect: Mapping[str, Any], damping: np.ndarray) -> bool:

@@ -50,7 +50,7 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     if config.reference:
         before, notes = read_flights(flight_files(config.reference), partial=True)
         warnings = [*warnings, *notes]
-    findings = check_before_diagnosis([*logs, *before], CheckContext(vehicle), config.accept)
+    findings = check_before_diagnosis(logs, CheckContext(vehicle), config.accept, before)
     logs, slow = without_slow_rotors(logs)
     before, slow_before = without_slow_rotors(before)
     warnings = [*warnings, *lines_of(findings), *slow, *slow_before]

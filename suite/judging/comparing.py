@@ -62,8 +62,9 @@ def read_runs(folder: Path) -> list[Run]:
     names = list(dict.fromkeys(row.policy for row in results))
     flown = manners(judged.get("speed") or (), bool(judged.get("monitor")))
     endings = sorted((manner.label("") for manner in flown), key=len, reverse=True)
-    # The rows of each manner have the policies in their order in the summary.
-    digests = [policy.get("sha256") for policy in summary.get("policies") or [{}]]
+    # The summary has an entry for each label, in the order of the rows.
+    digests = [policy.get("sha256") for policy in summary.get("policies") or ()]
+    digests += [None] * (len(names) - len(digests))
     return [
         Run(
             f"{folder}" if len(names) == 1 else f"{folder}: {name}",
@@ -71,9 +72,9 @@ def read_runs(folder: Path) -> list[Run]:
             conditions,
             versions,
             next((ending for ending in endings if name.endswith(ending)), ""),
-            digests[number % len(digests)],
+            digest,
         )
-        for number, name in enumerate(names)
+        for name, digest in zip(names, digests, strict=False)
     ]
 
 

@@ -273,9 +273,7 @@ class Table:
             return self.values[key]
         if default is REQUIRED:
             where = f"[{self._place}]" if self._place else "the file"
-            similar = closest(key, [other for other in self.values if other not in self._known])
-            hint = f", or rename {shown(similar)}" if similar else ""
-            raise self._refused(f"{where} has no {key!r}; add it ({kind}){hint}")
+            raise self._refused(f"{where} has no {key!r}; add it ({kind})")
         return default
 
     def _at(self, key: str) -> str:

@@ -195,27 +195,32 @@ def with_fixes(log: FlightLog, readings: Readings) -> FlightLog:
 
 
 def check_before_diagnosis(
-    logs: Sequence[FlightLog], against: CheckContext, accept: Sequence[str] = ()
+    logs: Sequence[FlightLog],
+    against: CheckContext,
+    accept: Sequence[str] = (),
+    earlier: Sequence[FlightLog] = (),
 ) -> list[dict[str, Any]]:
     """Return the findings of logs and files as records, before a diagnosis or identification.
 
-    Known faults that are named in `accept` are ignored.
+    Known faults that are named in `accept` are ignored. The vehicle of `earlier` flights, before a
+    change, may have another name.
 
     Raises:
         ValueError: for a fault that a diagnosis would attribute to a wrong effect, or two copies of
             a flight, of which one could be held out to test the fit to the other.
     """
-    for number, log in enumerate(logs):
-        for other in logs[:number]:
+    flights = [*logs, *earlier]
+    for number, log in enumerate(flights):
+        for other in flights[:number]:
             if _is_copy(log, other):
                 raise ValueError(f"{other.name} and {log.name} are the same flight: give it once")
     unknown = [fault for fault in accept if fault not in FAULTS]
     if unknown:
         raise unknown_name("fault", unknown[0], list(FAULTS))
     found: list[tuple[Finding, str | None]] = [(f, None) for f in check_files(against)]
-    for log in logs:
+    for log in flights:
         found += [(finding, log.name) for finding in check_log(log, against)[0]]
-    found += check_same_vehicle(logs)
+    found += [*check_same_vehicle(logs), *check_same_vehicle(earlier)]
     stops = [(f, name) for f, name in found if f.is_open and f.fault not in accept]
     if stops:
         lines = [f"{name or 'the vehicle file'}: {line(f)}" for f, name in stops]

@@ -92,7 +92,7 @@ def check_same_vehicle(logs: Sequence[FlightLog]) -> list[tuple[Finding, str]]:
         for name, vehicle in named:
             if vehicle != usual:
                 text = f"is of vehicle {vehicle!r}; {count} of {len(named)} logs are of {usual!r}"
-                fix = "give only the logs of one vehicle"
+                fix = "give only the logs of one vehicle, imported with one --vehicle"
                 finding = Finding("doubt", "log", text, "vehicle_mixed", None, 0.95, fix)
                 found.append((finding, name))
     return found

@@ -84,7 +84,7 @@ class ParameterSpace:
         return np.array([getattr(entry, field) for entry in self.entries])
 
     def effects(self, theta: Array) -> dict[str, Any]:
-        """Return the values of every effect for `theta` (P,), numpy or JAX."""
+        """Return the values of the effects in `base` for `theta` (P,), numpy or JAX."""
         return effects_at(self.layout, self.base, theta)
 
     @property

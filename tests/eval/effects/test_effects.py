@@ -84,15 +84,19 @@ def test_an_effect_of_another_package_may_have_a_motion_of_its_own(monkeypatch, 
         step(plant, state._replace(carried={}), motion, inputs, 0.0)
 
 
-def test_a_cubic_series_is_shifted_exactly_also_beyond_its_ends_and_two_rows_along_a_line():
+def test_a_series_is_shifted_by_a_cubic_between_rows_and_goes_on_as_a_line_beyond_its_ends():
     time_s = np.array([0.0, 1.0, 2.5, 4.0, 4.5])
 
     def cubic(at_s):
         return (0.5 - 2.0 * at_s + at_s**2 - 0.3 * at_s**3)[:, None]
 
-    for offset in (0.5, -0.5, 0.0):
+    for offset, known in ((0.5, slice(1, None)), (-0.5, slice(None, -1)), (0.0, slice(None))):
         shifted = time_shifted(time_s, cubic(time_s), np.asarray(offset))
-        np.testing.assert_allclose(shifted, cubic(time_s - offset), atol=1e-9)
+        np.testing.assert_allclose(shifted[known], cubic(time_s - offset)[known], atol=1e-9)
+    # At rest, and then moving: before the start it has always been at rest.
+    moving = np.array([[1.0], [1.0], [1.0], [5.0], [9.0]])
+    assert time_shifted(time_s, moving, np.asarray(3.0))[0, 0] == 1.0
+    assert time_shifted(time_s, moving, np.asarray(-1.0))[-1, 0] == 17.0
     line = time_shifted(np.array([0.0, 2.0]), np.array([[1.0], [2.0]]), np.asarray(1.0))
     np.testing.assert_allclose(line, [[0.5], [1.5]])
 

@@ -83,7 +83,7 @@ BAD = [
     ("schema = 2\n" + GATE, "schema is 2, allowed is"),
     ("[[gates]]\ncenter=[0,0,1]\nwidth = 1\n", r"has no 'height'"),
     ("[[gates]]\ncenter=[0,0,1]\nwidht = 1\n", r"key 'widht' in .*Did you mean 'width'"),
-    (GATE + "[[boxes]]\nsise = [1, 1, 1]\ncenter = [9, 9, 9]\n", "has no 'size'.*rename 'sise'"),
+    (GATE + "[[boxes]]\nsise = [1, 1, 1]\ncenter = [9, 9, 9]\n", "has no 'size'; add it"),
     ("[[gates]]\ncenter = [0, 0, 1]\n", "allowed is one of: width and height"),
     (GATE + "radius = 0.5\n", r"\['width', 'radius'\], allowed is one of"),
     (GATE.replace("width = 1.0", 'width = "1"'), "width is '1'.*a number from 0.001"),
