@@ -319,9 +319,7 @@ def test_text_among_numbers_is_refused_with_its_row(tmp_path):
     with pytest.raises(FlightLogError, match=r"column rate_y, row 8: 'broken' is not a number$"):
         import_log(path)
     path.write_text("\n".join([NAMES, NAMES, *rows[8:]]))
-    with pytest.raises(
-        FlightLogError, match="row 1: 'time' is not a number; if this row has the un"
-    ):
+    with pytest.raises(FlightLogError, match="row 1: 'time' is not a number; if this row"):
         import_log(path)
     for mark in ";\t":
         path.write_text("\n".join([NAMES, *rows]).replace(",", mark))
