@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from eval.effects.interface import Array, Effect, Flow, Parameter, along_z, per_axis
 from tracks.geometry.rotation import cross
 
@@ -106,10 +104,6 @@ class HubDrag(NamedTuple):
     """(...,) c: drag along body z, per speed of the hub and rotor speed [kg/rad]."""
 
 
-IN_PLANE, ALONG_Z = np.array([1.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
-"""Body axes in the rotor plane, and across it."""
-
-
 def hub_drag_force(values: HubDrag, flow: Flow) -> Array:
     """Return the sum of the rotors' drags (..., 3) [N]."""
     return _hub_drags(values, flow).sum(axis=-2)
@@ -124,8 +118,9 @@ def _hub_drags(values: HubDrag, flow: Flow) -> Array:
     """Return the drag of each rotor, -Omega_i diag(k, k, c) (v_b + w x r_i) (..., 4, 3) [N]."""
     turning_b = cross(flow.rate_b[..., None, :], flow.constants.rotor_position_b)
     hub_vel_b = flow.air_vel_b[..., None, :] + turning_b
-    per_speed = per_axis(values.in_plane) * IN_PLANE + per_axis(values.axial) * ALONG_Z
-    return -flow.rotor_speed[..., None] * per_speed[..., None, :] * hub_vel_b
+    axial_b = along_z(hub_vel_b[..., 2])
+    in_plane, axial = (per_axis(per_axis(value)) for value in values)
+    return -flow.rotor_speed[..., None] * (in_plane * (hub_vel_b - axial_b) + axial * axial_b)
 
 
 HUB_DRAG = Effect(

@@ -7,7 +7,7 @@ Unknown columns of any origin are kept.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -289,6 +289,26 @@ def read_flight(path: str | Path, partial: bool = False, limits: bool = True) ->
         reason = f"a partial log, without {', '.join(log.partial)}; this command needs whole ones"
         raise FlightLogError(str(path), None, None, reason)
     return replace(log, warnings=(*warnings, *log.warnings))
+
+
+def logs_in(folder: Path) -> list[Path]:
+    """Return the flight logs in `folder`, sorted by name."""
+    return sorted([*folder.glob("*.parquet"), *folder.glob("*.csv")])
+
+
+def flight_files(paths: Sequence[Path]) -> list[Path]:
+    """Return the flight logs among `paths` and in folders among them, each once.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    files = []
+    for path in paths:
+        files += logs_in(path) if path.is_dir() else [path]
+    if not files:
+        folders = ", ".join(map(str, paths)) or "nowhere"
+        raise ValueError(f"no flight logs in {folders}; record some with suite collect")
+    return list({path.resolve(): path for path in reversed(files)}.values())[::-1]
 
 
 def read_flights(

@@ -17,7 +17,7 @@ from suite.common.running.hosts import ProcessOptions, connect, read_member
 from suite.common.startup import use_device
 from suite.train.config import TrainConfig
 from suite.train.overrides import PREFIX, check_owned, check_phases, phase_configs, with_changes
-from suite.train.recipes import finetune, named_recipe, with_iterations, with_model, with_sensors
+from suite.train.recipes import finetune, named_recipe, with_model, with_sensors
 from tracks.common.files import check_no_input, plain
 from tracks.input.ranges import Iterations, Range, Seed
 
@@ -85,7 +85,7 @@ class Config(Command):
 def resolve(config: Config) -> TrainConfig:
     """Return the configuration of the training that the options describe.
 
-    Later steps override earlier ones: recipe, model, fine-tuning, sensors, iterations, changes.
+    Later steps override earlier ones: recipe, model, fine-tuning, sensors, options and changes.
 
     Raises:
         ValueError: with what is allowed, for an unknown recipe, setting or vehicle, a setting given
@@ -110,9 +110,7 @@ def resolve(config: Config) -> TrainConfig:
         run = replace(finetune(run), seed=config.seed)
     if config.sensors is not None:
         run = with_sensors(run, config.sensors)
-    if config.iterations is not None:
-        run = with_iterations(run, config.iterations)
-    changes = [f"{path}={value}" for path, _, value in options[:2] if value is not None]
+    changes = [f"{path}={value}" for path, _, value in given]
     run = with_changes(run, [*changes, *config.set])
     check_phases(run)
     return run

@@ -16,7 +16,7 @@ import numpy as np
 from eval.logs.faults.check import kept_lines
 from eval.logs.faults.finding import line
 from eval.logs.faults.vehicle import check_same_vehicle
-from eval.logs.flight_log import FlightLog, read_flights
+from eval.logs.flight_log import FlightLog, flight_files, read_flights
 from policies.formats.checkpoint import save_arrays
 from policies.formats.policy_file import DELTA
 from suite.common.console import Console
@@ -49,22 +49,6 @@ def fitting_estimate(config: FitConfig, steps: float, through_quadrotor: bool) -
     if through_quadrotor:
         return Estimate(40 + total / PLANT_STEPS_S, 1.5e9)
     return Estimate(20 + total / POINT_STEPS_S, 8e8)
-
-
-def flight_files(paths: Sequence[Path]) -> list[Path]:
-    """Return the flight logs among `paths` and in folders among them, each once.
-
-    Raises:
-        ValueError: if there is none.
-    """
-    files = []
-    for path in paths:
-        logs = [*path.glob("*.parquet"), *path.glob("*.csv")] if path.is_dir() else [path]
-        files += sorted(logs)
-    if not files:
-        folders = ", ".join(map(str, paths)) or "nowhere"
-        raise ValueError(f"no flight logs in {folders}; record some with suite collect")
-    return list({path.resolve(): path for path in reversed(files)}.values())[::-1]
 
 
 def split(

@@ -6,12 +6,11 @@ from dataclasses import replace
 from typing import Any
 
 from eval.logs.faults.check import CheckContext, check_before_diagnosis, lines_of
-from eval.logs.flight_log import FlightLog, read_flights
+from eval.logs.flight_log import FlightLog, flight_files, read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console
 from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.report import write_report
-from suite.delta.run import flight_files
 from suite.diagnose.config import Config
 from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.diagnose import diagnose

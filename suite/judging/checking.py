@@ -62,9 +62,8 @@ def check_flight_files(
     )
     from eval.logs.faults.finding import Finding, finding_lines
     from eval.logs.faults.vehicle import check_same_vehicle
-    from eval.logs.flight_log import read_flights, write_flight
+    from eval.logs.flight_log import flight_files, read_flights, write_flight
     from eval.quadrotor.vehicle_file import load_vehicle
-    from suite.delta.run import flight_files
 
     # Check the files, then each flight; write the corrected flights.
     spec = None if policy is None else policy.spec

@@ -216,9 +216,10 @@ def _write_log(
 
 def _refuse_other_logs(out: Path, trial_set: TrialSet) -> None:
     """Refuse a folder with logs of other commands: a diagnosis would mix them with these."""
+    from eval.logs.flight_log import logs_in
+
     names = {log_name(t.track, t.difficulty, t.seed) for t in trial_set.trials}
-    logs = sorted(file.name for end in ("parquet", "csv") for file in out.glob(f"*.{end}"))
-    if others := [name for name in logs if name not in names]:
+    if others := [log.name for log in logs_in(out) if log.name not in names]:
         raise ValueError(
             f"{out} holds other flight logs ({others[0]} and so on), which suite diagnose would "
             "mix with the new ones; give another --out"

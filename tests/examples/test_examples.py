@@ -14,12 +14,11 @@ import pytest
 
 import suite
 from eval.effects import EFFECTS
-from eval.logs.flight_log import read_flights
+from eval.logs.flight_log import flight_files, read_flights
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules
 from policies.formats import torch_file
 from suite.commands import train as train_command
-from suite.delta.run import flight_files
 from suite.diagnose import run as diagnose_run
 from suite.train import run as train_run
 from suite.train.overrides import with_changes

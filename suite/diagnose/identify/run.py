@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from eval.logs.faults.check import CheckContext, check_before_diagnosis, lines_of
-from eval.logs.flight_log import read_flights
+from eval.logs.flight_log import flight_files, read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console
 from suite.common.provenance import stamp
-from suite.delta.run import flight_files
 from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.estimate.parameters import refuse_own_motion
 from suite.diagnose.identify.drive import unmodelled_effects

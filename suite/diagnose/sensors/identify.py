@@ -15,13 +15,12 @@ import numpy as np
 from eval.judging.statistics import Interval
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.check import kept_lines
-from eval.logs.flight_log import FlightLog, read_flights
+from eval.logs.flight_log import FlightLog, flight_files, read_flights
 from eval.sensors import SENSORS
 from eval.sensors.measured_state import AXES, GROUPS
 from eval.sensors.sensors_file import save_sensors, sensor_set
 from suite.common.console import Console
 from suite.common.provenance import stamp
-from suite.delta.run import flight_files
 from suite.diagnose.identify.numbers import Number, number_lines, numbers_json
 from suite.diagnose.sensors.clock import clock_of, on_gyro_clock
 from suite.diagnose.sensors.colour import SHORT_S, Coloured, Series, fit_colour

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from eval.logs.faults.finding import Finding
-from eval.logs.flight_log import write_flight
+from eval.logs.flight_log import flight_files, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies.formats.policy_file import load_delta
 from suite.common.console import Console
 from suite.delta.fit import FitConfig, _descend, _loss, identify, window_errors
 from suite.delta.replay import PointMassModel, check_corrects, describe_dynamics, nominal_model
-from suite.delta.run import errors_grid, fit_delta, flight_files, long_enough, split
+from suite.delta.run import errors_grid, fit_delta, long_enough, split
 from suite.delta.windows import cut_windows
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from suite.train.recipes import race, race_paper

@@ -17,7 +17,7 @@ from eval.effects.body import ComOffset, MassOffset, TorqueTrim
 from eval.judging.results import read_trials
 from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.check import CheckContext, check_before_diagnosis
-from eval.logs.flight_log import read_flights
+from eval.logs.flight_log import flight_files, read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import with_effects
 from policies.formats.checkpoint import WEIGHTS, save_arrays
@@ -27,7 +27,6 @@ from suite import cli
 from suite.common.console import Quiet
 from suite.delta.fit import DeltaFit, ReplayErrors
 from suite.delta.replay import nominal_model
-from suite.delta.run import flight_files
 from suite.loop import hidden_effect, work
 from suite.loop.compare import policy_results
 from suite.loop.config import resolve
