@@ -12,6 +12,9 @@ separated by commas, and all by default. For every parameter of a vehicle file t
 - the median half-width of the interval, relative to the true value,
 - mean and root mean square of the pulls. A pull is an error divided by the half-width of the
   interval. For exact intervals the mean is 0 and the root mean square 0.51.
+
+A second table, that of docs/results/identify.md, has a row for each parameter and a column for each
+case. Its entries are the number of intervals that contain the true value, of all intervals.
 """
 
 from __future__ import annotations
@@ -236,7 +239,8 @@ def main(count: int, seed: int, cases: Sequence[str], out: str) -> None:
     """Identify `count` vehicles, and print the table; the arguments are those of `measure`."""
     print("| log | number | estimated | covered | 95 % interval of that | half-width | pulls |")
     print("|---|---|---|---|---|---|---|")
-    for (case, key), rows in sorted(measure(count, seed, cases, out).items()):
+    measured = measure(count, seed, cases, out)
+    for (case, key), rows in sorted(measured.items()):
         pull, width = (np.array([row[k] for row in rows]) for k in (1, 2))
         covered = int((np.abs(pull) < 1.0).sum())
         low, high = wilson(covered, len(rows))[1:]
@@ -245,6 +249,21 @@ def main(count: int, seed: int, cases: Sequence[str], out: str) -> None:
             f"| {100 * low:.0f} to {100 * high:.0f} % | {100 * np.median(width):.1f} % "
             f"| {pull.mean():.2f}, {np.sqrt((pull**2).mean()):.2f} |"
         )
+    print("\n" + "\n".join(counts_table(measured, cases)))
+
+
+def counts_table(measured: Mapping[tuple[str, str], Sequence], cases: Sequence[str]) -> list[str]:
+    """Return the lines of the table of covered and all intervals, and of their sums."""
+    counts = {
+        place: np.array([sum(abs(pull) < 1.0 for _, pull, _ in rows), len(rows)])
+        for place, rows in measured.items()
+    }
+    lines = [f"| number | {' | '.join(cases)} |", "|---" * (len(cases) + 1) + "|"]
+    for key in dict.fromkeys(key for _, key in sorted(measured)):
+        entries = ("{}/{}".format(*counts.get((case, key), "--")) for case in cases)
+        lines.append(f"| `{key}` | {' | '.join(entries).replace('-/-', '–')} |")
+    covered, every = sum(counts.values())
+    return [*lines, f"\n{covered} of {every} intervals ({100 * covered / every:.1f} %)"]
 
 
 if __name__ == "__main__":
