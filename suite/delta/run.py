@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 
 from eval.logs.faults.check import kept_lines
-from eval.logs.faults.finding import line
-from eval.logs.faults.vehicle import check_same_vehicle
 from eval.logs.flight_log import FlightLog, flight_files, read_flights
 from policies.formats.checkpoint import save_arrays
 from policies.formats.policy_file import DELTA
@@ -108,8 +106,7 @@ def fit_delta(
     # Read the flights, and hold some of them out.
     logs, warnings = read_flights(flight_files(paths))
     logs, short = long_enough(logs, config.horizon_s)
-    mixed = [f"{name}: {line(finding)}" for finding, name in check_same_vehicle(logs)]
-    for warning in [*warnings, *short, *kept_lines(logs), *mixed]:
+    for warning in [*warnings, *short, *kept_lines(logs)]:
         console.note(f"warning: {warning}")
     groups = split(logs, config.held_out, config.seed)
     description = describe_dynamics(dynamics)

@@ -259,11 +259,14 @@ def lines_of(records: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def kept_lines(logs: Sequence[FlightLog]) -> list[str]:
-    """Return lines of text for the open findings that logs keep in their metadata.
+    """Return lines of text for the open findings that the metadata of logs show.
 
-    A command that does not check the logs prints them as warnings.
+    They are kept there, or the logs are of several vehicles. A command that does not check the logs
+    prints them as warnings.
     """
-    return [f"{log.name}: {line(f)}" for log in logs for f in findings_of(log.about) if f.is_open]
+    found = [(finding, log.name) for log in logs for finding in findings_of(log.about)]
+    found += check_same_vehicle(logs)
+    return [f"{name}: {line(finding)}" for finding, name in found if finding.is_open]
 
 
 def check_files(against: CheckContext) -> list[Finding]:

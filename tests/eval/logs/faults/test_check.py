@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eval.logs.faults.catalogue import FAULTS
-from eval.logs.faults.check import CheckContext, check_before_diagnosis, check_log
+from eval.logs.faults.check import CheckContext, check_before_diagnosis, check_log, kept_lines
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.reading import parse_readings, read_rows
 from tests.support.diagnosis_flights import fly
@@ -63,6 +63,9 @@ def test_logs_of_two_vehicles_are_refused_and_a_log_without_a_name_is_not():
     assert logs[2].name in str(error.value) and "--accept vehicle_mixed" in str(error.value)
     records = check_before_diagnosis(logs, CheckContext(), ["vehicle_mixed"])
     assert [r["flight"] for r in records if r["fault"] == "vehicle_mixed"] == [logs[2].name]
+    # Commands that do not check the logs, such as `suite identify --sensors`, warn.
+    (warning,) = kept_lines(logs)
+    assert warning.startswith(logs[2].name) and "vehicle 'other'" in warning
     check_before_diagnosis([*logs[:2], replace(logs[2], about={})], CheckContext())
     # Flights before a change may be of a vehicle file with another name.
     check_before_diagnosis(logs[:2], CheckContext(), earlier=logs[2:])
