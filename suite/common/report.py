@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -15,6 +16,8 @@ from tracks.common.grid import Grid, html_table
 
 TEMPLATE = Path(__file__).with_name("report.html")
 """HTML page with places for the contents of a report, and the style sheet."""
+OPTION = re.compile(r"--[a-z][a-z-]*")
+"""An option of a command in a text; it is set as code, and not broken at its hyphens."""
 
 
 @dataclass(frozen=True)
@@ -132,5 +135,10 @@ def _part(part: Part) -> str:
         summary = f"<summary>{escape(part.summary)}</summary>"
         return f"<details>{summary}<pre>{escape(part.text)}</pre></details>"
     if isinstance(part, Steps):
-        return f"<ol>{''.join(f'<li>{escape(text)}</li>' for text in part.texts)}</ol>"
-    return f"<p>{escape(part)}</p>"
+        return f"<ol>{''.join(f'<li>{_words(text)}</li>' for text in part.texts)}</ol>"
+    return f"<p>{_words(part)}</p>"
+
+
+def _words(text: str) -> str:
+    """Return a text as HTML, with options as code."""
+    return OPTION.sub(r"<code>\g<0></code>", escape(text))

@@ -79,8 +79,7 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
             actuator_mismatches(flown.logs, flown.vehicle, flown.limits)
         )
         if not config.no_recording:
-            fitted = diagnosis.main.theta if diagnosis.main.names else None
-            write_rollouts(out / "recording.rrd", flown, fitted)
+            write_rollouts(out / "recording.rrd", flown, diagnosis.main.search)
             files.add("recording.rrd")
     if config.plan:
         result["plan"] = write_plan(out / "plan", *trajectories_for(result))

@@ -10,9 +10,10 @@ from matplotlib.figure import Figure
 
 from eval.logs.flight_log import FlightLog
 from eval.view.comparison import ComparedFlight, Simulation, States, write_comparison
-from suite.common.charts import png, titled
+from suite.common.charts import plain_axes, png, titled
 from suite.diagnose.data.windows import FlightWindows, take
 from suite.diagnose.report.summary import superscripts
+from suite.diagnose.search.evaluation import SearchResult
 from suite.diagnose.sources.rollout_source import RolloutSource
 from suite.diagnose.sources.source import Series
 from tracks.geometry.rotation import exp_rot, rot_to_quat
@@ -22,33 +23,40 @@ MEASURED, BEFORE, AFTER = "#1d2430", "#8b93a1", "#2463c9"
 
 
 def series_chart(series: Series) -> bytes:
-    """Draw held-out flights, measured and simulated, as a PNG."""
-    figure = Figure(figsize=(9.0, 3.1), layout="constrained")
-    axes = figure.subplots()
+    """Draw held-out flights, measured and simulated, as a PNG.
+
+    Below are the errors, measured - simulated, if the horizontal axis is the time.
+    """
+    figure = Figure(figsize=(9.0, 3.7), layout="constrained")
+    is_over_time = series.x_label != "flight"
+    panels = figure.subplots(1 + is_over_time, sharex=True, squeeze=False)[:, 0]
     measured: dict[str, Any] = {"lw": 1.6}
     simulated: dict[str, Any] = {"lw": 1.4}
-    if series.x_label == "flight":
+    if not is_over_time:
         measured = {"ls": "", "marker": "o", "ms": 9.0, "mfc": "none"}
         simulated = {"ls": "", "marker": "x", "mew": 2.0}
-        axes.set_xticks(series.x)
-    axes.plot(series.x, series.measured, color=MEASURED, label="measured", **measured)
+        panels[0].set_xticks(series.x)
+    panels[0].plot(series.x, series.measured, color=MEASURED, label="measured", **measured)
     for (label, values), colour in zip(series.simulated.items(), (BEFORE, AFTER), strict=False):
-        axes.plot(series.x, values, color=colour, label=label, **simulated)
-    axes.set_xlabel(series.x_label, fontsize=8)
+        panels[0].plot(series.x, values, color=colour, label=label, **simulated)
+        if is_over_time:
+            panels[1].plot(series.x, series.measured - values, color=colour, lw=1.0)
+    titled(panels[0], superscripts(series.label))
+    for axes in panels[1:]:
+        axes.set_ylabel("measured -\nsimulated", fontsize=8)
+        plain_axes(axes)
+    panels[-1].set_xlabel(series.x_label, fontsize=8)
     figure.legend(fontsize=8, frameon=False, ncols=3, loc="outside lower center")
-    titled(axes, superscripts(series.label))
     return png(figure)
 
 
-def write_rollouts(path: Path, flown: RolloutSource, fitted: np.ndarray | None) -> Path:
+def write_rollouts(path: Path, flown: RolloutSource, found: SearchResult) -> Path:
     """Write held-out flights, measured and simulated in rollouts of 1 s, as a recording (.rrd).
-
-    `fitted` (P,) are the parameters with the named effects; None if nothing was named.
 
     Raises:
         OSError: if the file cannot be written; no partial file remains.
     """
-    windows, simulated = flown.simulated(fitted)
+    windows, simulated = flown.simulated(found)
     flights = []
     for number in np.unique(windows.flight):
         rows = np.flatnonzero(windows.flight == number)

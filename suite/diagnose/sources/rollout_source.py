@@ -61,6 +61,7 @@ from suite.diagnose.verdict.gap import (
     overlap,
     remaining_share,
     rollout_size,
+    start_correction,
 )
 from suite.diagnose.verdict.residual_structure import (
     DisturbanceEquations,
@@ -72,13 +73,12 @@ from suite.diagnose.verdict.residual_structure import (
 
 SHOWN = 4
 """Number of held-out flights in pictures and recordings."""
+GIVEN = "simulated as given"
+"""Label of the vehicle file's model in pictures and recordings."""
 ROUNDING_S = 1e-6
 """Start times that differ by less are equal [s]."""
 SHAPES = 5
 """Largest number of shapes of the residual (functions of the state) in the report."""
-CLEAR_NOISE = 4.0
-"""A chart shows the axis with the clearest error: squared errors count above this many noise
-variances."""
 
 
 def of_rollouts(evaluation: Evaluation) -> RolloutEvidence:
@@ -284,25 +284,28 @@ class RolloutSource(Source):
         share = np.where(is_raised, least / np.maximum(noise, TINY), 0.0)
         return float(min(share.max(), 1.0))
 
-    def simulated(self, fitted: np.ndarray | None) -> tuple[FlightWindows, dict[str, np.ndarray]]:
+    def simulated(self, found: SearchResult) -> tuple[FlightWindows, dict[str, np.ndarray]]:
         """Return 1 s windows of some held-out flights, and their errors by label of the model.
 
-        The errors are measured - simulated (W, N, 19). One entry is with the vehicle file's
-        parameters. If other parameters `fitted` (P,) are given, a second entry is with these.
+        The errors are measured - simulated (W, N, 19), with the vehicle file's parameters, and if
+        something is named also with the fitted ones. Both start from the state that fits the better
+        model (`start_correction`).
         """
         windows = self.cut(LENGTH_S, np.unique(self.held.flight)[:SHOWN].tolist())
         windows = take(windows, np.asarray(windows.start_s) >= self.since_s - ROUNDING_S)
-        series = {"simulated as given": self.start.theta}
-        if fitted is not None:
-            series["simulated with the named effects"] = fitted
-        return windows, {
-            label: self.model.residual(theta, true_starts(self.model, theta, windows), windows)
-            for label, theta in series.items()
-        }
+        noise, best = of_rollouts(found.last).noise, found.estimate.theta
+        correction = start_correction(self.model, best, windows, noise, self.limits)
+
+        def errors(theta: np.ndarray) -> np.ndarray:
+            start = true_starts(self.model, theta, windows) + correction
+            return self.model.residual(theta, start, windows)
+
+        named = {"simulated with the named effects": errors(best)} if found.named else {}
+        return windows, {GIVEN: errors(self.start.theta), **named}
 
     def series(self, found: SearchResult) -> Series:
         """Return a held-out flight along the axis with the clearest error, see `Source`."""
-        windows, simulated = self.simulated(found.estimate.theta if found.named else None)
+        windows, simulated = self.simulated(found)
         rows = np.asarray(windows.flight) == windows.flight[0]
         groups = ("position", "velocity", "rates")
         channels = np.concatenate([np.r_[SLICES[group]] for group in groups])
@@ -311,12 +314,11 @@ class RolloutSource(Source):
         )[rows]
         is_logged = np.asarray(windows.valid)[rows][..., channels]
         errors = {label: values[rows][..., channels] for label, values in simulated.items()}
-        # The axis with the largest squared error beyond noise, next to the variance of the motion.
-        error = np.ma.masked_invalid(np.where(is_logged, next(iter(errors.values())), np.nan))
-        motion = np.ma.array(measured, mask=error.mask).var(axis=(0, 1))
-        noise = of_rollouts(found.last).noise.sigma[channels] ** 2
-        excess = (error**2).mean(axis=(0, 1)) - CLEAR_NOISE * noise
-        channel = int((excess / np.ma.maximum(motion, noise)).filled(-np.inf).argmax())
+        # The axis with the largest error of the vehicle file's model, relative to the noise.
+        error = np.where(is_logged, errors[GIVEN], np.nan)
+        power = np.ma.masked_invalid(error**2).mean(axis=(0, 1)).filled(0.0)
+        noise = np.nan_to_num(of_rollouts(found.last).noise.sigma[channels], nan=np.inf)
+        channel = int((power / noise**2).argmax())
         group, axis = groups[channel // 3], "xyz"[channel % 3]
         time_s = (np.asarray(windows.start_s)[:, None] + np.asarray(windows.row_s))[rows]
         value = np.where(is_logged, measured, np.nan)[..., channel]
@@ -331,8 +333,9 @@ class RolloutSource(Source):
             {label: line(value - error[..., channel]) for label, error in errors.items()},
             f"{group.capitalize()} along {'body' if group == 'rates' else 'world'} {axis} "
             f"[{UNITS[group]}]",
-            "A held-out flight in rollouts of a second from measured states, along the axis where "
-            "the error is largest next to the motion.",
+            "A held-out flight in rollouts of a second. Each starts from the measured state, "
+            "corrected within its noise. Shown is the axis where the error is largest in units of "
+            "noise.",
         )
 
 

@@ -31,12 +31,21 @@ from suite.diagnose.data.whitening import (
     rotor_spread,
     slow_energy,
 )
-from suite.diagnose.data.windows import LENGTH_S, SLICES, STATE, STATE_GROUPS, FlightWindows
+from suite.diagnose.data.windows import (
+    LENGTH_S,
+    SLICES,
+    STATE,
+    STATE_GROUPS,
+    FlightWindows,
+    take,
+)
 from suite.diagnose.evidence.rollouts import RolloutModel, true_starts
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 HORIZONS_S = (0.1, 0.5, 1.0)
 """Times after the start at which plain errors of rollouts are reported [s]."""
+START_SIGMAS = 3.0
+"""Largest correction of a number of a start state, in standard deviations of its noise."""
 
 
 def rms_length(vectors: np.ndarray) -> float:
@@ -129,6 +138,28 @@ def from_true_starts(
     """
     offset = true_starts(model, theta, windows)
     return model.linearise(theta, offset, windows, [*indices, *model.starts])
+
+
+def start_correction(
+    model: RolloutModel, theta: np.ndarray, windows: FlightWindows, noise: Noise, limits: Thresholds
+) -> np.ndarray:
+    """Return corrections (W, F) of the true start states, fitted to all rows of each window.
+
+    The noise of a measured start state grows along a rollout. So each number of the state is
+    corrected by what fits the model with `theta` (P,) best, but at most by `START_SIGMAS`. Windows
+    in which the model diverges, and the rotor speeds, are not corrected.
+    """
+    linear = from_true_starts(model, theta, windows)
+    flies = np.isfinite(linear.residual).all(axis=(1, 2))
+    flies &= np.isfinite(linear.slope).all(axis=(1, 2, 3))
+    correction = np.zeros_like(linear.offset)
+    if flies.any():
+        linear, windows = take(linear, flies), take(windows, flies)
+        whitening = make_whitening(linear, noise, windows, limits)
+        best = block_of(whitening, linear, (), windows).free[:, :STATE]
+        most = START_SIGMAS * np.nan_to_num(noise.sigma[:STATE])
+        correction[flies, :STATE] = np.clip(best, -most, most)
+    return correction
 
 
 def gap_of(

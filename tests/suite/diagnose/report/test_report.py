@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -169,10 +169,14 @@ def test_a_log_is_shown_with_duration_rate_holes_and_signals():
 
 def test_the_chart_shows_measured_next_to_simulated(drag, monkeypatch):
     series = drag.main.source.series(drag.main.search)
-    monkeypatch.setattr(charts, "png", lambda figure: figure.axes[0])
-    axes: Any = series_chart(series)
-    labels = [line.get_label() for line in axes.lines if not line.get_label().startswith("_")]
+    monkeypatch.setattr(charts, "png", lambda figure: figure.axes)
+    over, below = cast(Any, series_chart(series))
+    labels = [line.get_label() for line in over.lines if not line.get_label().startswith("_")]
     assert labels == ["measured", *series.simulated] and len(series.simulated) == 2
+    for line, simulated in zip(below.lines, series.simulated.values(), strict=True):
+        np.testing.assert_array_equal(line.get_ydata(), series.measured - simulated)
+    given, named = (np.nanstd(line.get_ydata()) for line in below.lines)
+    assert named < 0.2 * given
 
 
 DRAG = {

@@ -8,13 +8,14 @@ import pytest
 
 from suite.diagnose.data.colour import Noise
 from suite.diagnose.data.whitening import Linearisation
-from suite.diagnose.data.windows import CHANNELS, STATE
+from suite.diagnose.data.windows import CHANNELS, SLICES, STATE
 from suite.diagnose.diagnose import diagnose
+from suite.diagnose.evidence.rollouts import true_starts
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict import actuators, model_error
 from suite.diagnose.verdict import residual_structure as structure
-from suite.diagnose.verdict.gap import Gap, gap_of, overlap
+from suite.diagnose.verdict.gap import Gap, gap_of, overlap, start_correction
 from tests.support.diagnosis_flights import NOISE, fly, fly_all
 from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
 
@@ -72,6 +73,26 @@ def test_an_error_is_read_where_its_signal_was_measured():
     last = gap_of(linear, windows, Noise(sigma, {})).channels["1 s"]
     assert last["position"].error == pytest.approx(0.99**2, rel=1e-6)
     assert last["velocity"].error == pytest.approx(2.0, rel=1e-6)
+
+
+def test_rollouts_for_a_picture_start_from_states_that_fit_all_rows(flown, found_drag):
+    """The noise of a measured start state would hide what the model explains."""
+    found, windows = found_drag.search, flown.held
+    theta, noise = found.estimate.theta, found.last.evidence.noise
+    measured = true_starts(flown.model, theta, windows)
+    correction = start_correction(flown.model, theta, windows, noise, flown.limits)
+    assert (np.abs(correction[:, :STATE]) <= 3.0 * noise.sigma[:STATE] + 1e-12).all()
+    assert not correction[:, STATE:].any()
+    position = SLICES["position"]
+    rms = [
+        np.sqrt((flown.model.residual(theta, start, windows)[..., position] ** 2).mean())
+        for start in (measured, measured + correction)
+    ]
+    assert rms[1] < 1.1 * noise.sigma[position].max() < 0.5 * rms[0]
+    # Windows in which the model diverges keep the measured state.
+    wrong = theta.copy()
+    wrong[:] = np.nan
+    assert not start_correction(flown.model, wrong, windows, noise, flown.limits).any()
 
 
 def test_a_window_that_diverges_is_left_out_and_one_without_an_error_counts(monkeypatch):
