@@ -262,7 +262,7 @@ def counts_table(measured: Mapping[tuple[str, str], Sequence], cases: Sequence[s
     for key in dict.fromkeys(key for _, key in sorted(measured)):
         entries = ("{}/{}".format(*counts.get((case, key), "--")) for case in cases)
         lines.append(f"| `{key}` | {' | '.join(entries).replace('-/-', '–')} |")
-    covered, every = sum(counts.values())
+    covered, every = np.sum([*counts.values()], axis=0)
     return [*lines, f"\n{covered} of {every} intervals ({100 * covered / every:.1f} %)"]
 
 
