@@ -39,7 +39,7 @@ from tracks.common.grid import Grid, markdown
 
 NOMINAL, CONTROL, DELTA, NAMED, BOTH = "nominal", "control", "delta", "named", "both"
 LABELS = {
-    NOMINAL: "before, nothing hidden",
+    NOMINAL: "before, no hidden effect",
     BEFORE: "before",
     CONTROL: "control",
     DELTA: "with delta",
