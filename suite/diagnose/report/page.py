@@ -25,6 +25,7 @@ from suite.diagnose.report.sections import (
 from suite.diagnose.report.summary import (
     cells,
     components,
+    figure,
     grid,
     next_steps,
     short_name,
@@ -70,9 +71,9 @@ def page(diagnosis: Diagnosis, result: Mapping[str, Any], toml: str, files: set[
     `files` are the paths of those of `FILES` that exist.
     """
     gap, flown = result["gap"], rollouts_of(diagnosis.main)
-    after = f" → {gap['after']:.3g}" if result["effects"] else ""
+    after = f" → {figure(gap['after'])}" if result["effects"] else ""
     facts = {
-        "gap on held-out flights": superscripts(f"{gap['before']:.3g}{after} {gap['unit']}"),
+        "gap on held-out flights": superscripts(f"{figure(gap['before'])}{after} {gap['unit']}"),
         "noise floor": f"{gap['noise_floor']:.3g}",
         "held out": _few(gap["held_out"]),
         "driven by": result["driven_by"],

@@ -42,14 +42,14 @@ def headline(result: Mapping[str, Any]) -> str:
     """Return the answer of a diagnosis.json: effects, sizes, verdict, gap, and what remains."""
     words, gap = [answer(result)], result["gap"]
     # The unit of rollouts is the noise floor itself.
-    floor = "" if gap["noise_floor"] == 1.0 else f" (noise floor {_figure(gap['noise_floor'])})"
-    before, after = f"{_figure(gap['before'])} to ", f"{_figure(gap['after'])} {gap['unit']}"
+    floor = "" if gap["noise_floor"] == 1.0 else f" (noise floor {figure(gap['noise_floor'])})"
+    before, after = f"{figure(gap['before'])} to ", f"{figure(gap['after'])} {gap['unit']}"
     if gap["after"] < gap["before"]:
         words.append(f"On held-out flights the {gap['of']} falls from {before}{after}{floor}.")
     elif not result["effects"]:
         words.append(f"On held-out flights the {gap['of']} is {after}{floor}.")
     offsets = [
-        f"{_figure(offset['after'])} {offset['unit']} ({view})"
+        f"{figure(offset['after'])} {offset['unit']} ({view})"
         for view, offset in gap["offset"].items()
         if offset["after"] >= result["relevance"].get(view, 0.0)
     ]
@@ -68,8 +68,10 @@ def superscripts(text: str) -> str:
     return text.replace("^2", "²")
 
 
-def _figure(value: float) -> str:
-    """Return a gap as text; logs without noise give values such as 1e-10."""
+def figure(value: float) -> str:
+    """Return a gap as text; logs without noise give values such as 1e-10 and 41,400."""
+    if value >= 1000.0:
+        return f"{value:,.0f}"
     return f"{value:.3g}" if value >= LEAST_SHOWN else f"less than {LEAST_SHOWN:g}"
 
 

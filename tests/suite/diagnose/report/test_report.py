@@ -196,6 +196,14 @@ def entries(verdict, effects=(), where=None, **more):
     return {**base, **more}
 
 
+@pytest.mark.parametrize(
+    ("gap", "text"),
+    [(41_400.0, "41,400"), (328.4, "328"), (1.03, "1.03"), (1e-10, "less than 0.001")],
+)
+def test_a_gap_is_printed_without_powers_of_ten(gap, text):
+    assert summary.figure(gap) == text
+
+
 def test_an_answer_has_the_effect_its_values_and_its_size_or_what_is_too_small():
     assert summary.answer(entries("named", [DRAG])) == (
         "Wrong or missing in the vehicle file: Drag proportional to the airspeed (linear_drag or "
