@@ -146,8 +146,9 @@ def start_correction(
     """Return corrections (W, F) of the true start states, fitted to all rows of each window.
 
     The noise of a measured start state grows along a rollout. So each number of the state is
-    corrected by what fits the model with `theta` (P,) best, but at most by `START_SIGMAS`. Windows
-    in which the model diverges, and the rotor speeds, are not corrected.
+    corrected by what fits the model with `theta` (P,) best, but at most by `START_SIGMAS`; without
+    a limit where nothing was measured. Windows in which the model diverges, and the rotor speeds,
+    are not corrected.
     """
     linear = from_true_starts(model, theta, windows)
     flies = np.isfinite(linear.residual).all(axis=(1, 2))
@@ -157,7 +158,7 @@ def start_correction(
         linear, windows = take(linear, flies), take(windows, flies)
         whitening = make_whitening(linear, noise, windows, limits)
         best = block_of(whitening, linear, (), windows).free[:, :STATE]
-        most = START_SIGMAS * np.nan_to_num(noise.sigma[:STATE])
+        most = START_SIGMAS * np.nan_to_num(noise.sigma[:STATE], nan=np.inf)
         correction[flies, :STATE] = np.clip(best, -most, most)
     return correction
 
