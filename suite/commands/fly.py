@@ -59,6 +59,14 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             f"--link {config.link}: set points would move a vehicle; read docs/fly.md, do its "
             "checks, then add --confirm"
         )
+    defaults = type(config).flown
+    if config.link and (
+        config.flown.vehicle == defaults.vehicle or config.flown.track == defaults.track
+    ):
+        raise ValueError(
+            f"--link {config.link}: give the vehicle file (--vehicle) and the course (--track) of "
+            "this vehicle; the defaults, reference and zigzag, are for simulated vehicles"
+        )
     if config.link and config.flown.time_limit_s != Flights().time_limit_s:
         raise ValueError(
             "--time-limit-s ends simulated flights only; leave it out with --link: a real flight "

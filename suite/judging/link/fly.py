@@ -158,6 +158,12 @@ def _fly_real_vehicle(
     link = UdpLink(address, wire.is_from_peer)
     track = track_of(trial_set.tracks, trial)
     companion = Companion(policy, track, trial_set.vehicle, wire, time.monotonic, limits)
+    vehicle = trial_set.vehicle
+    console.say(
+        f"vehicle {vehicle.name}: full thrust per mass is {vehicle.full_thrust:.3g} m/s^2; track "
+        f"{trial.track}; messages are "
+        + ("signed" if key else "not signed: whoever reaches the link can steer the vehicle")
+    )
     console.say(
         f"waiting for states and images on {address}; Ctrl-C returns control to the autopilot"
     )

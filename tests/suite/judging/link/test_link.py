@@ -238,13 +238,17 @@ def test_a_link_on_which_nobody_is_ends_and_a_vehicle_that_waits_is_called(
     assert Wire(1, 2).decode(heard) == []
 
 
-REAL = "fly --link udpin:127.0.0.1:0 --out"
+LINK = "fly --link udpin:127.0.0.1:0 --out"
+REAL = LINK.replace("--out", "--track tracks/examples/yard.toml --vehicle crazyflie21 --out")
 
 
 def test_a_real_vehicle_needs_the_operators_word(capsys, tmp_path, monkeypatch):
     assert "docs/fly.md" in refused(capsys, REAL, tmp_path)
     assert "silence-s" in refused(capsys, REAL, tmp_path, "--silence-s", "-1")
     confirmed = (REAL, tmp_path, "--confirm")
+    for one in ("--vehicle racer5", "--track tracks/examples/yard.toml"):
+        said = refused(capsys, f"{LINK} {tmp_path} --confirm {one}")
+        assert "the vehicle file (--vehicle) and the course (--track)" in said
     assert "--link flies one flight" in refused(capsys, *confirmed, "--trials", "3")
     assert "--time-limit-s ends simulated" in refused(capsys, *confirmed, "--time-limit-s", "5")
 
@@ -258,7 +262,9 @@ def test_a_real_vehicle_needs_the_operators_word(capsys, tmp_path, monkeypatch):
     ):  # fmt: skip
         monkeypatch.setattr(fly, "fly_link", fly_nowhere)
         assert run(*confirmed) == 1
-        assert words in printed(capsys)
+        assert words in (said := printed(capsys))
+        assert "crazyflie21: full thrust per mass is 20.4" in said and "yard.toml" in said
+        assert "messages are not signed" in said
 
 
 def test_an_operator_who_ends_a_flight_is_told_to_the_vehicle_and_its_log_stays(
@@ -290,7 +296,7 @@ def test_each_limit_has_an_option(capsys, tmp_path, monkeypatch):
 
 
 def printed(capsys):
-    return " ".join(capsys.readouterr().err.split())
+    return " ".join("".join(capsys.readouterr()).split())
 
 
 def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first(
