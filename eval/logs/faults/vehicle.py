@@ -19,12 +19,16 @@ LIFT = (1.15, 20.0)
 ROUND = (0.015, 2.5)
 """Usual inertia about x and y over mass times arm squared: small where the mass is near the centre,
 large where it is at the rotors or beyond."""
+TORQUE_M = (0.001, 0.2)
+"""Plausible ratio of a rotor's torque to its thrust [m]; usual are 0.005 to 0.05."""
+GAIN = 1.0
+"""Smallest plausible gain of the nominal rate loop [1/s]."""
 FOV_DEG = 2.0
 """Fields of view that differ by at most this belong to the same camera [deg]."""
 
 
 def check_vehicle_numbers(vehicle: Vehicle) -> list[Finding]:
-    """Return findings on implausible parameters: arm length, full thrust over weight, inertia."""
+    """Return findings on implausible arms, thrust, inertia, rotor torque and rate gains."""
     found = []
     hubs = np.asarray(vehicle.rotors.position)
     arm = float(np.mean(np.hypot(hubs[:, 0], hubs[:, 1])))
@@ -52,7 +56,34 @@ def check_vehicle_numbers(vehicle: Vehicle) -> list[Finding]:
         )
         fix = "inertia in kg m^2, of this vehicle, or rotors.position in m"
         found.append(Finding("doubt", "vehicle", text, "vehicle_inertia", gyration, 0.93, fix))
+    found += [*_rotor_torque(vehicle), *_rate_gain(vehicle)]
     return found or [Finding("ok", "vehicle", f"full thrust is {lift:.3g} times the weight")]
+
+
+def _rotor_torque(vehicle: Vehicle) -> list[Finding]:
+    """Return a finding if the ratio of a rotor's torque to its thrust is implausible."""
+    torque = vehicle.rotors.torque_coefficient
+    ratio_m = torque / vehicle.rotors.thrust_coefficient
+    if TORQUE_M[0] <= ratio_m <= TORQUE_M[1]:
+        return []
+    text = f"torque_coefficient / thrust_coefficient is {ratio_m:.3g} m; usual are 0.005 to 0.05 m"
+    fix = "rotors.torque_coefficient in N m/(rad/s)^2"
+    if TORQUE_M[0] <= torque <= TORQUE_M[1]:
+        fix = "PX4's KM is this ratio: torque_coefficient = KM * thrust_coefficient"
+    return [Finding("doubt", "vehicle", text, "vehicle_torque", ratio_m, 0.95, fix)]
+
+
+def _rate_gain(vehicle: Vehicle) -> list[Finding]:
+    """Return a finding if the gain of the nominal rate loop is implausibly small."""
+    gain = min(vehicle.controller.rate_gain)
+    if vehicle.controller.kind != "p" or gain >= GAIN:
+        return []
+    text = f"the smallest controller.rate_gain is {gain:.3g} 1/s; usual are 5 to 40 1/s"
+    fix = (
+        "gains are 1/s: angular acceleration for each rad/s of rate error; a firmware's PID gains "
+        "have other units (docs/measure.md)"
+    )
+    return [Finding("doubt", "vehicle", text, "vehicle_gain", gain, 0.95, fix)]
 
 
 def _gyration(vehicle: Vehicle, arm: float) -> float:

@@ -72,6 +72,21 @@ def test_arms_in_cm_or_mm_are_converted_by_the_divisor_that_fits_the_inertia(
     assert finding.fix == f"rotors.position in m: divide by {divisor}"
 
 
+@pytest.mark.parametrize(
+    ("torque", "gain", "fault", "fix"),
+    [
+        (0.01375, (20.0, 20.0, 8.0), "vehicle_torque", "torque_coefficient = KM * thrust"),
+        (2.2e-12, (20.0, 20.0, 8.0), "vehicle_torque", "in N m/(rad/s)^2"),
+        (2.2e-8, (0.15, 0.15, 0.2), "vehicle_gain", "angular acceleration for each rad/s"),
+    ],
+)
+def test_numbers_copied_from_a_firmware_are_doubted(torque, gain, fault, fix):
+    rotors = replace(PLAIN.rotors, torque_coefficient=torque)
+    wrong = replace(PLAIN, rotors=rotors, controller=replace(PLAIN.controller, rate_gain=gain))
+    (finding,) = check_vehicle_numbers(wrong)
+    assert finding.fault == fault and fix in finding.fix
+
+
 def thrust(factor, vehicle=PLAIN):
     time_s = np.arange(0.0, 4.0, 0.01)
     force = 9.81 + 2.0 * np.sin(3.0 * time_s)
