@@ -47,8 +47,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     pictures = []
     if is_track_file(config.track):
         from tracks.formats.custom import load_track
+        from tracks.formats.plausibility import track_notes
 
         tracks = [load_track(Path(config.track))]
+        for note in track_notes(config.track, tracks[0]):
+            console.note(note)
         if config.difficulty != Config.difficulty:
             console.note(NO_LEVELS)
     else:

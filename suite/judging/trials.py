@@ -25,11 +25,6 @@ if TYPE_CHECKING:
 
 LEVELS = tuple(range(10))
 """The levels of difficulty, from easy to hard."""
-GATE_MOST_M, TRACK_MOST_M = 50.0, 5000.0
-"""Largest plausible width of a gate and size of a track [m]. Above them a note asks whether the
-file is in millimetres."""
-
-
 NO_LEVELS = "a track from a file has no levels, so --difficulty does not change it"
 """Note if a level is given for a track from a file."""
 
@@ -157,6 +152,7 @@ def read_trial_set(
     from eval.sensors.sensors_file import load_sensors
     from eval.worlds import differences, world_class
     from eval.worlds.engine import refuse_start_contact
+    from tracks.formats.plausibility import track_notes
 
     world_class(options.simulator)
     check_ranges(options, options=True)
@@ -186,23 +182,10 @@ def read_trial_set(
         notes += [f"{name}: {NO_LEVELS}" for name in tracks]
     for name, custom in tracks.items():
         refuse_start_contact(name, custom, vehicle)
-        notes += [*_in_millimetres(name, custom), *_too_small(name, custom, vehicle)]
+        notes += [*track_notes(name, custom), *_too_small(name, custom, vehicle)]
     trials = trial_list(names, levels, options.trials, options.seed, once)
     simulator_differences = differences(options.simulator, vehicle)
     return TrialSet(trials, tracks, vehicle, sensors, simulator_differences, notes)
-
-
-def _in_millimetres(name: str, track: Track) -> list[str]:
-    """Return a note if the size of the gates or of the track suggests a file in millimetres."""
-    gates = track.scene.gates
-    opening = float((gates.opening_g.max(1) - gates.opening_g.min(1)).max())
-    extent = float((gates.center_w.max(0) - gates.center_w.min(0)).max())
-    if opening <= GATE_MOST_M and extent <= TRACK_MOST_M:
-        return []
-    return [
-        f"{name}: its largest gate is {opening:g} m wide and its gates are up to {extent:g} m "
-        "apart; is the file in millimetres? Lengths are in metres: divide them by 1000"
-    ]
 
 
 def _too_small(name: str, track: Track, vehicle: Vehicle) -> list[str]:

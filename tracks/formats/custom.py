@@ -269,20 +269,20 @@ def _refuse_inside(top: Table, track: Track, frame_names: list[str]) -> None:
     gates, frames = track.scene.gates, set(frame_names)
     corners_w = gates.center_w[:, None] + gates.opening_g @ np.swapaxes(gates.rot_w[:, :, 1:], 1, 2)
     for name, mesh in solid_meshes(track):
-        if _is_inside(mesh, track.start_pos_w):
+        if is_inside(mesh, track.start_pos_w):
             allowed = f"a position outside of every solid; this one is inside {name!r}"
             raise top.error("start.position", track.start_pos_w.tolist(), allowed)
         if name in frames:
             continue
         # A solid is convex: if it contains an opening's corners, it contains the opening.
-        blocked = _is_inside(mesh, corners_w).all(axis=-1)
+        blocked = is_inside(mesh, corners_w).all(axis=-1)
         if blocked.any():
             gate = int(np.argmax(blocked))
             allowed = f"a place outside of every solid; the opening is inside {name!r}"
             raise top.error(f"gates[{gate}].center", gates.center_w[gate].tolist(), allowed)
 
 
-def _is_inside(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+def is_inside(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
     """Return which points (..., 3) are inside a convex mesh."""
     origin = np.asarray(mesh.triangles)[:, 0]
     side = np.sum((points[..., None, :] - origin) * mesh.face_normals, axis=-1)

@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -34,10 +34,11 @@ from suite.judging import checking, flying
 from suite.judging.content import PolicyContent, policy_digest
 from suite.judging.flying import Manner, manners, policy_labels, workers_for
 from suite.judging.requests import Collection, Evaluation
-from suite.judging.trials import _in_millimetres, _too_small, read_trial_set, trial_list
+from suite.judging.trials import _too_small, read_trial_set, trial_list
 from tests.support.commands import evaluate, refused
 from tests.support.courses import IN_CONTACT, straight
 from tests.support.engines import STAND_IN
+from tests.support.pilots import Pursuit
 from tests.support.tools import python
 from tests.support.vehicles import with_effects
 from tracks.common.work.pickling import pack, unpack
@@ -85,6 +86,36 @@ def test_an_object_that_is_no_policy_or_whose_act_returns_something_else_is_refu
         for trials in (2, 3):
             with pytest.raises(ValueError, match=rf"act returned {said}.* tuple \(action, hidden"):
                 suite.evaluate_policy(members, track="zigzag", difficulty=0, trials=trials)
+
+
+def test_an_object_whose_rows_depend_on_each_other_is_refused_and_one_with_memory_warns(
+    monkeypatch,
+):
+    monkeypatch.setattr(eval.judging.judge, "fly", lambda *_, **__: [])
+
+    @dataclass
+    class Own(Pursuit):
+        kind: str = ""
+        calls: int = 0
+
+        def act(self, hidden, state, image, fresh):
+            action, hidden = super().act(hidden, state, image, fresh)
+            self.calls += 1
+            return {
+                "mean": action - state.mean(0)[:3],
+                "image": action - image.mean(),
+                "count": action / len(state),
+                "memory": action + np.float32(self.calls),
+            }.get(self.kind, action), hidden
+
+    for kind in ("mean", "image", "count"):
+        with pytest.raises(ValueError, match="'pursuit': a row's action changes by .* other rows"):
+            suite.evaluate_policy(Own(kind=kind), trials=1)
+    policy = Own(kind="memory")
+    with pytest.warns(UserWarning, match="the same inputs gave two answers"):
+        suite.evaluate_policy(policy, trials=1)
+    assert policy.calls == 0
+    suite.evaluate_policy(Own(), trials=1)
 
 
 def test_a_track_file_is_flown_once_a_seed_and_once_where_nothing_acts_by_chance(pilots, tmp_path):
@@ -297,14 +328,12 @@ def onnx_file(folder):
 FLIGHT = min(path.name for path in example.FOLDER.glob("*.parquet"))
 
 
-def test_a_track_in_millimetres_or_with_gates_smaller_than_the_body_is_reported():
-    track = straight()
-    assert _in_millimetres("here", track) == []
-    gates = track.scene.gates._replace(center_w=1000 * track.scene.gates.center_w)
-    gates = gates._replace(opening_g=1000 * gates.opening_g)
-    large = replace(track, scene=track.scene._replace(gates=gates))
-    assert "millimetres" in _in_millimetres("here", large)[0]
-    vehicle = load_vehicle("reference")
+def test_a_track_with_gates_smaller_than_the_body_or_far_apart_is_reported(tmp_path):
+    far = tmp_path / "far.toml"
+    far.write_text("[[gates]]\ncenter = [0, 0, 1300]\nwidth = 1\nheight = 1\n")
+    far.write_text(far.read_text() + far.read_text().replace("[0,", "[5000,"))
+    assert "5000 m apart" in read_trial_set(Evaluation(track=str(far), trials=1)).notes[0]
+    track, vehicle = straight(), load_vehicle("reference")
     assert _too_small("here", track, vehicle) == []
     gates = track.scene.gates
     small = gates._replace(opening_g=gates.opening_g * [1e-3, 1e-5])
@@ -367,4 +396,5 @@ def test_check_reports_the_contract_and_an_unscaled_file_that_says_nothing(tmp_p
     faults = [finding["fault"] for finding in answer["findings"]]
     assert faults[0] == "no_contract" and "action_scale" in faults
     assert "30 Hz" in answer["findings"][0]["evidence"]
+    assert "78.4 x 63.8 deg, range 10 m" in answer["findings"][0]["evidence"]
     assert answer["contract"]["digest"] == contract_of(PolicySpec()).digest

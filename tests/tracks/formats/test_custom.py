@@ -12,6 +12,7 @@ import trimesh
 from tracks.formats import mesh_reader
 from tracks.formats.custom import load_track
 from tracks.formats.mesh_reader import load_convex_parts
+from tracks.formats.plausibility import track_notes
 
 GATE = """
 [[gates]]
@@ -27,8 +28,25 @@ def write(folder, text):
     return path
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (GATE.replace("1.5]", "1500]") + GATE.replace("0, 1.5]", "4000, 1500]"), "4000 m apart"),
+        (GATE.replace("1.0", "30.0").replace("1.5]", "40]"), "30 m wide"),
+        (GATE + GATE, "gates 0 and 1 have the same place and direction"),
+        (GATE + GATE.replace("0, 1.5]", "5, 1.5]\nyaw_deg = 1.5708"), "gate 1 has a yaw of 1.571"),
+        (GATE + '[[spheres]]\nname = "tree"\ncenter = [0, 0, 1.5]\nradius = 0.3\n',
+         "the centre of gate 0 is inside 'tree'"),
+    ],
+)  # fmt: skip
+def test_probable_mistakes_in_a_track_are_noted(tmp_path, text, said):
+    (note,) = track_notes("mine", load_track(write(tmp_path, text)))
+    assert note.startswith("mine: ") and said in note
+
+
 def test_the_example_is_read_as_it_says(root):
     track = load_track(root / "tracks" / "examples" / "yard.toml")
+    assert not track_notes("yard", track)
     gates = track.scene.gates
     assert (track.family, track.level, track.seed) == ("yard", 0, 0)
     assert gates.opening_g.shape == (4, 12, 2)
