@@ -257,6 +257,7 @@ def summary(contract: Contract) -> str:
     return (
         f"{contract.rate_hz:g} Hz; state of {size} numbers in SI units; image "
         f"{' x '.join(map(str, image.shape))}, camera {image.pitch_deg:g} deg up, "
+        f"field of view {image.fov_deg[0]:g} x {image.fov_deg[1]:g} deg, range {image.far_m:g} m, "
         f"{image.scale_m:g}/depth - {image.offset:g}{levels}; action {action.kind} "
         f"[{', '.join(dict.fromkeys(action.unit))}], {scaled}, {action.frame}"
     )

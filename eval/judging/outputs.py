@@ -8,15 +8,18 @@ accelerates.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from eval.effects.interface import GRAVITY
 from eval.judging.guard import ActionLimits, Guarded
 from eval.worlds.trial import TrialResult
-from policies.policy import Policy
-from policies.spec import ActionSpec, Note, PolicySpec
+from policies.block_policy import ROUNDING
+from policies.policy import Policy, checked_act
+from policies.spec import ACTION_SIZE, STATE_SIZE, ActionSpec, Note, PolicySpec
 
 LIMITED_MOST = 0.05
 """Share of limited actions above which there is a warning."""
@@ -32,6 +35,10 @@ LIFT = 3.0
 outputs probably contain gravity."""
 CLEAR = 0.5
 """Smallest difference of outputs between gates on opposite sides that counts [m/s^2]."""
+FOV_LEAST_DEG = 10.0
+"""If both fields of view are smaller than this [deg], they are probably in radians."""
+THRUST = (3.0, 40.0)
+"""Plausible mean of the commanded thrust per mass [m/s^2]."""
 UNIT_FIX = "check the unit of its output"
 SCALE_FIX = (
     "export it with the contract (units, scales, frames) of its environment, or set action.scale; "
@@ -43,8 +50,6 @@ IMAGE_FACTOR, NO_CHANGE = 1.5, 1e-3
 VEL_B, UP_B, GATE_B = slice(0, 3), slice(3, 6), slice(6, 9)
 """Parts of a state observation (`policies.observation`), in body axes: velocity, the world's z
 axis, the next gate's centre."""
-ACTION_B = slice(9, 12)
-"""Last action, an acceleration in body axes."""
 ASIDE_M, AHEAD_M, SPEED, STEPS = 2.0, 6.0, 3.0, 10
 """Distances of the test gate to the side and ahead [m], forward speed [m/s], number of steps."""
 
@@ -133,9 +138,28 @@ def notes_of(policy: Policy) -> tuple[Note, ...]:
 
 
 def probable_faults(policy: Policy) -> tuple[Note, ...]:
-    """Return the probable faults of unit, scale and frame in the policy's outputs."""
-    if policy.spec.action.kind != "acceleration":
+    """Return the probable faults of unit, scale and frame in the policy's camera and outputs."""
+    kind, fov_deg = policy.spec.action.kind, policy.spec.camera.fov_deg
+    notes: tuple[Note, ...] = ()
+    if max(fov_deg) < FOV_LEAST_DEG:
+        text = f"{policy.name}: its camera sees only {fov_deg[0]:g} x {fov_deg[1]:g} deg"
+        notes = (Note("camera_fov", text, "camera.fov_deg in degrees, not radians"),)
+    checks = {"acceleration": _acceleration_faults, "ctbr": _thrust_faults}
+    return (*notes, *checks[kind](policy)) if kind in checks else notes
+
+
+def _thrust_faults(policy: Policy) -> tuple[Note, ...]:
+    """Return a note if the mean commanded thrust towards test gates is implausible."""
+    thrust = float(probe(policy)[0][:, 0].mean())
+    if THRUST[0] <= thrust <= THRUST[1]:
         return ()
+    text = f"{policy.name}: commands a thrust of {thrust:.3g} m/s^2 in level flight towards a gate"
+    fix = "thrust is per mass [m/s^2], 9.81 in hover, no share and no force; or set action.scale"
+    return (Note("action_thrust", text, fix),)
+
+
+def _acceleration_faults(policy: Policy) -> tuple[Note, ...]:
+    """Return the probable faults of an action of kind `acceleration`."""
     name = policy.name
     action, output = probe(policy)
     left, right, above, below, _ = action
@@ -193,7 +217,7 @@ def probe(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
     The gates are to the left, to the right, above, below and straight ahead.
 
     Returns:
-        The last actions (5, 3) [m/s^2], and the outputs of all steps (STEPS, 5, 3).
+        The last actions (5, size) in SI units, and the outputs of all steps (STEPS, 5, size).
     """
     spec = policy.spec
     offset = ASIDE_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [0, 0]])
@@ -207,6 +231,8 @@ def _level_states(spec: PolicySpec, offset: np.ndarray) -> np.ndarray:
     state = np.zeros((len(offset), spec.state_size), np.float32)
     state[:, VEL_B], state[:, UP_B] = (SPEED, 0, 0), (0, 0, 1)
     state[:, GATE_B] = np.insert(offset, 0, AHEAD_M, axis=1)
+    if spec.action.kind == "ctbr":
+        state[:, STATE_SIZE - ACTION_SIZE] = GRAVITY  # the last thrust
     next_entry = spec.base_size
     for key, size in (("second_gate", 3), ("gate_axis", 3), ("second_axis", 3)):
         if getattr(spec, key):
@@ -219,15 +245,68 @@ def _level_states(spec: PolicySpec, offset: np.ndarray) -> np.ndarray:
     return state
 
 
+def check_rows(policy: Policy) -> list[str]:
+    """Refuse a policy object whose answer for a row depends on the other rows.
+
+    A row is the observation of one trial. A copy of the object is tested, if it can be copied, so
+    that the object itself stays as it is.
+
+    Returns:
+        A warning if the same inputs give two answers: the policy is random or keeps memory.
+
+    Raises:
+        ValueError: naming the largest change of an answer.
+    """
+    rng, spec, count = np.random.default_rng(0), policy.spec, 3
+    state = _level_states(spec, ASIDE_M * rng.normal(size=(count, 2)))
+    state += 0.3 * rng.normal(size=state.shape).astype(np.float32)
+    pixels = rng.uniform(0.0, 255.0 if spec.depth.uint8 else 2.0, (count, *spec.image_shape))
+
+    def answers(tested: Policy, rows: int) -> np.ndarray:
+        hidden, actions = tested.start(rows), []
+        for fresh in (True, False):
+            image = pixels[:rows].astype(np.float32)
+            flags = np.full(rows, fresh)
+            action, hidden = checked_act(tested, hidden, state[:rows].copy(), image, flags)
+            actions.append(np.asarray(action))
+        return np.stack(actions)
+
+    tested = _copy(policy)
+    first, again = answers(tested, count), answers(tested, count)
+    if first.shape[1:] != (count, spec.action.size) or first.dtype.kind not in "fiu":
+        return []  # the judge refuses these actions
+    if first.tobytes() != again.tobytes():
+        return [
+            f"policy {policy.name!r}: the same inputs gave two answers. It is random, or its "
+            "memory is in the object, so that results depend on earlier trials: keep it in hidden"
+        ]
+    change = np.abs(answers(_copy(policy), 1)[:, 0] - first[:, 0]).max()
+    if change > ROUNDING * max(1.0, np.abs(first).max()):
+        raise ValueError(
+            f"policy {policy.name!r}: a row's action changes by {change:.2g} with the other rows "
+            "of its batch; rows are separate trials (docs/policies.md)"
+        )
+    return []
+
+
+def _copy(policy: Policy) -> Policy:
+    """Return a copy of a policy, or the policy itself if it cannot be copied."""
+    try:
+        return copy.deepcopy(policy)
+    except Exception:  # any error of an object's own code
+        return policy
+
+
 def _run(policy: Policy, state: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Run a policy for STEPS steps; return what `probe` returns, for N rows."""
     spec = policy.spec
-    hidden, outputs, action = policy.start(len(state)), [], state[:, ACTION_B]
+    last_action = state[:, STATE_SIZE - ACTION_SIZE : spec.base_size]
+    hidden, outputs, action = policy.start(len(state)), [], last_action
     for step in range(STEPS):
         fresh = np.full(len(state), step == 0)
         output, hidden = policy.act(hidden, state, image, fresh)
         outputs.append(output)
         action = np.asarray(spec.action.to_si(output), np.float32)
         norm = np.linalg.norm(action, axis=-1, keepdims=True)
-        state[:, ACTION_B] = action * np.minimum(1.0, ActionLimits().size / np.maximum(norm, 1e-6))
+        last_action[:] = action * np.minimum(1.0, ActionLimits().size / np.maximum(norm, 1e-6))
     return np.asarray(action, float), np.array(outputs, float)

@@ -18,6 +18,7 @@ from policies.policy import load_policy
 from policies.spec import ActionSpec, PolicySpec
 from tests.support.courses import end_of, fly_on, straight
 from tests.support.pilots import Pursuit, Steady
+from tracks.geometry.camera import Camera
 
 VEHICLE = load_vehicle("reference")
 RULES = Rules(time_limit_s=0.8)
@@ -197,3 +198,13 @@ def test_gravity_and_frames_show_in_flight_or_in_made_up_observations():
             return change(action), hidden
 
         assert [doubt.fault for doubt in notes_of(replace(policy, model=model))] == [fault]
+
+
+def test_a_thrust_that_is_a_share_and_a_camera_in_radians_are_doubted():
+    def faults(action, **camera):
+        spec = PolicySpec(action=ActionSpec("ctbr"), camera=Camera(**camera))
+        return [doubt.fault for doubt in probable_faults(Steady(action, spec))]
+
+    assert faults((0.4, 0.0, 0.0, 0.0)) == ["action_thrust"]
+    assert faults((GRAVITY, 0.0, 0.0, 0.0)) == []
+    assert faults((GRAVITY, 0.0, 0.0, 0.0), fov_deg=(1.37, 1.11)) == ["camera_fov"]
