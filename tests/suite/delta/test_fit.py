@@ -15,12 +15,14 @@ from eval.logs.flight_log import flight_files, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies.formats.policy_file import load_delta
 from suite.common.console import Console
+from suite.common.errors import WorkFailed
 from suite.delta.fit import FitConfig, _descend, _loss, identify, window_errors
 from suite.delta.replay import PointMassModel, check_corrects, describe_dynamics, nominal_model
 from suite.delta.run import errors_grid, fit_delta, long_enough, split
 from suite.delta.windows import cut_windows
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from suite.train.recipes import race, race_paper
+from tests.support.commands import run
 from tests.support.point_mass_flights import fly
 from tests.support.vehicles import with_lag
 from tracks.common.files import plain
@@ -150,6 +152,22 @@ def test_flights_without_what_a_fit_needs_are_refused(tmp_path, dynamics, missin
     # A log that an earlier step does not refuse repeats the open findings of its import.
     said = capsys.readouterr().err
     assert missing != "cmd_thrust" or ("6 motors turn" in said and "vehicle_mixed" in said)
+
+
+def test_flights_of_another_vehicle_than_the_corrected_one_warn(tmp_path, capsys, monkeypatch):
+    for i, log in enumerate(fly(nominal_model(PHYSICS), 2, seconds=1.5)):
+        given = {"thrust_cmd": np.full_like(log.time_s, 9.81), "rate_cmd_b": log.rate_b}
+        about = {"vehicle": "reference"}
+        write_flight(tmp_path / f"{i}.parquet", replace(log, about=about, **given))
+
+    def fit(*_):
+        raise WorkFailed("far enough")
+
+    monkeypatch.setattr("suite.delta.run.fit_delta", fit)
+    for vehicle, warns in (("crazyflie21", True), ("reference", False)):
+        assert run(f"delta {tmp_path} --model quad --vehicle {vehicle}") == 1
+        said = capsys.readouterr().err
+        assert ("flights are of vehicle 'reference'" in said and vehicle in said) == warns
 
 
 @pytest.fixture(scope="module")
