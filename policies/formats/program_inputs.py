@@ -62,7 +62,8 @@ def check_inputs(
             raise PolicyError(
                 f"{where}: input {name!r} has shape {shapes[name]}, expected (batch, "
                 f"{', '.join(map(str, expected))}); set the camera's size, {', '.join(EXTRAS)} "
-                f"and the kind of action in {KEY} or in its contract"
+                f"and the kind of action in {KEY} or in its contract; the state's last action has "
+                f"{spec.action.size} numbers with the kind {spec.action.kind}"
             )
     return block, tuple(hidden)
 

@@ -21,6 +21,8 @@ FLAGS = ("-std=c99", "-O3", "-ffp-contract=fast", "-fPIC", "-shared")
 """Compiler options that every machine supports."""
 NATIVE_FLAGS = ("-march=native",)
 """Options for this machine's processor, left out where the compiler does not support them."""
+MACROS = ("POLICY_STATE_SIZE", "POLICY_IMAGE_HEIGHT", "POLICY_IMAGE_WIDTH")
+"""Macros with the sizes of the inputs, which policy.h must define."""
 MACHINE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENOMEM)
 """Errors of the operating system whose cause is the machine, not the file."""
 COMPILE_S = 600.0
@@ -129,6 +131,6 @@ def _compile(compiler: list[str], files: list[Path], out: Path) -> None:
                 raise OSError(number, os.strerror(number), path[1] if path else str(out))
     error = next((line for line in message.splitlines() if "error" in line), message[:300])
     raise PolicyError(
-        f"{policy_c}: {compiler[0]} refuses it ({error[:300]}); export it again, or compile it by "
-        "hand to see all messages"
+        f"{policy_c}: {compiler[0]} refuses it ({error[:300]}); export it again; C of your own "
+        f"needs {', '.join(MACROS)} in policy.h (docs/export.md)"
     )

@@ -19,7 +19,7 @@ from policies.formats.onnx_file import files_of
 from policies.formats.program_inputs import check_inputs
 from policies.formats.spec_json import KEY
 from policies.policy import load_policy
-from policies.spec import NoAnswer, PolicyError, PolicySpec
+from policies.spec import ActionSpec, NoAnswer, PolicyError, PolicySpec
 from tests.support.policy_files import WEIGHT, action_of, onnx_model, port, save_onnx
 
 ONES = np.ones((1, 12), np.float32)
@@ -197,6 +197,9 @@ def test_the_spec_sets_the_states_size():
     said = r"expected \(batch, 18\); .* second_gate, gate_axis, second_axis, speed"
     with pytest.raises(PolicyError, match=said):
         check_inputs({"state": STATE, "image": IMAGE}, wider, "here")
+    rates = PolicySpec(action=ActionSpec("ctbr"))
+    with pytest.raises(PolicyError, match="last action has 4 numbers with the kind ctbr"):
+        check_inputs({"state": STATE, "image": IMAGE}, rates, "here")
 
 
 PROGRAM = "models/model.json"

@@ -254,6 +254,11 @@ def test_any_c_with_this_door_flies_but_none_with_a_memory_of_its_own(tmp_path):
             foreign(tmp_path, "state->seen", size)
 
 
+def test_c_without_its_sizes_is_refused_with_their_names(tmp_path):
+    with pytest.raises(PolicyError, match="own needs POLICY_STATE_SIZE, POLICY_IMAGE_HEIGHT"):
+        foreign(tmp_path, "0.0f", "12\n#undef POLICY_STATE_SIZE")
+
+
 def test_c_without_its_functions_is_refused_with_what_it_lacks(tmp_path):
     (tmp_path / "policy.h").write_text(DOOR.replace("{size}", "12"))
     (tmp_path / "policy.c").write_text('#include "policy.h"\n')
