@@ -25,10 +25,11 @@ def test_tracks_command_lists_and_draws(tmp_path, capfd):
     assert names == ["zigzag-0-4.png", "zigzag-4.png", "zigzag-9-4.png"]
     assert (tmp_path / names[0]).read_bytes().startswith(b"\x89PNG")
     mine, out = tmp_path / "mine.toml", tmp_path / "out"
-    mine.write_text('name = "a/b c"\n[[gates]]\ncenter = [3, 0, 2]\nwidth = 2\nheight = 2\n')
+    mine.write_text('name = "a/b c"\n[[gates]]\ncenter = [3, 0, 2]\nwidth = 25\nheight = 2\n')
     assert run("tracks --difficulty 5 --out", out, mine) == 0
     assert [path.name for path in out.iterdir()] == ["mine-0-0.png"]
-    assert "has no levels, so --difficulty" in " ".join(capfd.readouterr().err.split())
+    said = " ".join(capfd.readouterr().err.split())
+    assert "has no levels, so --difficulty" in said and "its largest gate is 25 m wide" in said
     for command in ("eval", "tracks zigzag", "export"):
         said = refused(capfd, f"{command} --out", mine)
         assert f"a file exists: {mine}; give another --out" in said
