@@ -16,6 +16,7 @@ from dataclasses import MISSING, is_dataclass
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # this checkout, not an installed one
 import suite
 from eval.effects import EFFECTS
 from eval.effects.interface import bound_value

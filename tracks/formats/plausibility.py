@@ -31,10 +31,10 @@ def track_notes(name: str, track: Track) -> list[str]:
     if written.any() and np.abs(yaw_deg).max() < 2.0 * np.pi + ROUNDING:
         gate = int(np.argmax(written))
         notes.append(f"gate {gate} has a yaw of {yaw_deg[gate]:.4g} deg; is yaw_deg in radians?")
-    apart = np.linalg.norm(center_w[:, None] - center_w, axis=-1)
-    same = np.triu((apart < 1e-3) & (ahead_w @ ahead_w.T > 0.999), 1)
-    for first, second in np.argwhere(same)[:1]:
-        notes.append(f"gates {first} and {second} have the same place and direction")
+    # A gate may be listed again, for another lap, but not next to itself.
+    step_w, turn = np.diff(center_w, axis=0), (ahead_w[1:] * ahead_w[:-1]).sum(axis=1)
+    for gate in np.flatnonzero((np.linalg.norm(step_w, axis=1) < 1e-3) & (turn > 0.999))[:1]:
+        notes.append(f"gates {gate} and {gate + 1} have the same place and direction")
     return [f"{name}: {note}" for note in [*notes, *_blocked(track)]]
 
 

@@ -44,6 +44,11 @@ def test_probable_mistakes_in_a_track_are_noted(tmp_path, text, said):
     assert note.startswith("mine: ") and said in note
 
 
+def test_a_second_lap_through_the_same_gates_is_no_mistake(tmp_path):
+    lap = GATE + GATE.replace("0, 1.5]", "5, 1.5]")
+    assert not track_notes("mine", load_track(write(tmp_path, lap + lap)))
+
+
 def test_the_example_is_read_as_it_says(root):
     track = load_track(root / "tracks" / "examples" / "yard.toml")
     assert not track_notes("yard", track)
