@@ -12,7 +12,7 @@ from collections.abc import Collection
 import numpy as np
 
 from eval.importers.checks.airborne import airborne
-from eval.importers.checks.glitches import clean
+from eval.importers.checks.glitches import clean, without_lost
 from eval.importers.checks.late import OF_POSE, check_delay
 from eval.importers.commands import order_motors, rates_wanted, thrust_command
 from eval.importers.mapping import KEPT
@@ -20,16 +20,20 @@ from eval.importers.options import ImportOptions
 from eval.importers.rows import GAP_S, GAP_STEPS, row_times, rows_at, sampled_rows, slowest
 from eval.importers.signals import NEEDED, Recording, median_step, with_readings
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
-from eval.logs.faults.check import DRIVE, POSE, CheckContext, run_checks
+from eval.logs.faults.check import DRIVE, POSE, CheckContext, check_common_cause, run_checks
 from eval.logs.faults.clock import check_time
 from eval.logs.faults.finding import Finding, finding_lines
+from eval.logs.faults.jumps import check_jumps
 from eval.logs.faults.reading import BY_ATTITUDE, MOTORS, read_rows
+from eval.logs.faults.vehicle import check_vehicle_name
 from eval.logs.flight_log import FlightLog, log_from_columns
 
 COARSE_HZ = 100.0
 """Largest row rate for the checks of the pose [Hz]."""
 SLOW_HZ = 40.0
 """A signal below this rate gets a note [Hz]."""
+END_S = 0.5
+"""A signal that begins or ends this much later or earlier than the others gets a note [s]."""
 SIGNAL_TEXTS = {
     "pos": "position",
     "quat": "attitude",
@@ -108,6 +112,9 @@ def assemble(
             findings.append(Finding("note", "file", text))
     findings += _unused_options(recording.signals, format, options)
     _require_signals(recording, options.partial, findings)
+    if options.fix:
+        recording, more_findings = without_lost(recording)
+        findings += more_findings
     # Checks of the frames of position, attitude and gyro.
     coarse = row_times(recording, COARSE_HZ, 0.0, None)
     more_findings, readings, _ = run_checks(rows_at(recording, coarse), POSE, context, options.fix)
@@ -128,6 +135,13 @@ def assemble(
         recording, options.rate_hz, options.start_s, options.end_s, flight_span_s, origin_s
     )
     findings += _notes_on_rates(recording, time_s)
+    if "pos" in recording.signals:
+        times, pos = recording.signals["pos"]
+        inside = (times >= time_s[0]) & (times <= time_s[-1])
+        findings += check_jumps(times[inside] - origin_s, pos[inside])
+    first_s = max(flight_span_s[0], origin_s + options.start_s)
+    last_s = flight_span_s[1] if options.end_s is None else origin_s + options.end_s
+    findings += _notes_on_ends(recording, (first_s, min(last_s, flight_span_s[1])), origin_s)
     rows = rows_at(recording, time_s)
     # Convert the commands, and check them.
     findings += order_motors(rows, recording.motor_side, options.vehicle)
@@ -137,6 +151,7 @@ def assemble(
     doubts = [finding for finding in findings if finding.status == "doubt"]
     more_findings, _, corrected_rows = run_checks(rows, DRIVE, context, options.fix, doubts)
     findings += more_findings
+    findings += check_common_cause(findings)
     rows = corrected_rows if options.fix else rows
     doubtful = {f.signal for f in findings if f.status == "doubt"}
     findings += thrust_command(rows, options, "accelerometer" not in doubtful)
@@ -159,6 +174,7 @@ def assemble(
         "imported_from": recording.name.replace("\\", "/").rsplit("/", 1)[-1],
         "findings": [finding._asdict() for finding in findings],
     }
+    findings += check_vehicle_name(about, options.vehicle)
     if options.vehicle is not None:
         about["vehicle"] = options.vehicle.name
     if missing:
@@ -213,6 +229,29 @@ def _notes_on_rates(recording: Recording, time_s: np.ndarray) -> list[Finding]:
             longest = float(np.max(np.diff(times)))
             text = f"{gaps} gaps, the longest {longest:.2g} s: left empty"
             findings.append(Finding("note", subject, text))
+    return findings
+
+
+def _notes_on_ends(
+    recording: Recording, within: tuple[float, float], origin_s: float
+) -> list[Finding]:
+    """Return notes on signals that begin later or end earlier than the others.
+
+    Only the times `within` are wanted (on the recording's clock); `origin_s` is the file's first
+    sample [s].
+    """
+    times = {n: recording.signals[n].time_s for n in SIGNAL_TEXTS if n in recording.signals}
+    first_s = max(within[0], min(t[0] for t in times.values()))
+    last_s = min(within[1], max(t[-1] for t in times.values()))
+    findings = []
+    for name, t in times.items():
+        what = "of other signals left out" if name in NEEDED else "left empty"
+        for verb, at, missing_s in (
+            ("begins", t[0], t[0] - first_s), ("ends", t[-1], last_s - t[-1])
+        ):  # fmt: skip
+            if missing_s > END_S:
+                text = f"{verb} at {at - origin_s:.1f} s; {missing_s:.1f} s {what}"
+                findings.append(Finding("note", SIGNAL_TEXTS[name], text))
     return findings
 
 

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from eval.effects.interface import GRAVITY
+from eval.importers.checks.angles import check_angles
 from eval.importers.frames import attitude, body_vector, conjugate, from_euler, rotate, world_vector
 from eval.importers.mapping_file import MIXERS, Column, LogMap
 from eval.importers.options import ImportOptions
 from eval.importers.rows import continuous, in_world, measured
-from eval.importers.signals import Recording, Signal, collect, without_empty
+from eval.importers.signals import Recording, Signal, collect, make_signal, without_empty
 from eval.logs.columns import ESTIMATE, GROUPS, FlightLogError
 from eval.logs.faults.finding import Finding
 
@@ -67,9 +68,11 @@ def recording_of(
         used_columns[signal], parts[signal] = column, _in_log_unit(part, column, name)
     parts.pop("time", None)
     # Angles become quaternions, unless the file has quaternions too.
+    euler: dict[str, Part] = {}
+    has_quat = "quat" in parts
     for angles, quat in (("euler", "quat"), ("cmd_euler", "cmd_quat")):
         if angles in parts:
-            time_s, value = parts.pop(angles)
+            time_s, value = euler[quat] = parts.pop(angles)
             parts.setdefault(quat, (time_s, from_euler(value)))
             used_columns.setdefault(quat, Column((), ()))
     parts = {
@@ -89,6 +92,18 @@ def recording_of(
         if signal in signals and used_columns[signal].other_axes:
             _change_axes(signals, signal, used_columns[signal])
     signals = without_empty(signals)
+    if "quat" in euler and not has_quat and {"quat", "rate"} <= signals.keys():
+
+        def quat_of(angles: np.ndarray) -> np.ndarray:
+            quat, column = from_euler(angles), used_columns["quat"]
+            return _in_log_frame("quat", signals["quat"].time_s, quat, column, mapping)[1]
+
+        angles, _ = make_signal(euler["quat"][0], euler["quat"][1], name, "quat")
+        assert angles is not None
+        value, found = check_angles(angles, quat_of, signals["rate"], options.fix)
+        findings += found
+        if value is not None:
+            signals["quat"] = signals["quat"]._replace(value=quat_of(value))
     if "cmd_thrust" in signals and not used_columns["cmd_thrust"].per_mass:
         findings += _per_mass(signals, about.get("mass"), options)
     return Recording(name, signals, (*findings, *more_findings), mapping.motor_side, about)

@@ -14,6 +14,7 @@ from eval.importers.frames import conjugate, multiply, rotation_vector
 from eval.importers.rows import continuous
 from eval.importers.signals import MAD_TO_SD, Recording, Signal, median_step
 from eval.logs.faults.finding import Finding
+from eval.logs.faults.relation import rms
 from eval.logs.velocity import velocity_from_position
 
 ACC_MAX = 60.0
@@ -28,6 +29,8 @@ MEDIAN_SAMPLES = 7
 """Number of samples of the running median with which a position is compared."""
 REPEATED = 0.02
 """Share of repeated or interpolated samples above which they are removed."""
+LOST_S, LOST_RATE = 0.2, 0.3
+"""A pose that repeats for longer [s] is lost where the gyro turns faster [rad/s]."""
 COARSE = 4.0
 """A signal is coarse if its median change between samples is below this many steps of its
 resolution. Repeated samples of a coarse signal may be real."""
@@ -79,6 +82,31 @@ def _drop_repeats(signals: dict[str, Signal]) -> list[Finding]:
         text = f"{100 * share:.0f} % of the poses repeat the one before: left out"
         return [Finding("corrected", TEXTS[name], text)]
     return []
+
+
+def without_lost(recording: Recording) -> tuple[Recording, list[Finding]]:
+    """Return the recording without poses that stand still while the gyro turns: tracking is lost.
+
+    On the ground a pose may repeat; without a gyro none counts as lost.
+    """
+    signals, findings, rate = dict(recording.signals), [], recording.signals.get("rate")
+    for name in TEXTS:
+        samples = signals.get(name)
+        if rate is None or samples is None or len(samples.time_s) <= MEDIAN_SAMPLES:
+            continue
+        if _is_coarse(samples):
+            continue
+        time_s, is_lost = samples.time_s, np.zeros(len(samples.time_s), dtype=bool)
+        starts = [0, *(np.flatnonzero(np.diff(samples.value, axis=0).any(axis=1)) + 1)]
+        for first, stop in zip(starts, [*starts[1:], len(time_s)], strict=True):
+            if time_s[stop - 1] - time_s[first] > LOST_S:
+                inside = (rate.time_s >= time_s[first]) & (rate.time_s <= time_s[stop - 1])
+                is_lost[first + 1 : stop] = rms(rate.value[inside]) > LOST_RATE
+        if is_lost.any():
+            signals[name] = _select(samples, ~is_lost)
+            text = f"{is_lost.sum()} samples stand still while the gyro turns (lost): left out"
+            findings.append(Finding("corrected", TEXTS[name], text))
+    return replace(recording, signals=signals), findings
 
 
 def _is_coarse(samples: Signal) -> bool:

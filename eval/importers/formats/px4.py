@@ -123,11 +123,14 @@ class _TruncationSafeReader(io.BufferedReader):
     """
 
     _requested = _missing = 0
+    is_cut = False
+    """Whether the file ended within a message."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         data = super().read(size)
         self._requested = size or 0
         self._missing = max(self._requested - len(data), 0)
+        self.is_cut |= bool(data) and self._missing > 0
         return data
 
     def seek(self, offset: int, whence: int = 0, /) -> int:
@@ -137,7 +140,7 @@ class _TruncationSafeReader(io.BufferedReader):
 
 
 def _load(path: Path) -> Any:
-    """Return the parsed file, a `pyulog.ULog`."""
+    """Return the parsed file, a `pyulog.ULog`; `is_cut`: it ends within a message."""
     from pyulog import ULog
 
     try:
@@ -147,7 +150,9 @@ def _load(path: Path) -> Any:
             _TruncationSafeReader(io.FileIO(path)) as file,
             contextlib.redirect_stdout(io.StringIO()),
         ):
-            return ULog(file, list(TOPICS))
+            log: Any = ULog(file, list(TOPICS))
+            log.is_cut = file.is_cut
+            return log
     except Exception as error:
         reason = f"a ULog file that cannot be read ({quoted(error)})"
         raise FlightLogError(str(path), None, None, reason) from None
@@ -346,6 +351,9 @@ def _motor_side(parameters: Mapping[str, Any]) -> tuple[Any, list[Finding]]:
 def _check_file(log: Any) -> list[Finding]:
     """Return findings on damage, dropouts and the thrust model's parameter."""
     findings = []
+    if log.is_cut:
+        text = "it ends within a message: the rest of the flight may be missing"
+        findings.append(Finding("note", "file", text))
     if log.file_corruption:
         findings.append(Finding("doubt", "file", "damaged in places; undamaged messages were read"))
     if log.dropouts:

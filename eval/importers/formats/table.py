@@ -59,7 +59,9 @@ def read_table(path: Path, map_path: Path | None, options: ImportOptions) -> Rec
     if map_path is None:  # a flight log has metadata
         about, more_warnings = flight_metadata(text, name)
         warnings += more_warnings
-    time_s = _time(columns, mapping, name, map_path is not None)
+    flag = "--pose-map" if path == options.pose else "--map"
+    hint = "name it in the mapping's [time]" if file_map else f"describe the columns with {flag}"
+    time_s = _time(columns, mapping, name, hint)
 
     def find(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray] | None:
         values = [_values(columns, column, name) for column in names]
@@ -74,12 +76,9 @@ def read_table(path: Path, map_path: Path | None, options: ImportOptions) -> Rec
     return replace(recording, findings=(*notes, *recording.findings), about=about)
 
 
-def _time(
-    columns: Mapping[str, np.ndarray], mapping: LogMap, name: str, has_map: bool
-) -> np.ndarray:
-    """Return the times (N,) of the rows [s]; `has_map` selects the hint in the error message."""
+def _time(columns: Mapping[str, np.ndarray], mapping: LogMap, name: str, hint: str) -> np.ndarray:
+    """Return the times (N,) of the rows [s]; `hint` says how to name the column."""
     if "time" not in mapping.columns:
-        hint = "name it in the mapping's [time]" if has_map else "describe the columns with --map"
         present = ", ".join(list(columns)[:12])
         reason = f"no column for the time; {hint}. There are: {present}"
         raise FlightLogError(name, "time", None, reason)

@@ -24,11 +24,18 @@ from eval.logs.faults.drive.motor_map import check_motor_map
 from eval.logs.faults.drive.motors import check_lift, check_motors
 from eval.logs.faults.finding import Finding, findings_of, line
 from eval.logs.faults.height import check_height_sign
+from eval.logs.faults.jumps import check_jumps
 from eval.logs.faults.pose import Rows, check_pose, fit_pose_readings
 from eval.logs.faults.reading import Readings, read_rows, readings_in
 from eval.logs.faults.sensors import check_accelerometer_bias, check_barometer, check_voltage
 from eval.logs.faults.vectors import check_accelerometer, check_gyro, check_velocity
-from eval.logs.faults.vehicle import LIFT, check_camera, check_same_vehicle, check_vehicle_numbers
+from eval.logs.faults.vehicle import (
+    LIFT,
+    check_camera,
+    check_same_vehicle,
+    check_vehicle_name,
+    check_vehicle_numbers,
+)
 from eval.logs.flight_log import FlightLog, columns_from_log, log_from_columns
 from eval.vehicles.vehicle import Vehicle
 from tracks.common.names import unknown_name
@@ -47,6 +54,8 @@ class CheckContext:
     """Rate of the policy that flew [Hz]."""
     policy_fov: tuple[float, float] | None = None
     """Horizontal and vertical field of view of the policy's camera [deg]."""
+    implausible: bool = False
+    """Whether a vehicle file is given, but so implausible that no check uses it."""
     found: frozenset[str] = frozenset()
     """Faults that earlier checks of the log found."""
 
@@ -67,7 +76,7 @@ DRIVE: tuple[Check, ...] = (
     lambda rows, against: check_gyro_signs(rows, against.vehicle),
     lambda rows, against: check_gyro_scale(rows, against.vehicle),
     lambda rows, against: check_motors(rows, against.vehicle),
-    lambda rows, against: check_lift(rows, against.vehicle),
+    lambda rows, against: check_lift(rows, against.vehicle, against.implausible),
     lambda rows, _: check_throttle(rows),
     lambda rows, against: check_thrust_command(rows, against.vehicle),
     lambda rows, against: check_motor_map(rows, against.vehicle),
@@ -117,7 +126,7 @@ def run_checks(
         return findings, readings, rows
     # No vehicle has such a full thrust: `check_files` reports the file, and no check uses it.
     implausible = against.vehicle is not None and against.vehicle.full_thrust > LIFT[1] * GRAVITY
-    against = replace(against, vehicle=None) if implausible else against
+    against = replace(against, vehicle=None, implausible=True) if implausible else against
     trusted = dict(rows)
     if implausible and "throttle" in rows:
         trusted.pop("cmd_thrust", None)  # made of the throttle by that vehicle file
@@ -154,6 +163,21 @@ def _without_doubted(rows: dict[str, np.ndarray], finding: Finding) -> dict[str,
     return {name: value for name, value in rows.items() if name != signal}
 
 
+def check_common_cause(findings: Sequence[Finding]) -> list[Finding]:
+    """Return a doubt on the pose where the axes of gyro and motors both contradict it.
+
+    The two agree with each other then, so one error of the pose is more likely than one of each.
+    """
+    axes = ("gyro_axes", "body_frame", "motor_order", "rate_command_sign", "accelerometer_axes")
+    wrong = [f.signal for f in findings if f.fault in axes and f.status in ("corrected", "doubt")]
+    signals = [signal for signal in SIGNALS if signal in wrong]
+    if not {"gyro", "motors"} <= set(signals):
+        return []
+    text = f"{', '.join(signals)} only fit it with other axes each; more likely the pose is wrong"
+    fix = "order and signs of the columns of attitude and position in the mapping file"
+    return [Finding("doubt", "attitude", text, "attitude", None, 0.9, fix)]
+
+
 def check_log(
     log: FlightLog, against: CheckContext = CheckContext(), fix: bool = False
 ) -> tuple[list[Finding], Readings]:
@@ -164,9 +188,12 @@ def check_log(
     """
     checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
     findings, readings, _ = run_checks(rows_of(log), checks, against, fix)
+    findings += check_common_cause(findings)
     action = {} if log.action_b is None else {"action": log.action_b}
     measured = {"time": log.time_s, **action, **_signals(columns_from_log(log))}
     findings += check_controller_rate(measured, against.policy_hz, "the policy")
+    findings += [] if log.pos_w is None else check_jumps(log.time_s, log.pos_w)
+    findings += check_vehicle_name(log.about, against.vehicle)
     again = {finding.fault for finding in findings if finding.fault}
     stored = [f for f in findings_of(log.about) if f.status in ("doubt", "corrected")]
     if against.vehicle is not None:

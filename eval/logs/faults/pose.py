@@ -47,19 +47,12 @@ SHOWN = (
 )
 """Faults that need an attitude to be identifiable."""
 POSITIONS = (
-    ("", "x,y,z"),
-    ("x,-y,-z", "x,-y,-z"),
-    ("y,x,-z", "y,x,-z"),
-    ("-x,y,z", "-x,y,z"),
-    ("x,-y,z", "x,-y,z"),
-    ("x,y,-z", "x,y,-z"),
-    ("-y,x,z", "-y,x,z"),
-    ("y,-x,z", "y,-x,z"),
-    ("-x,-y,z", "-x,-y,z"),
+    *("", "x,-y,-z", "y,x,-z", "-x,y,z", "x,-y,z", "x,y,-z", "-y,x,z", "y,-x,z", "-x,-y,z"),
+    *("y,x,z", "z,y,x", "x,z,y", "y,z,x", "z,x,y"),
 )
-"""Readings of a position: the step, and the axes as text for `axes_matrix`."""
-LENGTHS = (1.0, 0.01, 0.001)
-"""Possible units of a position [m]."""
+"""Readings of a position: "" for the given one, or a step for `axes_matrix`."""
+LENGTHS = {1.0: "m", 0.01: "cm", 0.001: "mm", 100.0: "m, read as cm", 1000.0: "m, read as mm"}
+"""Possible units of a position [m], in words."""
 
 
 class Reading(NamedTuple):
@@ -132,8 +125,8 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
         count = sum(step not in ("", "ned", "frd") for step in steps.split("+")) + bool(frames)
         apart = 0 if seen is None else int(seen.axes != "x,y,z")
         apart = 0 if "frd" in frames and seen is not None and seen.axes == "x,-y,-z" else apart
-        for pos, _ in POSITIONS if path is not None else POSITIONS[:1]:
-            for length in LENGTHS if path is not None else LENGTHS[:1]:
+        for pos in POSITIONS if path is not None else POSITIONS[:1]:
+            for length in LENGTHS if path is not None else (1.0,):
                 if len(found) == 1 and _is_right(found[0]):
                     break
                 force, size = forces.get((pos, length), (None, 0.0))
@@ -255,7 +248,7 @@ def _words(best: Reading) -> str:
     }
     parts = [words[step] for step in best.quat.split("+") if step]
     parts += [f"the position's axes are {best.pos}"] if best.pos else []
-    parts += [f"it is in {'cm' if best.length == 0.01 else 'mm'}"] if best.length != 1.0 else []
+    parts += [f"it is in {LENGTHS[best.length]}"] if best.length != 1.0 else []
     return " and ".join(parts)
 
 
@@ -327,8 +320,8 @@ def _force_misfits(
     """
     good = np.isfinite(axes).all(axis=(1, 2)) & np.isfinite(path[1]).all(axis=1)
     if good.sum() < 20:
-        return {(pos, length): (0.0, 0.0) for pos, _ in POSITIONS for length in LENGTHS}
-    changes = np.stack([axes_matrix(name) for _, name in POSITIONS])
+        return {(pos, length): (0.0, 0.0) for pos in POSITIONS for length in LENGTHS}
+    changes = np.stack([axes_matrix(pos or "x,y,z") for pos in POSITIONS])
     acc_size, found = np.linalg.norm(path[1][good], axis=1), {}
     for length in LENGTHS:
         usual = length * acc_size <= 4.0 * length * np.median(acc_size) + 1.0
@@ -349,7 +342,7 @@ def _force_misfits(
         # A velocity may be unknown where the acceleration is not; the misfit is then 0.
         misfit = np.nan_to_num(rms_of_squares(wrong)) / np.maximum(level, CALM_ACC)
         pairs = zip(misfit.tolist(), level.tolist(), strict=True)
-        found |= {(pos, length): pair for (pos, _), pair in zip(POSITIONS, pairs, strict=True)}
+        found |= {(pos, length): pair for pos, pair in zip(POSITIONS, pairs, strict=True)}
     return found
 
 

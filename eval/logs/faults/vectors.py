@@ -58,6 +58,8 @@ reading must lower the residual by the third factor."""
 SIGNS = {"": "", "-x,-y,-z": "of the other sign", "x,-y,-z": "in forward-right-down axes",
          "-x,y,z": "with axes -x,y,z", "x,-y,z": "with axes x,-y,z"}  # fmt: skip
 """Signs of an accelerometer's axes that a mistake could have made -> in words."""
+MIRRORS = ("-x,y,z", "x,-y,z")
+"""Signs of single axes: they turn a right-handed frame into a left-handed one."""
 SIMPLER = 0.03
 """Penalty on the relative residual of an accelerometer's unusual readings, so that the usual ones
 are chosen where both fit."""
@@ -303,6 +305,8 @@ def check_accelerometer(rows: Rows, body_is_frd: bool = False) -> list[Finding]:
     to_si = f"{1.0 / scale:.10g}+" if scale != 1.0 else ""
     fix = option(("acc", (to_si + steps).rstrip("+")))
     size_ = scale if scale != 1.0 else None
+    if steps in MIRRORS:  # no mounting mirrors a sensor, so the reference may be wrong
+        return [Finding("doubt", "accelerometer", text, fault, size_, 0.95, fix)]
     others = [] if body_is_frd and steps == first else _same_fit(steps, readings[best], force)
     if others:
         text = f"{text}; {' or '.join(words[other] for other in others)} fits as well"

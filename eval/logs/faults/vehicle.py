@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -110,6 +111,15 @@ def check_camera(policy_fov: tuple[float, float] | None, vehicle: Vehicle | None
         return [Finding("ok", "camera", figures)]
     fix = "camera.fov_deg of the vehicle file, or crop the image"
     return [Finding("doubt", "camera", figures, "camera_fov", here[0] / policy_fov[0], 0.97, fix)]
+
+
+def check_vehicle_name(about: Mapping[str, Any], vehicle: Vehicle | None) -> list[Finding]:
+    """Return a note where a log's metadata `about` name another vehicle than the given one."""
+    name = about.get("vehicle")
+    if vehicle is None or not name or str(name) == vehicle.name:
+        return []
+    text = f"the log names the vehicle {str(name)!r}, and --vehicle is {vehicle.name!r}"
+    return [Finding("note", "vehicle", text)]
 
 
 def check_same_vehicle(logs: Sequence[FlightLog]) -> list[tuple[Finding, str]]:

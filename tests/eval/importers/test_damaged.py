@@ -52,9 +52,17 @@ def test_a_message_without_a_length_is_no_circle(tmp_path, monkeypatch):
         import_log(path)
 
 
+def test_a_ulog_that_ends_within_a_message_has_a_note(tmp_path):
+    path = made.write_ulog(tmp_path / "log.ulg", span=(0, 4))
+    for data, is_cut in ((path.read_bytes(), False), (path.read_bytes()[:-5], True)):
+        path.write_bytes(data)
+        _, findings = import_log(path, None, FULL)
+        assert ("it ends within a message" in text(findings, "file")) == is_cut
+
+
 def test_dropouts_are_counted_and_their_time_is_in_seconds():
     lost: Any = [SimpleNamespace(duration=ms) for ms in (200, 300)]
-    log = SimpleNamespace(file_corruption=False, dropouts=lost, initial_parameters={})
+    log = SimpleNamespace(is_cut=False, file_corruption=False, dropouts=lost, initial_parameters={})
     assert "2 dropouts, 0.5 s in all" in text(px4._check_file(log), "file")
 
 

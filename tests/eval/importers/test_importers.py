@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from eval.importers import import_log
 from eval.importers.assemble import assemble, usable_for
@@ -16,7 +17,8 @@ from eval.logs.faults.finding import Finding, finding_lines
 from eval.logs.flight_log import read_flight, write_flight
 from tests.support import foreign_logs as made
 from tests.support import known_flight
-from tests.support.imported import flight, near, text, write
+from tests.support.imported import NAMES, flight, near, text, write
+from tests.support.log_tables import write_table
 from tests.support.vehicles import PLAIN
 
 FULL = ImportOptions(full_thrust=30.0)
@@ -79,6 +81,74 @@ def test_published_logs_are_read_by_their_shipped_mappings(path, lacks, length_s
     for axis, drive in enumerate(drives):
         both = np.isfinite(drive[:-3]) & np.isfinite(change[3:, axis])
         assert np.corrcoef(drive[:-3][both], change[3:, axis][both])[0, 1] > 0.15
+
+
+@pytest.mark.parametrize(
+    ("signal", "late", "words"),
+    [
+        ("rate", False, "gyro: ends at 4.0 s; 4.0 s of other signals left out"),
+        ("pos", True, "position: begins at 4.0 s; 4.0 s of other signals left out"),
+    ],
+)
+def test_a_signal_that_ends_early_or_begins_late_has_a_note(tmp_path, signal, late, words):
+    parts = flight()
+    keep = (parts["time"] >= 4.0) == late
+    _, findings = import_log(write(tmp_path / "log.csv", parts, {signal: keep}))
+    assert any(words in line for line in finding_lines(findings))
+    _, findings = import_log(write(tmp_path / "log.csv", parts))
+    assert not any("other signals" in line for line in finding_lines(findings))
+
+
+def test_positions_that_stand_still_in_flight_are_left_out(tmp_path):
+    parts = flight()
+    lost = (parts["time"] > 3.0) & (parts["time"] < 3.5)
+    parts["pos"][lost] = parts["pos"][lost][0]
+    log, findings = import_log(write(tmp_path / "log.csv", parts))
+    assert "stand still while the gyro turns" in text(findings, "position")
+    assert not [f for f in findings if f.status == "doubt"]
+    assert np.isnan(log.pos_w[(log.time_s > 3.05) & (log.time_s < 3.45)]).all()
+
+
+@pytest.mark.parametrize(
+    ("columns", "unit", "words"),
+    [
+        (["yaw", "pitch", "roll"], "rad", "the columns are yaw, pitch, roll"),
+        (["pitch", "roll", "yaw"], "rad", "the columns are pitch, roll, yaw"),
+        (["roll", "pitch", "yaw"], "deg", "the angles are in rad, read as deg"),
+        (["roll", "pitch", "yaw"], "rad", ""),
+    ],
+)
+def test_order_and_unit_of_euler_angles_are_found(tmp_path, columns, unit, words):
+    parts = flight()
+    angles = Rotation.from_quat(parts["quat"], scalar_first=True).as_euler("ZYX")[:, ::-1]
+    table = dict(zip(["roll", "pitch", "yaw"], angles.T, strict=True)) | {"time": parts["time"]}
+    mapping = f'[euler]\ncolumns = {columns}\nunit = "{unit}"\n[time]\ncolumn = "time"\n'
+    for name, names in NAMES.items():
+        if name not in ("quat", "cmd_thrust"):
+            table |= dict(zip(names, parts[name].T, strict=True))
+            mapping += f"[{name}]\ncolumns = {names}\n"
+    path = write_table(tmp_path / "log.csv", table)
+    (tmp_path / "map.toml").write_text(mapping)
+    for fix in (True, False):
+        log, findings = import_log(
+            path, "table", ImportOptions(map=tmp_path / "map.toml", fix=fix, partial=True)
+        )
+        wrong = [f for f in findings if f.status in ("corrected", "doubt")]
+        assert [f.status for f in wrong][:1] == (
+            [] if not words else ["corrected" if fix else "doubt"]
+        )
+        assert not words or words in wrong[0].evidence
+        if fix:
+            assert len(wrong) == bool(words)
+            near(np.abs(log.quat_wxyz), np.abs(known_flight.fly(log.time_s).quat), 0.01)
+
+
+def test_a_pose_file_without_a_time_is_described_with_pose_map(tmp_path):
+    parts = flight()
+    path = write(tmp_path / "log.csv", parts)
+    pose = write_table(tmp_path / "pose.csv", {"t": parts["time"]})
+    with pytest.raises(FlightLogError, match="describe the columns with --pose-map"):
+        import_log(path, "table", ImportOptions(pose=pose))
 
 
 def test_unknown_formats_and_files(tmp_path):

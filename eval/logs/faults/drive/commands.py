@@ -16,7 +16,7 @@ from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows
 from eval.logs.faults.reading import option
 from eval.logs.faults.relation import match, pooled_scale, rms, smooth
-from eval.logs.faults.vectors import DEG, RATES, UPWARDS, upwards
+from eval.logs.faults.vectors import DEG, RATES, UPWARDS, check_gyro, upwards
 from eval.vehicles.vehicle import Vehicle
 
 LATE_S = 0.06
@@ -25,7 +25,8 @@ USUAL_S = 0.08
 """Delay of rate loop, rotors and radio link that is assumed without a vehicle file [s]."""
 GAIN = (0.8, 1.25)
 """Correct range of the gain."""
-UNITS = {"in degrees per second": 1.0 / DEG, "ten times too large (blackbox_high_resolution)": 10.0}
+UNITS = {"in degrees per second": 1.0 / DEG, "ten times too large (blackbox_high_resolution)": 10.0,
+         "in rad/s, read as deg/s": DEG}  # fmt: skip
 """Wrong unit -> factor by which rate commands are then too large."""
 LOOP_GAIN = (0.87, 1.1)
 """Correct range of the rate loop's gain at low frequency. Motors at their limits lower it."""
@@ -176,7 +177,7 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
     # Unit of the command, then unit of the gyro.
     gain, low, high = pooled_scale(matched)
     for words, factor in UNITS.items():
-        if abs(np.log(gain * factor)) < np.log(1.4):
+        if abs(np.log(gain * factor)) < np.log(1.4) and (factor > 1.0 or _gyro_is_right(rows)):
             text = f"{figures}, by {gain:.3g} of it: it is {words}"
             fix = option(("cmd_rate", f"{1.0 / factor:.10g}"))
             return [Finding("corrected", subject, text, "rate_command_unit", factor, 0.98, fix)]
@@ -201,6 +202,16 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
         fix = "the link's or the logger's clock; a delay in the simulation: effects.command_delay"
         findings.append(Finding("doubt", subject, text, "command_delay", delay, 0.93, fix))
     return findings or [Finding("ok", subject, figures)]
+
+
+def _gyro_is_right(rows: Rows) -> bool:
+    """Return whether the attitude confirms the gyro's unit; without one, whether it may be right.
+
+    A gyro in deg/s, read as rad/s, exceeds usual rates.
+    """
+    if "quat" in rows:
+        return any(f.signal == "gyro" and f.status == "ok" for f in check_gyro(rows))
+    return rms(rows["rate"]) < FASTEST_RMS
 
 
 def check_gyro_signs(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding]:
@@ -250,7 +261,8 @@ def check_gyro_scale(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding
     gain, between_axes = gains
     text = f"it is {gain:.3g} times a steady rate command"
     unit = next((w for w, f in RATES.items() if abs(np.log(gain / f)) < np.log(SAME_UNIT)), None)
-    if unit is not None and rms(rows["cmd_rate"]) < FASTEST_RMS:
+    is_command = unit == "deg/s" and _gyro_is_right(rows)
+    if unit is not None and rms(rows["cmd_rate"]) < FASTEST_RMS and not is_command:
         fix = option(("rate", f"{1.0 / RATES[unit]:.10g}"))
         text = f"{text}: {unit}"
         return [Finding("corrected", "gyro", text, "gyro_scale", RATES[unit], 0.95, fix)]

@@ -40,6 +40,8 @@ FITS = 1.35
 UNITS = {
     "rpm in place of rad/s": 60.0 / (2.0 * np.pi),
     "revolutions a second in place of rad/s": 1.0 / (2.0 * np.pi),
+    "rad/s, read as rpm": 2.0 * np.pi / 60.0,
+    "revolutions a second, read as rpm": 1.0 / 60.0,
     **{f"electrical, of {pairs} pole pairs": float(pairs) for pairs in (6, 7, 11, 12, 14)},
     **{
         f"electrical rpm of {pairs} pole pairs, in place of rad/s": pairs * 60.0 / (2.0 * np.pi)
@@ -242,13 +244,16 @@ def _correlations(mean: np.ndarray, turning: np.ndarray) -> np.ndarray:
     return (a.T @ b) / np.maximum(size, 1e-12)
 
 
-def check_lift(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
-    """Compare the rotors' thrust by the vehicle file with the path's acceleration."""
+def check_lift(rows: Rows, vehicle: Vehicle | None, doubtful: bool = False) -> list[Finding]:
+    """Compare the rotors' thrust by the vehicle file with the path's acceleration.
+
+    `doubtful`: there is a vehicle file, but it is implausible, so no check uses it.
+    """
     if "motor" not in rows:
         return []
     if vehicle is None:
-        text = "not checked against the weight; --vehicle makes it possible"
-        return [Finding("note", "rotor speeds", text)]
+        why = ": the vehicle file is in doubt" if doubtful else "; --vehicle makes it possible"
+        return [Finding("note", "rotor speeds", f"not checked against the weight{why}")]
     thrust = vehicle.rotors.thrust_coefficient * np.sum(rows["motor"] ** 2, axis=1)
     lift = over_force(rows, thrust) / vehicle.mass
     if not lift > 0.0:
@@ -272,7 +277,7 @@ def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Fin
     names = [n for n in ("motor", "motor_cmd") if n in rows]
     if len(certain) == 1:
         (words,) = certain
-        text = f"{figures}: they are {UNITS[words]:.3g} times too large ({words})"
+        text = f"{figures}: they are {UNITS[words]:.3g} times the true ones ({words})"
         others = " or ".join(name for name in near if name != words)
         text += f"; if the vehicle file is far off, it may be {others}" if others else ""
         fix = option(*((n, f"{1.0 / UNITS[words]:.10g}") for n in names))

@@ -6,12 +6,12 @@ the body follow a commanded rate; it is modelled as a delay and a second-order f
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import permutations, product
 
 import numpy as np
 
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S
-from eval.logs.faults.relation import shift_rows, smooth
+from eval.logs.faults.relation import CLEAR, shift_rows, smooth
 
 REACH_S, STEP_S = 0.3, 0.01
 """Largest delay that is tried, and the step between trials [s]."""
@@ -31,11 +31,12 @@ reliable."""
 def delayed(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the delay [s] with the best correlation of command and rate, and the delayed command.
 
-    The command (T, 3) is also averaged over `WIDTH_S`; `rate` (T, 3) must already be averaged.
+    The command (T, 3) is also averaged over `WIDTH_S`; `rate` (T, 3) must already be averaged. If
+    another order of the command's axes correlates clearly better, the delay is that of this order.
     """
     step = float(np.median(np.diff(time_s)))
     value = smooth(time_s, command, WIDTH_S)
-    best, delay, best_command = -1.0, 0.0, value
+    best: dict[tuple[int, ...], tuple[float, float, np.ndarray]] = {}
     for late in np.arange(0.0, REACH_S + 1e-9, max(STEP_S, step)):
         count = round(late / step)
         moved = shift_rows(value, count)
@@ -44,13 +45,15 @@ def delayed(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> tuple[
             break
         # Correlation of each axis, weighted by how much the axis turns.
         a, b = moved[both] - moved[both].mean(axis=0), rate[both] - rate[both].mean(axis=0)
-        norms = np.linalg.norm(a, axis=0) * np.linalg.norm(b, axis=0)
-        correlation = float(
-            np.sum(b.std(axis=0) * np.abs(np.sum(a * b, axis=0)) / np.maximum(norms, 1e-12))
-        )
-        if correlation > best + 1e-6:
-            best, delay, best_command = correlation, count * step, moved
-    return delay, best_command
+        norms = np.outer(np.linalg.norm(b, axis=0), np.linalg.norm(a, axis=0))
+        shares = (b.std(axis=0) / b.std(axis=0).sum())[:, None]
+        correlations = shares * np.abs(b.T @ a) / np.maximum(norms, 1e-12)
+        for order in permutations(range(3)):
+            score = float(correlations[range(3), order].sum())
+            if score > best.get(order, (-1.0,))[0] + 1e-6:
+                best[order] = score, count * step, moved
+    order = max(best, key=lambda o: best[o][0] + CLEAR * (o == (0, 1, 2)), default=None)
+    return (0.0, value) if order is None else best[order][1:]
 
 
 def bend(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> float:

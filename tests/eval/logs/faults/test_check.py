@@ -8,6 +8,7 @@ import pytest
 from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.check import CheckContext, check_before_diagnosis, check_log, kept_lines
 from eval.logs.faults.finding import Finding
+from eval.logs.faults.jumps import check_jumps
 from eval.logs.faults.reading import parse_readings, read_rows
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN
@@ -69,6 +70,35 @@ def test_logs_of_two_vehicles_are_refused_and_a_log_without_a_name_is_not():
     check_before_diagnosis([*logs[:2], replace(logs[2], about={})], CheckContext())
     # Flights before a change may be of a vehicle file with another name.
     check_before_diagnosis(logs[:2], CheckContext(), earlier=logs[2:])
+
+
+@pytest.mark.parametrize(
+    ("rows", "moved_m", "status"),
+    [
+        (slice(150, None), 4.2, "doubt"),
+        (slice(150, 151), 0.9, "doubt"),
+        (slice(150, 151), 0.2, "note"),
+    ],
+)
+@pytest.mark.parametrize("missing", [slice(0), slice(140, 150)])
+def test_a_jump_of_the_position_is_named(rows, moved_m, status, missing):
+    log = fly(PLAIN, 0, duration_s=3.0)
+    assert not check_jumps(log.time_s, log.pos_w)
+    pos = log.pos_w.copy()
+    pos[rows] += [moved_m, 0.0, 0.0]
+    pos[missing] = np.nan
+    found = [f for f in check_log(replace(log, pos_w=pos))[0] if "it jumps" in f.evidence]
+    assert [(f.status, f.is_open) for f in found] == [(status, status == "doubt")]
+    at_s = float(found[0].evidence.partition("t = ")[2].split(" s")[0])
+    assert at_s == pytest.approx(log.time_s[150], abs=0.12)
+
+
+def test_another_vehicles_name_is_a_note_and_an_implausible_file_is_in_doubt():
+    log = replace(fly(PLAIN, 0, duration_s=3.0, motors=True), about={"vehicle": "other"})
+    fast = replace(PLAIN, rotors=replace(PLAIN.rotors, speed_max=10.0 * PLAIN.rotors.speed_max))
+    texts = [f.evidence for f in check_log(log, CheckContext(fast))[0] if f.status == "note"]
+    assert "not checked against the weight: the vehicle file is in doubt" in texts
+    assert f"the log names the vehicle 'other', and --vehicle is {PLAIN.name!r}" in texts
 
 
 def test_the_rate_of_slow_commands_is_that_of_their_own_rows():

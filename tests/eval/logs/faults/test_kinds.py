@@ -14,6 +14,7 @@ from eval.logs.faults.check import (
     DRIVE,
     POSE,
     CheckContext,
+    check_common_cause,
     check_files,
     check_log,
     run_checks,
@@ -22,6 +23,7 @@ from eval.logs.faults.check import (
 from eval.logs.faults.clock import check_clock
 from eval.logs.faults.drive import commands
 from eval.logs.faults.drive.commands import check_controller_rate
+from eval.logs.faults.drive.rate_following import delayed
 from eval.logs.faults.height import check_height_sign
 from eval.logs.faults.reading import parse_readings, read_rows
 from eval.logs.flight_log import read_flight
@@ -103,6 +105,42 @@ def test_a_fault_is_named_and_its_fix_restores_the_flight(name):
         assert right.keys() - fixed.keys() == ({"voltage"} if name == "battery of 0.1 V" else set())
         for signal in fixed:
             np.testing.assert_allclose(fixed[signal], right[signal], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "signal", "fix"),
+    [
+        ("cmd_rate=0.01745329252", "rate command", "cmd_rate=57.29577951"),
+        ("cmd_rate=y,x,z", "rate command", "cmd_rate=y,x,z"),
+        ("motor=0.10471975512", "rotor speeds", "motor=9.549296586"),
+        ("pos=0.001", "position", "pos=1000"),
+        ("pos=0.01", "position", "pos=100"),
+        ("pos=y,x,z", "position", "pos=y,x,z"),
+    ],
+)
+def test_the_fix_names_the_signal_whose_unit_or_order_is_wrong(wrong, signal, fix):
+    findings, _ = checked(read_rows(good(end=10.0), parse_readings([wrong])))
+    (found,) = (f for f in findings if f.status in ("corrected", "doubt"))
+    assert (found.signal, found.fix) == (signal, f"--read {fix}")
+
+
+def test_commands_of_swapped_axes_are_not_late():
+    """By its own axis the command may fit best after another time."""
+    parts, time_s = good(end=10.0), good(end=10.0)["time"]
+    wave = np.column_stack([np.sin(3.0 * time_s), np.cos(3.0 * time_s), np.sin(5.0 * time_s)])
+    late, _ = delayed(time_s, wave[:, [1, 0, 2]], np.roll(wave, 5, axis=0))
+    assert late == pytest.approx(0.05, abs=0.011)
+    parts["cmd_rate"] = parts["cmd_rate"][:, [1, 0, 2]]
+    assert "command_delay" not in named(checked(parts)[0])
+
+
+def test_gyro_and_motors_that_both_contradict_the_pose_put_it_in_doubt():
+    parts = good(end=10.0)
+    parts["pos"] *= [1, -1, 1]
+    parts["vel"] *= [1, -1, 1]
+    parts["quat"] *= [1, -1, 1, -1]
+    (found,) = check_common_cause(checked(parts)[0])
+    assert found.is_open and "gyro, motors" in found.evidence
 
 
 @pytest.mark.parametrize("name", ["motors 3 and 4 swapped", "accelerometer's bias with throttle"])
