@@ -101,7 +101,7 @@ def without_lost(recording: Recording) -> tuple[Recording, list[Finding]]:
         for first, stop in zip(starts, [*starts[1:], len(time_s)], strict=True):
             if time_s[stop - 1] - time_s[first] > LOST_S:
                 inside = (rate.time_s >= time_s[first]) & (rate.time_s <= time_s[stop - 1])
-                is_lost[first + 1 : stop] = rms(rate.value[inside]) > LOST_RATE
+                is_lost[first + 1 : stop] = inside.any() and rms(rate.value[inside]) > LOST_RATE
         if is_lost.any():
             signals[name] = _select(samples, ~is_lost)
             text = f"{is_lost.sum()} samples stand still while the gyro turns (lost): left out"
