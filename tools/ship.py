@@ -42,6 +42,7 @@ def card(name: str, run: Path, judged: Path | None) -> str:
         f"| {len(rows)} | {duration(seconds)} |"
     )
     machine = training["machine"]
+    cores = machine["cores"]
     checkpoint = load_policy_checkpoint(run / "policy")
     size = sum(array.size for array in checkpoint.params.values())
     quadrotor = training["config"]["quadrotor"]
@@ -58,7 +59,7 @@ flights of earlier recipes on the judged tracks and vehicle, at other seeds.
 |---|---|---|---|---|
 {row}
 
-On {machine["processor"]}, {machine["cores"]} cores.
+On {machine["processor"]}, {cores} core{"s" * (cores != 1)}.
 
 ![Gates passed, collisions and speed over the training](curve.png)
 """
