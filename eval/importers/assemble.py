@@ -20,7 +20,7 @@ from eval.importers.options import ImportOptions
 from eval.importers.rows import GAP_S, GAP_STEPS, row_times, rows_at, sampled_rows, slowest
 from eval.importers.signals import NEEDED, Recording, median_step, with_readings
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
-from eval.logs.faults.check import DRIVE, POSE, CheckContext, check_common_cause, run_checks
+from eval.logs.faults.check import DRIVE, POSE, CheckContext, run_checks
 from eval.logs.faults.clock import check_time
 from eval.logs.faults.finding import Finding, finding_lines
 from eval.logs.faults.jumps import check_jumps
@@ -151,7 +151,6 @@ def assemble(
     doubts = [finding for finding in findings if finding.status == "doubt"]
     more_findings, _, corrected_rows = run_checks(rows, DRIVE, context, options.fix, doubts)
     findings += more_findings
-    findings += check_common_cause(findings)
     rows = corrected_rows if options.fix else rows
     doubtful = {f.signal for f in findings if f.status == "doubt"}
     findings += thrust_command(rows, options, "accelerometer" not in doubtful)

@@ -50,6 +50,8 @@ IMAGE_FACTOR, NO_CHANGE = 1.5, 1e-3
 VEL_B, UP_B, GATE_B = slice(0, 3), slice(3, 6), slice(6, 9)
 """Parts of a state observation (`policies.observation`), in body axes: velocity, the world's z
 axis, the next gate's centre."""
+ROWS = 3
+"""Number of rows with which policy objects are tested."""
 ASIDE_M, AHEAD_M, SPEED, STEPS = 2.0, 6.0, 3.0, 10
 """Distances of the test gate to the side and ahead [m], forward speed [m/s], number of steps."""
 
@@ -249,7 +251,8 @@ def check_rows(policy: Policy) -> list[str]:
     """Refuse a policy object whose answer for a row depends on the other rows.
 
     A row is the observation of one trial. A copy of the object is tested, if it can be copied, so
-    that the object itself stays as it is.
+    that the object itself stays as it is. An object that fails here, as it takes another number of
+    rows, is not tested.
 
     Returns:
         A warning if the same inputs give two answers: the policy is random or keeps memory.
@@ -257,36 +260,42 @@ def check_rows(policy: Policy) -> list[str]:
     Raises:
         ValueError: naming the largest change of an answer.
     """
-    rng, spec, count = np.random.default_rng(0), policy.spec, 3
-    state = _level_states(spec, ASIDE_M * rng.normal(size=(count, 2)))
-    state += 0.3 * rng.normal(size=state.shape).astype(np.float32)
-    pixels = rng.uniform(0.0, 255.0 if spec.depth.uint8 else 2.0, (count, *spec.image_shape))
-
-    def answers(tested: Policy, rows: int) -> np.ndarray:
-        hidden, actions = tested.start(rows), []
-        for fresh in (True, False):
-            image = pixels[:rows].astype(np.float32)
-            flags = np.full(rows, fresh)
-            action, hidden = checked_act(tested, hidden, state[:rows].copy(), image, flags)
-            actions.append(np.asarray(action))
-        return np.stack(actions)
-
     tested = _copy(policy)
-    first, again = answers(tested, count), answers(tested, count)
-    if first.shape[1:] != (count, spec.action.size) or first.dtype.kind not in "fiu":
+    try:
+        first, again, other = (_two_answers(tested, ROWS, seed) for seed in (0, 0, 1))
+        alone = _two_answers(tested, 1, 0)
+    except Exception:  # any error of an object's own code; the judge reports it
+        return []
+    if first.shape[1:] != (ROWS, policy.spec.action.size) or first.dtype.kind not in "fiu":
         return []  # the judge refuses these actions
     if first.tobytes() != again.tobytes():
         return [
             f"policy {policy.name!r}: the same inputs gave two answers. It is random, or its "
             "memory is in the object, so that results depend on earlier trials: keep it in hidden"
         ]
-    change = np.abs(answers(_copy(policy), 1)[:, 0] - first[:, 0]).max()
+    change = max(np.abs(answers[:, 0] - first[:, 0]).max() for answers in (other, alone))
     if change > ROUNDING * max(1.0, np.abs(first).max()):
         raise ValueError(
             f"policy {policy.name!r}: a row's action changes by {change:.2g} with the other rows "
             "of its batch; rows are separate trials (docs/policies.md)"
         )
     return []
+
+
+def _two_answers(policy: Policy, count: int, seed: int) -> np.ndarray:
+    """Return two actions (2, count, size) of a policy; the seed changes all rows but the first."""
+    spec = policy.spec
+    rows = [np.random.default_rng([row, seed if row else 0]) for row in range(count)]
+    state = _level_states(spec, ASIDE_M * np.stack([rng.normal(size=2) for rng in rows]))
+    state[:, VEL_B] += np.stack([rng.normal(size=3) for rng in rows])
+    most = 255.0 if spec.depth.uint8 else 2.0
+    image = np.stack([rng.uniform(0.0, most, spec.image_shape) for rng in rows]).astype(np.float32)
+    hidden, actions = policy.start(count), []
+    for fresh in (True, False):
+        flags = np.full(count, fresh)
+        action, hidden = checked_act(policy, hidden, state.copy(), image.copy(), flags)
+        actions.append(np.asarray(action))
+    return np.stack(actions)
 
 
 def _copy(policy: Policy) -> Policy:

@@ -59,15 +59,13 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     recipe = with_model(named_recipe(config.recipe), config.model, config.vehicle)
     dynamics = recipe.quadrotor or recipe.physics
     if recipe.quadrotor is not None:
+        from eval.logs.faults.vehicle import check_vehicle_name
         from eval.logs.flight_log import flight_files, read_flights
 
         logs, _ = read_flights(flight_files(config.flights))
-        named = {str(log.about["vehicle"]) for log in logs if log.about.get("vehicle")}
-        for other in sorted(named - {recipe.quadrotor.vehicle.name}):
-            console.note(
-                f"warning: flights are of vehicle {other!r}, and the model corrects vehicle "
-                f"{recipe.quadrotor.vehicle.name!r} (--vehicle)"
-            )
+        found = [check_vehicle_name(log.about, recipe.quadrotor.vehicle) for log in logs]
+        for text in sorted({finding.evidence for notes in found for finding in notes}):
+            console.note(f"warning: {text}")
     result = fit_delta(fitting, dynamics, config.flights, config.out, console)
     errors = plain(result.errors)
     console.say(markdown(errors_grid({"horizon_s": fitting.horizon_s, **errors})))

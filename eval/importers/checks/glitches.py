@@ -14,11 +14,10 @@ from eval.importers.frames import conjugate, multiply, rotation_vector
 from eval.importers.rows import continuous
 from eval.importers.signals import MAD_TO_SD, Recording, Signal, median_step
 from eval.logs.faults.finding import Finding
+from eval.logs.faults.jumps import ACC_MAX
 from eval.logs.faults.relation import rms
 from eval.logs.velocity import velocity_from_position
 
-ACC_MAX = 60.0
-"""Largest possible acceleration [m/s^2]."""
 POS_LEAST, VEL_LEAST = 0.02, 0.1
 """Jumps of position [m] and velocity [m/s] up to these sizes are kept."""
 GLITCH_SD = 8.0
@@ -29,8 +28,9 @@ MEDIAN_SAMPLES = 7
 """Number of samples of the running median with which a position is compared."""
 REPEATED = 0.02
 """Share of repeated or interpolated samples above which they are removed."""
-LOST_S, LOST_RATE = 0.2, 0.3
-"""A pose that repeats for longer [s] is lost where the gyro turns faster [rad/s]."""
+LOST_S, LOST_HOLDS, LOST_RATE = 0.2, 5.0, 0.3
+"""A pose that repeats for longer [s], and for so many times the usual hold, is lost where the gyro
+turns faster [rad/s]."""
 COARSE = 4.0
 """A signal is coarse if its median change between samples is below this many steps of its
 resolution. Repeated samples of a coarse signal may be real."""
@@ -98,12 +98,17 @@ def without_lost(recording: Recording) -> tuple[Recording, list[Finding]]:
             continue
         time_s, is_lost = samples.time_s, np.zeros(len(samples.time_s), dtype=bool)
         starts = [0, *(np.flatnonzero(np.diff(samples.value, axis=0).any(axis=1)) + 1)]
-        for first, stop in zip(starts, [*starts[1:], len(time_s)], strict=True):
-            if time_s[stop - 1] - time_s[first] > LOST_S:
+        stops = np.array([*starts[1:], len(time_s)])
+        held_s = time_s[stops - 1] - time_s[starts]
+        longest_s = LOST_S + LOST_HOLDS * np.median(held_s)  # a slow signal is held in fast rows
+        for first, stop, hold_s in zip(starts, stops, held_s, strict=True):
+            if hold_s > longest_s:
                 inside = (rate.time_s >= time_s[first]) & (rate.time_s <= time_s[stop - 1])
                 is_lost[first + 1 : stop] = inside.any() and rms(rate.value[inside]) > LOST_RATE
         if is_lost.any():
-            signals[name] = _select(samples, ~is_lost)
+            for other in (name, "vel"):
+                if other in signals and np.array_equal(signals[other].time_s, time_s):
+                    signals[other] = _select(signals[other], ~is_lost)
             text = f"{is_lost.sum()} samples stand still while the gyro turns (lost): left out"
             findings.append(Finding("corrected", TEXTS[name], text))
     return replace(recording, signals=signals), findings

@@ -163,21 +163,6 @@ def _without_doubted(rows: dict[str, np.ndarray], finding: Finding) -> dict[str,
     return {name: value for name, value in rows.items() if name != signal}
 
 
-def check_common_cause(findings: Sequence[Finding]) -> list[Finding]:
-    """Return a doubt on the pose where the axes of gyro and motors both contradict it.
-
-    The two agree with each other then, so one error of the pose is more likely than one of each.
-    """
-    axes = ("gyro_axes", "body_frame", "motor_order", "rate_command_sign", "accelerometer_axes")
-    wrong = [f.signal for f in findings if f.fault in axes and f.status in ("corrected", "doubt")]
-    signals = [signal for signal in SIGNALS if signal in wrong]
-    if not {"gyro", "motors"} <= set(signals):
-        return []
-    text = f"{', '.join(signals)} only fit it with other axes each; more likely the pose is wrong"
-    fix = "order and signs of the columns of attitude and position in the mapping file"
-    return [Finding("doubt", "attitude", text, "attitude", None, 0.9, fix)]
-
-
 def check_log(
     log: FlightLog, against: CheckContext = CheckContext(), fix: bool = False
 ) -> tuple[list[Finding], Readings]:
@@ -188,7 +173,6 @@ def check_log(
     """
     checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
     findings, readings, _ = run_checks(rows_of(log), checks, against, fix)
-    findings += check_common_cause(findings)
     action = {} if log.action_b is None else {"action": log.action_b}
     measured = {"time": log.time_s, **action, **_signals(columns_from_log(log))}
     findings += check_controller_rate(measured, against.policy_hz, "the policy")

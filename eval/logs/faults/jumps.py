@@ -26,7 +26,10 @@ def check_jumps(time_s: np.ndarray, pos: np.ndarray) -> list[Finding]:
         time_s: (N,) increasing times [s].
         pos: (N, 3) positions, NaN where unknown.
     """
-    known = np.isfinite(pos).all(axis=1)
+    # Of a position that is held between its samples, the first row of each counts.
+    known = np.flatnonzero(np.isfinite(pos).all(axis=1))
+    is_new = (np.diff(pos[known], axis=0) != 0.0).any(axis=1) & (np.diff(time_s[known]) > 0.0)
+    known = known[np.append(True, is_new)] if len(known) else known
     time_s, pos = time_s[known], pos[known]
     if len(time_s) < 4 * STEPS:
         return []
@@ -39,7 +42,8 @@ def check_jumps(time_s: np.ndarray, pos: np.ndarray) -> list[Finding]:
         [np.linalg.norm(velocity[k] - usual[k + other], axis=1) for other in (-STEPS, 1)], axis=0
     )
     # The median velocity is that of the middle of its window: half of its steps away.
-    turned_m = ACC_MAX * 0.5 * (STEPS + 1) * float(np.median(step_s)) * step_s[k]
+    around_s = np.lib.stride_tricks.sliding_window_view(step_s, 2 * STEPS + 1).mean(axis=-1)
+    turned_m = ACC_MAX * 0.5 * (STEPS + 1) * around_s * step_s[k]
     noise_m = SURE_SD / 0.6745 * float(np.median(size_m))
     excess_m = size_m - (LEAST_M + turned_m + 0.5 * ACC_MAX * step_s[k] ** 2 + noise_m)
     jumps = np.flatnonzero(excess_m > 0.0)

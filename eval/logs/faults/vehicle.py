@@ -84,7 +84,8 @@ def _rate_gain(vehicle: Vehicle) -> list[Finding]:
         "gains are 1/s: angular acceleration for each rad/s of rate error; a firmware's PID gains "
         "have other units (docs/measure.md)"
     )
-    return [Finding("doubt", "vehicle", text, "vehicle_gain", gain, 0.95, fix)]
+    # Only rollouts by rate commands use the gains, so they do not stop a diagnosis.
+    return [Finding("note", "vehicle", text, "vehicle_gain", gain, 0.95, fix)]
 
 
 def _gyration(vehicle: Vehicle, arm: float) -> float:

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from eval.importers import import_log
 from eval.importers.assemble import assemble, usable_for
+from eval.importers.checks.angles import check_angles
 from eval.importers.formats import FORMATS, detect
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, Signal
@@ -107,6 +108,12 @@ def test_positions_that_stand_still_in_flight_are_left_out(tmp_path):
     assert "stand still while the gyro turns" in text(findings, "position")
     assert not [f for f in findings if f.status == "doubt"]
     assert np.isnan(log.pos_w[(log.time_s > 3.05) & (log.time_s < 3.45)]).all()
+    # A slow pose that is held in fast rows was never lost.
+    parts, hold = flight(), 25
+    for name in ("pos", "vel"):
+        parts[name] = np.repeat(parts[name][::hold], hold, axis=0)[: len(parts["time"])]
+    _, findings = import_log(write(tmp_path / "held.csv", parts))
+    assert "repeat the one before" in text(findings, "position")
 
 
 @pytest.mark.parametrize(
@@ -134,13 +141,28 @@ def test_order_and_unit_of_euler_angles_are_found(tmp_path, columns, unit, words
             path, "table", ImportOptions(map=tmp_path / "map.toml", fix=fix, partial=True)
         )
         wrong = [f for f in findings if f.status in ("corrected", "doubt")]
+        is_order = "columns are" in words
         assert [f.status for f in wrong][:1] == (
-            [] if not words else ["corrected" if fix else "doubt"]
+            [] if not words else ["corrected" if fix and is_order else "doubt"]
         )
         assert not words or words in wrong[0].evidence
-        if fix:
+        if fix and (is_order or not words):
             assert len(wrong) == bool(words)
             near(np.abs(log.quat_wxyz), np.abs(known_flight.fly(log.time_s).quat), 0.01)
+
+
+def test_right_angles_are_kept_next_to_a_gyro_in_another_unit():
+    """Small angles in a wrong unit look like it."""
+    clock = np.arange(0.0, 8.0, 0.01)
+    truth = known_flight.fly(clock)
+    angles = Rotation.from_quat(truth.quat, scalar_first=True).as_euler("ZYX")[:, ::-1]
+
+    def quat_of(value):
+        return Rotation.from_euler("ZYX", value[:, ::-1]).as_quat(scalar_first=True)
+
+    for factor in (np.pi / 180.0, 1.0, 180.0 / np.pi):
+        gyro = Signal(clock, factor * truth.rate)
+        assert check_angles(Signal(clock, angles), quat_of, gyro, True) == (None, [])
 
 
 def test_a_pose_file_without_a_time_is_described_with_pose_map(tmp_path):

@@ -167,7 +167,7 @@ def test_flights_of_another_vehicle_than_the_corrected_one_warn(tmp_path, capsys
     for vehicle, warns in (("crazyflie21", True), ("reference", False)):
         assert run(f"delta {tmp_path} --model quad --vehicle {vehicle}") == 1
         said = capsys.readouterr().err
-        assert ("flights are of vehicle 'reference'" in said and vehicle in said) == warns
+        assert ("the log names the vehicle 'reference'" in said and vehicle in said) == warns
 
 
 @pytest.fixture(scope="module")

@@ -93,6 +93,16 @@ def test_a_jump_of_the_position_is_named(rows, moved_m, status, missing):
     assert at_s == pytest.approx(log.time_s[150], abs=0.12)
 
 
+@pytest.mark.parametrize("held", [10, 20])
+def test_a_slow_position_that_is_held_in_fast_rows_does_not_jump(held):
+    time_s = np.arange(0.0, 8.0, 0.01)
+    pos = np.column_stack([3.0 * np.sin(2.0 * time_s), 3.0 * np.cos(2.0 * time_s), 0.0 * time_s])
+    slow = np.repeat(pos[::held], held, axis=0)
+    for rows in (slow, np.concatenate([pos[:400], slow[400:]])):
+        assert not check_jumps(time_s, rows)
+    assert not check_jumps(np.append(time_s, time_s[-1]), np.append(pos, pos[-1:], axis=0))
+
+
 def test_another_vehicles_name_is_a_note_and_an_implausible_file_is_in_doubt():
     log = replace(fly(PLAIN, 0, duration_s=3.0, motors=True), about={"vehicle": "other"})
     fast = replace(PLAIN, rotors=replace(PLAIN.rotors, speed_max=10.0 * PLAIN.rotors.speed_max))
