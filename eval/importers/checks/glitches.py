@@ -97,8 +97,8 @@ def without_lost(recording: Recording) -> tuple[Recording, list[Finding]]:
         if _is_coarse(samples):
             continue
         time_s, is_lost = samples.time_s, np.zeros(len(samples.time_s), dtype=bool)
-        starts = [0, *(np.flatnonzero(np.diff(samples.value, axis=0).any(axis=1)) + 1)]
-        stops = np.array([*starts[1:], len(time_s)])
+        changes = np.flatnonzero(np.diff(samples.value, axis=0).any(axis=1)) + 1
+        starts, stops = np.append(0, changes), np.append(changes, len(time_s))
         held_s = time_s[stops - 1] - time_s[starts]
         longest_s = LOST_S + LOST_HOLDS * np.median(held_s)  # a slow signal is held in fast rows
         for first, stop, hold_s in zip(starts, stops, held_s, strict=True):
