@@ -46,11 +46,11 @@ SHOWN = (
     *("body_frame", "position_axes", "position_unit"),
 )
 """Faults that need an attitude to be identifiable."""
-ORDERS = ("y,x,z", "z,y,x", "x,z,y", "y,z,x", "z,x,y")
+SWAPS = ("y,x,z", "z,y,x", "x,z,y", "y,z,x", "z,x,y")
 """Other orders of a position's columns; tried only with an attitude that is right as given."""
 POSITIONS = (
     *("", "x,-y,-z", "y,x,-z", "-x,y,z", "x,-y,z", "x,y,-z", "-y,x,z", "y,-x,z", "-x,-y,z"),
-    *ORDERS,
+    *SWAPS,
 )
 """Readings of a position: "" for the given one, or a step for `axes_matrix`."""
 LENGTHS = {1.0: "m", 0.01: "cm", 0.001: "mm", 100.0: "m, read as cm", 1000.0: "m, read as mm"}
@@ -131,7 +131,7 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
             for length in LENGTHS if path is not None else (1.0,):
                 if len(found) == 1 and _is_right(found[0]):
                     break
-                if steps and pos in ORDERS:
+                if steps and pos in SWAPS:
                     continue
                 force, size = forces.get((pos, length), (None, 0.0))
                 level = max(level, size) if not steps and not pos and length == 1.0 else level
