@@ -54,7 +54,7 @@ POSITIONS = (
 )
 """Readings of a position: "" for the given one, or a step for `axes_matrix`."""
 LENGTHS = {1.0: "m", 0.01: "cm", 0.001: "mm", 100.0: "m, read as cm", 1000.0: "m, read as mm"}
-"""Possible units of a position [m], in words."""
+"""Possible units of a position [m], in words; those above 1 only where nothing else is wrong."""
 
 
 class Reading(NamedTuple):
@@ -131,7 +131,7 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
             for length in LENGTHS if path is not None else (1.0,):
                 if len(found) == 1 and _is_right(found[0]):
                     break
-                if steps and pos in SWAPS:
+                if (steps and pos in SWAPS) or (length > 1.0 and (steps or pos)):
                     continue
                 force, size = forces.get((pos, length), (None, 0.0))
                 level = max(level, size) if not steps and not pos and length == 1.0 else level
