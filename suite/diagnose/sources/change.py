@@ -27,7 +27,7 @@ from suite.diagnose.search.change import (
     search_motion_change,
 )
 from suite.diagnose.search.evaluation import Evaluation, SearchResult
-from suite.diagnose.sources.source import DiagnosisInput, Series
+from suite.diagnose.sources.source import FITTED, GIVEN, DiagnosisInput, Series
 from suite.diagnose.sources.view_source import NO_AGREEMENT, QUANTITIES, Shares, ViewSource
 
 MEASURE = (
@@ -76,11 +76,11 @@ class MeansSource(ViewSource):
         size = np.abs(change - left if found.named else change).mean(axis=0)
         axis = max(self.view.axes, key=lambda k: float(size[k]))
         count, zeros = len(earlier), np.zeros(len(earlier) + len(change))
-        lines = {"simulated as given": zeros}
+        lines = {GIVEN: zeros}
         if found.named:
             named = zeros.copy()
             named[count:] = (change - left)[:, axis]
-            lines["simulated with the named effects"] = named
+            lines[FITTED] = named
         quantity = QUANTITIES.get(self.name, self.name)
         return Series(
             1.0 + np.arange(len(zeros)),

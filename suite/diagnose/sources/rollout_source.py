@@ -41,6 +41,8 @@ from suite.diagnose.evidence.rollouts import (
 from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.search.evaluation import Evaluation, SearchResult
 from suite.diagnose.sources.source import (
+    FITTED,
+    GIVEN,
     TOO_SMALL,
     Finding,
     Remaining,
@@ -73,8 +75,6 @@ from suite.diagnose.verdict.residual_structure import (
 
 SHOWN = 4
 """Number of held-out flights in pictures and recordings."""
-GIVEN = "simulated as given"
-"""Label of the vehicle file's model in pictures and recordings."""
 ROUNDING_S = 1e-6
 """Start times that differ by less are equal [s]."""
 SHAPES = 5
@@ -300,7 +300,7 @@ class RolloutSource(Source):
             start = true_starts(self.model, theta, windows) + correction
             return self.model.residual(theta, start, windows)
 
-        named = {"simulated with the named effects": errors(best)} if found.named else {}
+        named = {FITTED: errors(best)} if found.named else {}
         return windows, {GIVEN: errors(self.start.theta), **named}
 
     def series(self, found: SearchResult) -> Series:

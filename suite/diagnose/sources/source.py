@@ -63,6 +63,10 @@ class Remaining(NamedTuple):
     """Further entries of `gap.channels` in diagnosis.json, by group and channel."""
 
 
+GIVEN, FITTED = "simulated as given", "simulated with the named effects"
+"""Labels of the vehicle file's model and of the fitted model, in charts and recordings."""
+
+
 class Series(NamedTuple):
     """A held-out stretch as measured and as simulated, for a chart of N points."""
 

@@ -19,7 +19,14 @@ from suite.diagnose.evidence.evidence import validation_groups
 from suite.diagnose.evidence.moments import centred, means_of
 from suite.diagnose.evidence.views import ViewBlock, ViewEvidence
 from suite.diagnose.search.evaluation import SearchResult
-from suite.diagnose.sources.source import Remaining, Series, Source, sizes_by_effect
+from suite.diagnose.sources.source import (
+    FITTED,
+    GIVEN,
+    Remaining,
+    Series,
+    Source,
+    sizes_by_effect,
+)
 from suite.diagnose.verdict.disturbances import residual_swing
 from suite.diagnose.verdict.gap import Channel, EffectSize, Gap, rms_length, view_size
 
@@ -198,10 +205,10 @@ class ViewSource(Source):
         first = int(np.convolve(size, np.ones(min(count, len(size))), "valid").argmax())
         shown = slice(first, first + count)
         measured = (before.value + before.residual)[rows, axis][shown]
-        lines = {"simulated as given": before.value[rows, axis][shown]}
+        lines = {GIVEN: before.value[rows, axis][shown]}
         if found.named:
             named = measured - after.residual[rows, axis][shown]
-            lines["simulated with the named effects"] = named
+            lines[FITTED] = named
         quantity = QUANTITIES.get(self.name, self.name).capitalize()
         return Series(
             middle[shown] - middle[shown][0],
