@@ -19,7 +19,7 @@ from suite.experiments.pages import paper
 from suite.experiments.pages.document import PageContents
 from suite.experiments.study import options, training
 from suite.experiments.study.cache import Workspace
-from suite.experiments.study.summary import Summary, summaries
+from suite.experiments.study.training import Summary
 from suite.train.overrides import check_owned, in_every_phase
 from tracks.common.grid import Grid, table
 
@@ -61,9 +61,8 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     # The first argument is 0: only the finished policies are measured.
     compared = settings(config)
     unseen = training.UnseenWorlds(0, config.trials, config.seed, config.seconds)
-    study = training.Study(compared, config.training_seeds, unseen)
-    runs = training.train_all(study, workspace, console)
-    rows, recipe = summaries(compared, runs), compared[0].recipe
+    runs = training.train_all(compared, config.training_seeds, unseen, workspace, console)
+    rows, recipe = training.summaries(compared, runs), compared[0].recipe
     at_end = {row.key: row.at[-1] for row in rows if row.at}
     steps = config.iterations * recipe.episode.batch * recipe.episode.steps
     median_time = duration(float(np.median([run.seconds for run in runs])))

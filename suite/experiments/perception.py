@@ -14,7 +14,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from eval.judging.statistics import paired_success, wilson
+from eval.judging.statistics import wilson
 from eval.judging.tables import percent
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors import SENSORS
@@ -25,15 +25,18 @@ from eval.sensors.sensors_file import (
     scale_sensors,
     shipped_sensors,
 )
-from eval.vehicles.vehicle import Vehicle
 from suite.common.console import Console
 from suite.common.report import Picture
 from suite.experiments.pages.document import PageContents
-from suite.experiments.study import disturbed, judging, options
+from suite.experiments.study import conditions, judging, options
 from suite.experiments.study.cache import Workspace
-from suite.experiments.study.conditions import Condition, Sweep, sweep_conditions
-from suite.experiments.study.disturbed import ConditionResult
-from suite.loop.tables import difference_cell
+from suite.experiments.study.conditions import (
+    Condition,
+    ConditionResult,
+    Sweep,
+    sweep_conditions,
+)
+from suite.loop.compare import difference_cell
 from tracks.common.grid import Cell, Grid, table
 from tracks.input.ranges import Trials
 
@@ -74,7 +77,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     preset_conditions = [
         Condition(name, 1.0, "", vehicle, sensors) for name, sensors in presets.items()
     ]
-    results = disturbed.fly_conditions(
+    results = conditions.fly_conditions(
         [base, *preset_conditions], policies, trials, workspace, console
     )
 
@@ -84,13 +87,17 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
 
     def fly_sweeps(
         sets: Mapping[str, SensorSet], magnitudes: Sequence[float], policies: Mapping[str, str]
-    ) -> disturbed.SweepResults:
+    ) -> conditions.SweepResults:
         """Return the results of each of `sets` at each of `magnitudes`."""
-        sweeps = magnitude_sweeps(sets, magnitudes)
-        conditions = {sweep: sweep_conditions(vehicle, sweep) for sweep in sweeps}
-        flown = [point for points in conditions.values() for point in points]
-        results = disturbed.fly_conditions(flown, policies, sweep_trials, workspace, console)
-        return disturbed.by_sweep(results, conditions)
+        axis = "magnitude, times the usual"
+        sweeps = [
+            Sweep(name, axis, magnitudes, partial(scale_sensors, sensors))
+            for name, sensors in sets.items()
+        ]
+        points = {sweep: sweep_conditions(vehicle, sweep) for sweep in sweeps}
+        flown = [point for listed in points.values() for point in listed]
+        results = conditions.fly_conditions(flown, policies, sweep_trials, workspace, console)
+        return conditions.by_sweep(results, points)
 
     first_policy = dict([next(iter(policies.items()))])
     preset_sweeps = fly_sweeps(presets, PRESET_MAGNITUDES, policies)
@@ -114,7 +121,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
             chart = Picture(sweeps_chart(points), "Success against the magnitude of each")
             parts[title] = [chart, magnitude_grid(points)]
     numbers = [
-        disturbed.tested_numbers(entry, entries[0])
+        conditions.tested_numbers(entry, entries[0])
         for entries in (results, *preset_sweeps.values(), *model_sweeps.values())
         for entry in entries
     ]
@@ -143,18 +150,6 @@ def select_sensor_sets(only: Sequence[str]) -> tuple[dict[str, SensorSet], dict[
     )
 
 
-def magnitude_sweeps(sets: Mapping[str, SensorSet], magnitudes: Sequence[float]) -> list[Sweep]:
-    """Return a sweep over `magnitudes` of each of `sets`."""
-
-    def make(sensors: SensorSet, vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorSet]:
-        return vehicle, scale_sensors(sensors, size)
-
-    return [
-        Sweep(name, "magnitude, times the usual", magnitudes, partial(make, sensors))
-        for name, sensors in sets.items()
-    ]
-
-
 def _median_speed(entry: ConditionResult, policy: str) -> float:
     """Return the median, over the trials of a policy, of the mean speed [m/s]."""
     return float(np.median([row.v_mean for row in entry.results[policy]]))
@@ -174,7 +169,7 @@ def preset_grid(results: Sequence[ConditionResult]) -> Grid:
             for level in levels:
                 success = [trial.success for trial in trials if trial.difficulty == level]
                 row.append(percent(wilson(sum(success), len(success))))
-            change = paired_success(entry.won(name), base.won(name))
+            change = entry.minus(base, name)
             speed, base_speed = _median_speed(entry, name), _median_speed(base, name)
             is_perfect = entry.condition.sensors == PERFECT
             row += [percent(entry.success(name)), "" if is_perfect else difference_cell(change)]
@@ -194,7 +189,7 @@ def gain_grids(results: Sequence[ConditionResult]) -> list[Grid]:
     for entry in results:
         cells = []
         for name in others:
-            change = difference_cell(paired_success(entry.won(name), entry.won(first)))
+            change = difference_cell(entry.minus(entry, name, first))
             speed_change = _median_speed(entry, name) / _median_speed(entry, first) - 1
             cells.append(Cell(f"{change.text}, {speed_change:+.1%}", change.tone))
         rows.append([entry.condition.name, *cells])

@@ -19,7 +19,7 @@ from suite.common.report import Picture
 from suite.experiments.pages.document import PageContents
 from suite.experiments.study import options, training
 from suite.experiments.study.cache import Workspace
-from suite.experiments.study.summary import Summary, summaries
+from suite.experiments.study.training import Summary
 from suite.train.overrides import check_owned, in_every_phase
 from suite.train.ppo.config import ppo_like
 from tracks.common.grid import Grid, table
@@ -62,9 +62,10 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
 
     compared = schemes(config)
     unseen = training.UnseenWorlds(config.measurements, config.trials, config.seed, config.seconds)
-    study = training.Study(compared, config.training_seeds, unseen, by_seed=True)
-    runs = training.train_all(study, workspace, console)
-    rows, episode = summaries(compared, runs), compared[0].recipe.episode
+    runs = training.train_all(
+        compared, config.training_seeds, unseen, workspace, console, by_seed=True
+    )
+    rows, episode = training.summaries(compared, runs), compared[0].recipe.episode
     compile_s = {
         row.key: float(np.mean([run.compile_s for run in runs if run.setting == row.key]))
         for row in rows

@@ -159,8 +159,10 @@ def resolve(
     Raises:
         ValueError: for an invalid option, with what is allowed.
     """
+    from eval.judging.judge import check_records
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.sensors.sensors_file import load_sensors, sensors_table
+    from eval.worlds import world_class
     from policies.formats.policy_file import load_policy_checkpoint
     from suite.diagnose.estimate.parameters import refuse_own_motion
     from suite.judging.content import policy_digest
@@ -201,7 +203,8 @@ def resolve(
     true_vehicle = vehicle if hidden_vehicle is None else hidden_vehicle
     if hidden:
         refuse_own_motion(simulated)
-        check_simulator(simulator)
+        world_class(simulator)
+        check_records(simulator)
         true = load_vehicle(true_vehicle)
         if simulated == replace(true, name=simulated.name) and simulator in EXACT_SIMULATORS:
             raise ValueError(
@@ -271,20 +274,6 @@ def _check_changes(
                 "number of fine-tuning steps"
             )
     check_owned(changes, owned)
-
-
-def check_simulator(name: str) -> None:
-    """Refuse a simulator that cannot fly a true vehicle.
-
-    Raises:
-        ValueError: for an unknown simulator, a missing package, or a simulator that does not record
-            flights.
-    """
-    from eval.judging.judge import check_records
-    from eval.worlds import world_class
-
-    world_class(name)
-    check_records(name)
 
 
 def _check_seeds(config: LoopConfig) -> None:

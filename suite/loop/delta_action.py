@@ -16,9 +16,8 @@ from suite.common.charts import curves_chart
 from suite.common.report import Picture, Section
 from suite.delta.run import errors_grid
 from suite.loop.charts import COLOURS, delta_chart
-from suite.loop.compare import BEFORE, PolicyResult
+from suite.loop.compare import BEFORE, PolicyResult, points, significance
 from suite.loop.config import LoopConfig
-from suite.loop.tables import points, significance
 from suite.loop.variants import DeltaModel, Findings, Loop, ShownPolicy, Variant
 
 WITHOUT, WITH = "without", "with"

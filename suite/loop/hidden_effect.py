@@ -29,9 +29,8 @@ from suite.common.report import Links, Picture, Section
 from suite.delta.run import errors_grid
 from suite.diagnose.report.summary import components, grid
 from suite.loop.charts import COLOURS
-from suite.loop.compare import BEFORE, PolicyResult
+from suite.loop.compare import BEFORE, PolicyResult, points, significance
 from suite.loop.config import EXACT_SIMULATORS, LoopConfig
-from suite.loop.tables import points, significance
 from suite.loop.variants import DeltaModel, Findings, Loop, ShownPolicy, Variant
 from suite.loop.work import named_effects, read_diagnosis
 from tracks.common.files import to_json

@@ -7,24 +7,24 @@ repeated.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from eval.judging.results import read_trials
-from suite.common.console import Console
-from suite.common.report import Picture
+from suite.common.console import Console, duration
+from suite.common.report import Details, Links, Picture, Report, Section, write_report
 from suite.common.stages import claim, run_stages
+from suite.judging.trials import parse_tracks
 from suite.loop import delta_action, hidden_effect
 from suite.loop.charts import success_chart
-from suite.loop.compare import policy_results
+from suite.loop.compare import CAVEAT, cell_grid, overall_grid, policy_results
 from suite.loop.config import LoopConfig, loop_by_content
-from suite.loop.report import write_loop_report
-from suite.loop.tables import CAVEAT, cell_grid, overall_grid
+from suite.loop.variants import Findings
 from suite.loop.work import LoopRun, plan
-from tracks.common.files import plain, write_json, write_text
-from tracks.common.grid import markdown, rich_table
-from tracks.common.provenance import stamp
+from tracks.common.files import plain, to_json, write_json, write_text
+from tracks.common.grid import Grid, markdown, rich_table, table
+from tracks.common.provenance import VERSION, git_commit, stamp
 from tracks.common.work import Workers
 
 FILES = ("table.md", "report.html", "recording.rrd")
@@ -91,7 +91,7 @@ def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any
         "files": {name: name for name in FILES},
     }
     write_json(out / "loop.json", answer)
-    write_loop_report(out, loop, config, findings, [chart, *grids], seconds)
+    write_report(out / "report.html", _report(run, findings, [chart, *grids], seconds))
     # Print the same tables, the verdict and where the files are.
     for grid in grids:
         console.show(rich_table(grid))
@@ -115,3 +115,54 @@ def seeds(run: LoopRun) -> dict[str, Any]:
         "judged": [config.seed, config.seed + config.trials - 1],
         "recorded": [config.recorded_from, config.recorded_from + config.flights - 1],
     }
+
+
+def _report(
+    run: LoopRun,
+    findings: Findings,
+    results: Sequence[Grid | Picture],
+    seconds: Mapping[str, float],
+) -> Report:
+    """Return the report: chart and tables of the policies, findings, pictures of flights, files.
+
+    The chart and the tables are `results`; `seconds` are the times of the stages [s].
+    """
+    loop, config, out = run.loop, run.config, run.out
+    vehicle = ", with the hidden vehicle" if loop.hidden else ""
+    texts = (
+        "The first seed of every track at the easiest and the hardest level, from above"
+        f"{vehicle}. Passed gates are green; a star is the end of a finished trial, a cross that "
+        "of any other.",
+        "The same trials.",
+    )
+    flights = [
+        Section(s.heading, [text, Picture((out / "replays" / f"{s.variant}.png").read_bytes(), "")])
+        for s, text in zip(loop.shown, texts, strict=True)
+    ]
+    links = [(path, text) for path, text in loop.files if (out / path).is_file()]
+    times_s = {**seconds, "all": sum(seconds.values())}
+    rows = [(name, duration(value)) for name, value in times_s.items()]
+    files = [
+        Links(links),
+        table(["stage", "took"], rows, "Time", strong_last=True),
+        Details("Configuration", to_json(config, indent=2)),
+    ]
+    return Report(
+        title=loop.title,
+        lead=findings.verdict,
+        facts={
+            "trials": f"{config.trials * config.cells} of each policy",
+            "tracks": ", ".join(parse_tracks(config.track)),
+            "levels": config.difficulty,
+            **findings.facts,
+            "started from": config.policy or "training",
+            "seed": str(config.seed),
+            "version": f"{VERSION}, {(git_commit() or 'no commit')[:10]}",
+        },
+        sections=[
+            Section("On the same seeds", [loop.reading, *results, CAVEAT]),
+            *findings.sections,
+            *flights,
+            Section("Files and configuration", files),
+        ],
+    )

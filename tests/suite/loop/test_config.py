@@ -17,10 +17,9 @@ from suite.common.stages import is_done
 from suite.common.usage import renamed
 from suite.delta.replay import nominal_model
 from suite.loop import delta_action, hidden_effect, measured, work
-from suite.loop.compare import policy_results
+from suite.loop.compare import cell_grid, overall_grid, policy_results
 from suite.loop.config import loop_by_content, resolve
 from suite.loop.hidden_effect import LABELS
-from suite.loop.tables import cell_grid, overall_grid
 from suite.loop.variants import DeltaModel, Variant
 from suite.loop.work import LoopRun, Quiet, plan
 from suite.train.config import PointMassConfig
