@@ -145,11 +145,7 @@ DRAWERS: dict[str, Callable[[int, int | None], dict[str, Case]]] = {
 
 
 def _counts(count: int | None, full: Mapping[str, int]) -> dict[str, int]:
-    """Return kind -> number of cases, for about `count` cases of a set with the numbers `full`.
-
-    Raises:
-        ValueError: for a count below 1.
-    """
+    """Return kind -> number of cases, for about `count` cases of a set with the numbers `full`."""
     if count is not None and count < 1:
         raise ValueError(f"count = {count}: must be at least 1")
     share = 1.0 if count is None else min(count / sum(full.values()), 1.0)

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from tracks.common.names import printable
 
@@ -20,12 +20,9 @@ PLAIN_PERIOD_S = 10.0
 """Time between two lines about the progress if standard error is no terminal [s]."""
 
 
-class Update(Protocol):
-    """The function that work calls to report its progress."""
-
-    def __call__(self, done: float, note: str = "") -> None:
-        """Show that `done` of the total is finished, with a short note."""
-        ...
+Update = Callable[..., None]
+"""Function (done, note) that shows that `done` of the total is finished, with a short note (or
+none)."""
 
 
 class Console:
@@ -104,7 +101,13 @@ class Quiet(Console):
 
 
 class Silent(Quiet):
-    """A console that prints nothing."""
+    """A console that prints nothing. In another process it forwards the progress."""
+
+    def __init__(
+        self, forward: Callable[[float, float], object] = lambda done, total: None
+    ) -> None:
+        """Make a console that calls `forward` with what is done of a total."""
+        self._forward = forward
 
     def note(self, text: str) -> None:
         """Print nothing."""
@@ -113,12 +116,8 @@ class Silent(Quiet):
     def progress(
         self, label: str, total: float, clock: object = None, begun: float = 0.0
     ) -> Iterator[Update]:
-        """Show nothing."""
-
-        def update(done: float, note: str = "") -> None:
-            del done, note
-
-        yield update
+        """Forward the progress of a long piece of work."""
+        yield lambda done, note="": self._forward(done, total)
 
 
 @contextmanager

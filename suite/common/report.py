@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +10,6 @@ from html import escape
 from pathlib import Path
 from string import Template
 
-from tracks.common.files import write_text
 from tracks.common.grid import Grid, html_table
 
 TEMPLATE = Path(__file__).with_name("report.html")
@@ -84,16 +82,6 @@ class Report:
     """Name -> value of the conditions, such as files and versions; shown below the lead."""
     sections: Sequence[Section]
     """All other contents."""
-
-
-def write_report(path: str | os.PathLike[str], report: Report) -> Path:
-    """Write `report` to `path` and return it as a Path.
-
-    Raises:
-        OSError: if the file cannot be written; then no partial file exists under its name.
-    """
-    write_text(path, html(report))
-    return Path(path)
 
 
 def html(report: Report) -> str:

@@ -25,7 +25,6 @@ from suite.delta.windows import (
     burn_in_before,
     decision_period,
     log_decisions,
-    refuse_no_windows,
     stack_windows,
     state_after,
 )
@@ -71,12 +70,6 @@ class QuadrotorWindows(NamedTuple):
     """Inputs of the network before each window."""
 
 
-def row_substeps(config: QuadrotorConfig, row_s: float) -> Substeps:
-    """Return the physics steps of one row, which is one step of the attitude loop."""
-    physics = whole_steps(row_s * max(config.physics_hz, LEAST_PHYSICS_HZ))
-    return Substeps(1, physics, row_s / physics)
-
-
 def row_period(logs: Sequence[FlightLog]) -> float:
     """Return the median time between rows of all `logs` [s]."""
     return float(np.median(np.concatenate([np.diff(log.time_s) for log in logs])))
@@ -106,7 +99,9 @@ def cut_quadrotor_windows(
                 "to fit the Delta Action Model of a quadrotor; record flights with suite collect"
             )
     row_s = row_period(logs) if row_s is None else row_s
-    substeps = row_substeps(config, row_s)
+    # A row is one step of the attitude loop.
+    physics = whole_steps(row_s * max(config.physics_hz, LEAST_PHYSICS_HZ))
+    substeps = Substeps(1, physics, row_s / physics)
     plant = plant_of(config, {}, substeps.dt, varies=False)
     delay_steps = plant.delay_weight.shape[-1]
     windows = [
@@ -114,8 +109,7 @@ def cut_quadrotor_windows(
         for log in logs
         for window in _flight_windows(log, substeps, delay_steps, row_s, duration_s, stride_s)
     ]
-    refuse_no_windows(windows, logs, duration_s)
-    return stack_windows(windows), substeps
+    return stack_windows(windows, logs, duration_s), substeps
 
 
 def _flight_windows(

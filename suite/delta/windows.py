@@ -75,15 +75,17 @@ def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -
         ValueError: if a log has no actions, or all flights are shorter than a window.
     """
     windows = [window for log in logs for window in _flight_windows(log, duration_s, stride_s)]
-    refuse_no_windows(windows, logs, duration_s)
-    return stack_windows(windows)
+    return stack_windows(windows, logs, duration_s)
 
 
-def refuse_no_windows(windows: Sequence[Any], logs: Sequence[FlightLog], duration_s: float) -> None:
-    """Refuse flights that give no window.
+def stack_windows(windows: Sequence[T], logs: Sequence[FlightLog], duration_s: float) -> T:
+    """Return the windows of `logs` along a new first axis, as 32-bit numbers.
+
+    They are truncated to the number of decisions that all have, and so are their burn-ins, since
+    flights with slightly shorter periods have more decisions in the same time.
 
     Raises:
-        ValueError: naming some of the flights, and what to do.
+        ValueError: if there are none, since all flights are shorter than `duration_s` [s].
     """
     if not windows:
         names = ", ".join(log.name for log in logs[:3])
@@ -92,13 +94,6 @@ def refuse_no_windows(windows: Sequence[Any], logs: Sequence[FlightLog], duratio
             "flights with suite collect"
         )
 
-
-def stack_windows(windows: Sequence[T]) -> T:
-    """Return windows along a new first axis, as 32-bit numbers.
-
-    They are truncated to the number of decisions that all have, and so are their burn-ins, since
-    flights with slightly shorter periods have more decisions in the same time.
-    """
     items: Sequence[Any] = windows
     count = min(len(item.burn_in.seen) for item in items)
     items = [

@@ -64,22 +64,20 @@ def page_states(folder: Path) -> dict[str, dict[str, Any]]:
     "policy" if a shipped policy now has other weights, and "code" if the code that flies or that
     the page measures is different, docstrings and comments apart. `newer` is None without a page.
     """
-    return {name: _page_state(folder / f"{name}.json") for name in PUBLISHED}
-
-
-def _page_state(path: Path) -> dict[str, Any]:
-    """Return the state of one page from its JSON file."""
-    if not path.is_file():
-        return {"commit": "", "newer": None}
-    page = json.loads(path.read_text(encoding="utf-8"))
-    policies = re.findall(r"([\w-]+), SHA-256 ([0-9a-f]{16})", json.dumps(page["made_by"]))
-    # Other policies than the shipped ones stand for themselves: nothing can be newer.
-    weights_differ = (
-        policy_digest(name)[:16] != digest for name, digest in policies if name in shipped.names()
-    )
-    newer = ["policy"] if any(weights_differ) else []
-    newer += ["code"] if page.get("code_sha256") != page_code(path.stem) else []
-    return {"commit": page["git_commit"] or "", "newer": newer}
+    states: dict[str, dict[str, Any]] = {}
+    for name in PUBLISHED:
+        path = folder / f"{name}.json"
+        if not path.is_file():
+            states[name] = {"commit": "", "newer": None}
+            continue
+        page = json.loads(path.read_text(encoding="utf-8"))
+        flown = re.findall(r"([\w-]+), SHA-256 ([0-9a-f]{16})", json.dumps(page["made_by"]))
+        # Other policies than the shipped ones stand for themselves: nothing can be newer.
+        digests = [(policy, digest) for policy, digest in flown if policy in shipped.names()]
+        newer = ["policy"] if any(policy_digest(p)[:16] != digest for p, digest in digests) else []
+        newer += ["code"] if page.get("code_sha256") != page_code(name) else []
+        states[name] = {"commit": page["git_commit"] or "", "newer": newer}
+    return states
 
 
 def status_grid(states: dict[str, dict[str, Any]]) -> Grid:

@@ -254,11 +254,7 @@ def resolve(
 def _check_changes(
     changes: Sequence[str], policy: str | None, iterations: int | None, hidden: bool
 ) -> None:
-    """Refuse options of a first training if there is none, and settings that the loop itself sets.
-
-    Raises:
-        ValueError: with the option and what to do instead.
-    """
+    """Refuse options of a first training if there is none, and settings that the loop sets."""
     owned = {"seed": "give --seed"}
     if hidden:
         owned["quadrotor.vehicle"] = "give --vehicle"
@@ -277,11 +273,7 @@ def _check_changes(
 
 
 def _check_seeds(config: LoopConfig) -> None:
-    """Refuse track files, on which recorded flights would equal judged trials, and too few flights.
-
-    Raises:
-        ValueError: with the option and what is allowed.
-    """
+    """Refuse track files, on which recorded flights would equal trials, and too few flights."""
     files = [name for name in parse_tracks(config.track) if is_track_file(name)]
     if files:
         raise ValueError(

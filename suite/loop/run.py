@@ -13,7 +13,7 @@ from typing import Any
 
 from eval.judging.results import read_trials
 from suite.common.console import Console, duration
-from suite.common.report import Details, Links, Picture, Report, Section, write_report
+from suite.common.report import Details, Links, Picture, Report, Section, html
 from suite.common.stages import claim, run_stages
 from suite.judging.trials import parse_tracks
 from suite.loop import delta_action, hidden_effect
@@ -91,7 +91,7 @@ def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any
         "files": {name: name for name in FILES},
     }
     write_json(out / "loop.json", answer)
-    write_report(out / "report.html", _report(run, findings, [chart, *grids], seconds))
+    write_text(out / "report.html", html(_report(run, findings, [chart, *grids], seconds)))
     # Print the same tables, the verdict and where the files are.
     for grid in grids:
         console.show(rich_table(grid))

@@ -35,13 +35,9 @@ class Body:
     def __init__(
         self, quadrotor: Quadrotor, wind: Wind, battery: Battery, hover_power: np.ndarray
     ) -> None:
-        """Prepare for N flights.
+        """Prepare for N flights of the vehicle `quadrotor`.
 
-        Args:
-            quadrotor: constants of the vehicle that flies.
-            wind: the moving air.
-            battery: constants of the battery.
-            hover_power: (N, 1) sum of the squared rotor speeds in hover [rad^2/s^2].
+        `hover_power` is the sum of the squared rotor speeds in hover, (N, 1) [rad^2/s^2].
         """
         self.quadrotor, self.wind, self._battery = quadrotor, wind, battery
         self._hover_power = hover_power

@@ -13,7 +13,7 @@ from eval.flights.simulate import SENSORS, fly, log_of
 from eval.flights.trajectory import Trajectory
 from eval.logs.flight_log import read_flight
 from suite.blind import build as module
-from suite.blind import make, simulators
+from suite.blind import make
 from suite.blind.build import build
 from suite.blind.cases import DRAWERS, MULTIPLES, SETS, Case, draw_cases, draw_continuous_cases
 from suite.blind.continuous.timing import draw_conditions
@@ -243,8 +243,8 @@ def test_a_continuous_cases_vehicle_has_the_loop_that_its_seed_draws(monkeypatch
     assert nominal == first.nominal and list(named) == ["linear_drag"]
     jumps = [np.diff(log.vel_w, 2, axis=0).std() for log in (exact, first.logs[0])]
     assert jumps[0] < 0.1 * jumps[1]
-    simulator = simulators.simulator_for(CONTINUOUS, np.random.default_rng(3))
+    simulator = module.simulator_for(CONTINUOUS, np.random.default_rng(3))
     drawn = draw_conditions(np.random.default_rng(3))
     assert simulator.conditions["row_hz"] == drawn.row_hz
     assert simulator.nominal.controller.frequency == drawn.loop_hz
-    assert not simulators.simulator_for(SINGLE, np.random.default_rng()).conditions
+    assert not module.simulator_for(SINGLE, np.random.default_rng()).conditions
