@@ -1,9 +1,9 @@
 """Make one blind case from its description: flights with hidden effects, their logs, the answer.
 
 The answer has the names that a diagnosis must give, and the alternatives: other effects that
-explain the flights as well. The alternatives come from the oracle (`suite/blind/oracle/`), which
-computes how well flights determine each parameter. It expresses a difference as a log-likelihood
-ratio, the squared change of the flights in standard deviations of the noise, divided by two.
+explain the flights as well. They come from the oracle (`suite/blind/oracle/`), which expresses a
+difference as a log-likelihood ratio: half the squared change of the flights in standard deviations
+of the noise.
 """
 
 from __future__ import annotations

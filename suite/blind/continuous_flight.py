@@ -1,8 +1,6 @@
 """Fly trajectories of blind cases in continuous time, with an engine of its own.
 
-The engine (`suite/blind/continuous/`) shares no code with the model that the diagnosis fits. The
-tracking controller, which follows the trajectory, is that of the other simulators: it only gives
-commands.
+The tracking controller is that of the other simulators: it only gives commands.
 """
 
 from __future__ import annotations

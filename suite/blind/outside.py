@@ -1,8 +1,7 @@
 """The hidden physics of a blind case: values of an effect, or physics that no effect describes.
 
-Effects are the physical causes of mismatch in the catalogue (`eval/effects/`), which a diagnosis
-can name. For physics outside the catalogue the correct verdict is `unknown`. A wrench is a force
-and a torque together. In the shapes, N is the number of flights.
+For physics outside the catalogue of effects the correct verdict is `unknown`. In the shapes, N is
+the number of flights.
 """
 
 from __future__ import annotations

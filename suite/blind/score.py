@@ -1,8 +1,7 @@
 """Score the diagnoses of blind cases: compare named effects and intervals with the answers.
 
-The answer of a case has the true effects. A diagnosis may name an effect with alternatives, other
-effects that explain the flights as well. The gap is the rollout error on held-out flights; its
-noise floor is the error that measurement noise alone gives.
+The gap is the rollout error on held-out flights; its noise floor is the error that measurement
+noise alone gives.
 """
 
 from __future__ import annotations

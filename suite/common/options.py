@@ -2,8 +2,7 @@
 
 The text below a field is the description of its option. The parser is the package tyro. Rare
 options are annotated `Advanced[...]` and are at the end of the help. A nested dataclass only groups
-options in the code: its fields are options of the command like all others. `settings` lists the
-settings of a training in the same way.
+options in the code: its fields are options of the command like all others.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """Replay recorded actions in the trainer's quadrotor, with or without a Delta Action Model.
 
-The model is a network that corrects the actions. A window is a short part of a measured flight. Its
-replay starts from the measured state; this includes the rotor speeds and the commands that are
-delayed and still to act. Each row of the log is one step of the attitude loop. The commanded yaw
-rate is the recorded one, because an action does not set the heading. The plant is the model of
-mixer, rotors and effects of the vehicle, for steps of a given length.
+The replay of a window starts from the measured state; this includes the rotor speeds and the
+commands that are delayed and still to act. Each row of the log is one step of the attitude loop.
+The commanded yaw rate is the recorded one, because an action does not set the heading. The plant is
+the model of mixer, rotors and effects of the vehicle, for steps of a given length.
 """
 
 from __future__ import annotations

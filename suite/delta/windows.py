@@ -1,8 +1,7 @@
 """Cut recorded flights into windows that start at a policy's decision, for replay in simulation.
 
-A window is a short part of a flight. A Delta Action Model, a recurrent network that corrects
-actions, is fitted to windows. In fine-tuning it runs for seconds, so its memory is not empty in
-most steps. Therefore it first runs over the measurements before a window, up to a few seconds
+A window is a short part of a flight. In fine-tuning a Delta Action Model runs for seconds, so its
+memory is not empty in most steps. Therefore it first runs over the measurements before a window
 (burn-in). Some windows start without memory, like the trainer's flights that start between two
 gates.
 """

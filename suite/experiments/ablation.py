@@ -1,8 +1,6 @@
-"""The page `ablation`: trainings with the Attractive Vector Field and without it.
+"""The page `ablation`: trainings with the Attractive Vector Field (Su et al. 2026) and without it.
 
-The field u_A is a term that guides the drone through gates (Su et al. 2026). Each setting is
-trained from several seeds at several weights of the progress term, and flies tracks that no
-training uses.
+Each setting is trained from several seeds, and flies tracks that no training uses.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The page `faults`: how many injected faults are named in simulated and real logs.
 
-A fault is an error of an interface or a log: a wrong unit, sign, scale, order, delay or rate. Each
-case takes a correct log, puts one fault into it, and imports and checks the result. `suite check`
-and `suite import` should report the fault by name, and report nothing in logs without a fault.
+Each case takes a correct log, puts one fault of its interface into it, and imports and checks the
+result. `suite check` and `suite import` should report the fault by name, and report nothing in logs
+without a fault.
 """
 
 from __future__ import annotations

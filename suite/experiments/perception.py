@@ -1,8 +1,7 @@
 """The page `perception`: success rate and speed of policies that get the data of sensor models.
 
-A sensor model simulates one kind of error in what a policy sees. A preset is a shipped sensors file
-with several models, such as `vio`. A magnitude multiplies the errors: 0 is a perfect sensor, 1 the
-usual size. All policies fly the same trials (a track, a level of difficulty, a seed).
+A preset is a shipped sensors file with several models, such as `vio`. A magnitude multiplies the
+errors: 0 is a perfect sensor, 1 the usual size.
 """
 
 from __future__ import annotations

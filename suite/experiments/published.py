@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from policies import shipped
-from suite.common.console import Console, duration
 from suite.experiments.study.cache import page_code
 from suite.judging.content import policy_digest
 from tracks.common.grid import Grid, table
@@ -39,22 +36,6 @@ class All:
 @dataclass(frozen=True)
 class Status:
     """List the published pages in --out, and which policy or code is newer than a page."""
-
-
-def make_all(make: Callable[[str, list[str]], Any], console: Console) -> dict[str, Any]:
-    """Make each published page by make(name, options), and print how long each took.
-
-    Returns:
-        `seconds`: page -> time that it took [s].
-    """
-    seconds: dict[str, float] = {}
-    for name, options in PUBLISHED.items():
-        console.say(f"{len(seconds) + 1} of {len(PUBLISHED)}: {name}")
-        started = time.monotonic()
-        make(name, options.split())
-        seconds[name] = round(time.monotonic() - started, 1)
-        console.say(f"{name}: {duration(seconds[name])}")
-    return {"seconds": seconds}
 
 
 def page_states(folder: Path) -> dict[str, dict[str, Any]]:

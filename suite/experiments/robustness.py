@@ -1,7 +1,5 @@
 """The page `robustness`: success of policies under physical effects and growing disturbances.
 
-An effect is one physical cause of a mismatch, such as drag or wind. A condition is a vehicle with
-an effect, or with other sensors. A sweep is a series of conditions in which one disturbance grows.
 All policies fly the same trials under every condition.
 """
 

@@ -1,8 +1,7 @@
 """The page `schemes`: the paper's comparison of three schemes (ways of training a policy).
 
-They are PPO, our method, and our method without the field (the Attractive Vector Field, which
-guides the drone through gates). All are trained in the same dynamics. During the training they are
-measured on tracks that no training uses.
+They are PPO, our method, and our method without the Attractive Vector Field ("the field"). During
+the training they are measured on tracks that no training uses.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The page `simulators`: policies on the same trials in every simulator, and why results differ.
 
-A trial is one judged flight. Where a simulator has other aerodynamics than MuJoCo, a control flies
-MuJoCo with these aerodynamics, which separates their effect from other differences.
+Where a simulator has other aerodynamics than MuJoCo, a control flies MuJoCo with these
+aerodynamics, which separates their effect from other differences.
 """
 
 from __future__ import annotations

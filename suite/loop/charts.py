@@ -1,10 +1,4 @@
-"""Draw the charts of a loop as PNG: success rates, and errors of the Delta Action Model.
-
-The loop (`suite loop`) flies a policy, corrects the simulation from these flights and fine-tunes
-the policy in it; the charts compare the policies before and after. The Delta Action Model ("delta")
-is a network that corrects actions so that simulated flights match measured ones. A cell is the
-trials of one track at one level of difficulty.
-"""
+"""Draw the charts of a loop as PNG: success rates, and errors of the Delta Action Model."""
 
 from __future__ import annotations
 

@@ -1,9 +1,7 @@
 """Compare the policies that a loop judged on the same trials: numbers, tables and sentences.
 
-A trial is one judged flight: a track, its level (difficulty 0 to 9) and a seed. The trials of one
-track and level are a cell.
-
-A p-value is that of the exact two-sided McNemar test, which compares the successes on equal trials.
+The trials of one track and level are a cell. A p-value is that of the exact two-sided McNemar test,
+which compares the successes on equal trials.
 """
 
 from __future__ import annotations
@@ -156,15 +154,13 @@ def value_text(interval: Interval, scale: float, digits: int) -> str:
     return f"{value} [{low}, {high}]"
 
 
-def difference_cell(
-    interval: Interval | PairedDifference, scale: float = 100, digits: int = 0
-) -> Cell:
-    """Return a difference with its sign and interval, coloured if the interval excludes zero.
+def difference_cell(interval: Interval | PairedDifference) -> Cell:
+    """Return a difference of rates with its sign and interval, in percentage points.
 
-    By default it is a difference of rates, written in percentage points.
+    It is coloured if the interval excludes zero.
     """
     # Adding zero turns a rounded -0 into +0.
-    value, low, high = (f"{round(scale * x, digits) + 0.0:+.{digits}f}" for x in interval[:3])
+    value, low, high = (f"{round(100 * x, 0) + 0.0:+.0f}" for x in interval[:3])
     tone = "good" if interval.low > 0 else "bad" if interval.high < 0 else ""
     return Cell(f"{value} [{low}, {high}]", tone)
 

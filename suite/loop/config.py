@@ -1,9 +1,7 @@
 """The settings of a loop, computed from a recipe (named settings of a training) and the options.
 
-A loop flies a policy, corrects the simulation from these flights, fine-tunes the policy in it and
-judges both. The true vehicle produces the flights. In a loop with a hidden vehicle it differs from
-the vehicle file of the simulation; else it is the same. A digest is the SHA-256 of a file's
-content.
+The true vehicle produces the flights. In a loop with a hidden vehicle it differs from the vehicle
+file of the simulation; else it is the same.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The loop that shows the effect of a Delta Action Model ("delta") on the fine-tuning of a policy.
 
-The model is a network that corrects actions so that simulated flights match measured ones. One
-policy is fine-tuned with it. Another one, the control, is fine-tuned without it for the same number
-of steps, and shows the effect of more training alone.
+One policy is fine-tuned with it. Another one, the control, is fine-tuned without it for the same
+number of steps, and shows the effect of more training alone.
 """
 
 from __future__ import annotations

@@ -1,14 +1,10 @@
 """The loop with a hidden vehicle: its effect is diagnosed, and policies are fine-tuned for it.
 
-The hidden vehicle has a physical effect (such as drag) that the simulation's vehicle file lacks.
-Only the judge, the simulator that scores policies, reads the file of the hidden vehicle. The
-simulation is corrected from measured flights only. A Delta Action Model is a network that corrects
-actions so that simulated flights match measured ones.
-
-Six policies are compared. `NOMINAL` and `BEFORE` are the first policy, with the vehicle of the
-simulation and with the hidden one. The others are fine-tuned and fly the hidden vehicle: `CONTROL`
-in the uncorrected simulation, `DELTA` with a Delta Action Model, `NAMED` with the effect that the
-diagnosis names, `BOTH` with that effect and a Delta Action Model.
+Only the judge reads the file of the hidden vehicle; the simulation is corrected from measured
+flights only. Six policies are compared. `NOMINAL` and `BEFORE` are the first policy, with the
+vehicle of the simulation and with the hidden one. The others are fine-tuned and fly the hidden
+vehicle: `CONTROL` in the uncorrected simulation, `DELTA` with a Delta Action Model, `NAMED` with
+the effect that the diagnosis names, `BOTH` with that effect and a Delta Action Model.
 """
 
 from __future__ import annotations

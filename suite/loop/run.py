@@ -1,8 +1,6 @@
 """Run a loop stage by stage, each in its own folder, and report the result (`suite loop`).
 
-A loop flies a policy, corrects the simulation from these flights, fine-tunes the policy in it and
-compares the policies. An interrupted stage continues where it stopped; a finished one is not
-repeated.
+An interrupted stage continues where it stopped; a finished one is not repeated.
 """
 
 from __future__ import annotations

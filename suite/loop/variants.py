@@ -1,10 +1,7 @@
 """Describe a loop as data: its policies, and the dynamics in which they are fine-tuned and judged.
 
-A loop flies a policy, corrects the simulation from these flights, fine-tunes the policy in it and
-judges both. The judge is the simulator that scores policies. There is one fine-tuned policy for
-each way to correct the simulation; all policies are called variants.
-
-The folder of a loop has, in the order of the stages:
+There is one fine-tuned policy for each way to correct the simulation; all policies are called
+variants. The folder of a loop has, in the order of the stages:
 - train/ or given/: the first policy, trained or copied; eval-X/: its trials, X is its name
 - flights/: the recorded flights; with a hidden vehicle also measured/ (with noise) and diagnosis/
 - a folder for each Delta Action Model

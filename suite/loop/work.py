@@ -1,8 +1,6 @@
 """The stages of a loop: train, judge, record, diagnose, fit, fine-tune, judge again, replay.
 
-The loop (`suite loop`) flies a policy, corrects the simulation from these flights, fine-tunes the
-policy in it and compares the policies, which are called variants. `plan` lists the stages of a kind
-of loop. Each function below returns one `Stage`, whose work runs in its own folder.
+Each function below `plan` returns one `Stage`, whose work runs in its own folder.
 """
 
 from __future__ import annotations

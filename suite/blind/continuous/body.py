@@ -1,8 +1,4 @@
-"""Forces and torques on a flying body, and the derivative of its state.
-
-This is a part of the continuous-time engine, which shares no code with the model of the diagnosis.
-In the shapes, N is the number of flights, which are computed together.
-"""
+"""Forces and torques on the N flying bodies of the continuous-time engine, and their motion."""
 
 from __future__ import annotations
 

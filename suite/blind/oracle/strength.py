@@ -1,10 +1,9 @@
 """The just detectable strength of each effect, computed from flights without noise.
 
-It depends only on the flights, not on a diagnosis. A change of the parameters of an effect is just
-detectable if the expected log-likelihood ratio against the nominal vehicle is
-`information.THRESHOLD`. The table of strengths is a file of the suite, which the command
-`suite blind strengths` writes. The strength of an effect that is not in the table, such as one of a
-plugin, is computed when it is needed.
+A change of the parameters of an effect is just detectable if the expected log-likelihood ratio
+against the nominal vehicle is `information.THRESHOLD`. The table of strengths is a file of the
+suite, which `suite blind strengths` writes. The strength of an effect that is not in the table,
+such as one of a plugin, is computed when it is needed.
 """
 
 from __future__ import annotations

@@ -95,11 +95,11 @@ def compare_times(
     return Comparison(name, ours, baseline, details=dict(details))
 
 
-def load_warnings(interval_s: float = 1.0) -> tuple[str, ...]:
+def load_warnings() -> tuple[str, ...]:
     """Return a warning if other processes use the processor, measured while this one is idle."""
     import psutil
 
-    share = psutil.cpu_percent(interval_s) / 100
+    share = psutil.cpu_percent(interval=1.0) / 100
     if share <= BUSY_SHARE:
         return ()
     return (

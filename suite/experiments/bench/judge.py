@@ -1,10 +1,8 @@
 """The benchmark `judge`: trials per second of the judge, against depth images by `mj_multiRay`.
 
-The judge is the simulator that scores policies. The shipped policy flies the same trials on both
-sides, level 9 of every track family, in one process. The suite casts the rays of all images
-together (`tracks/geometry/tiles.py`). The baseline casts the rays of one camera after the other
-with MuJoCo's `mj_multiRay`, and flies 64 trials at once. Both are timed by the processor time of
-the process, which depends little on other work on the machine.
+The suite casts the rays of all images together (`tracks/geometry/tiles.py`). The baseline casts the
+rays of one camera after the other, and flies 64 trials at once. Both are timed by the processor
+time of the process, which depends little on other work on the machine.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""The data of the benchmark `diagnose`: windows of simulated flights of a vehicle to identify.
+"""The data of the benchmark `diagnose`: windows (short parts) of flights of a vehicle to identify.
 
-A window is a short part of a flight. Both sides simulate it with the measured rotor speeds as
-input, since a MuJoCo model has no rate loop. They fit mass, centre of mass and inertia, the
-parameters that `mujoco.sysid` is made for.
+Both sides simulate them with the measured rotor speeds as input, since a MuJoCo model has no rate
+loop.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """The baseline of the benchmark `diagnose`: fit mass, centre of mass and inertia by `mujoco.sysid`.
 
-It takes finite differences of rollouts (simulated windows) in MuJoCo's C engine. A window is a
-short part of a flight; its rollout starts in the measured state, because `mujoco.sysid` does not
-estimate initial states. The inputs of the model are the thrusts of the rotors. Bounds and typical
-sizes of the parameters are those of the suite's catalogue of effects. Residuals are divided by the
-measurement noise, so both sides minimise the same error.
+It takes finite differences of rollouts (simulated windows) in MuJoCo's C engine. A rollout starts
+in the measured state, because `mujoco.sysid` does not estimate initial states. Its inputs are the
+thrusts of the rotors. Residuals are divided by the measurement noise, so both sides minimise the
+same error.
 """
 
 from __future__ import annotations

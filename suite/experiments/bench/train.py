@@ -1,9 +1,8 @@
 """The benchmark `train`: trained decisions per second against a plain torch-eager loop.
 
-Both sides make whole gradient steps (rollout, gradient, AdamW) on the same worlds of 64 solids with
-the recipe `paper`: batch 64, 150 steps, 24x32 images, two threads. A world is one simulated scene
-and drone, which is a point mass in this recipe. A gradient step with a quadrotor instead,
-randomised as in the recipe `race`, is timed too; its time is reported as a multiple.
+Both sides make whole gradient steps (rollout, gradient, AdamW) on the same worlds with the recipe
+`paper`, whose drones are point masses. A gradient step with a quadrotor instead, randomised as in
+the recipe `race`, is timed too.
 """
 
 from __future__ import annotations

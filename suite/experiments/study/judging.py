@@ -1,10 +1,9 @@
 """Judge trials with a permanent cache of results: each flight is flown only once.
 
-A trial is one flight: a track, a level of difficulty and a seed. The results of a setup (policy,
-vehicle, sensors, simulator) are in one file of the cache, its journal. The name of a journal is the
-SHA-256 of everything else that determines an outcome: the setup, the code of the judge and the
-versions of the packages. A result is written as soon as its trial ends. All pages share the
-journals.
+The results of a setup (policy, vehicle, sensors, simulator) are in one file of the cache, its
+journal. Its name is the SHA-256 of everything else that determines an outcome: the setup, the code
+of the judge and the versions of the packages. A result is written as soon as its trial ends. All
+pages share the journals.
 """
 
 from __future__ import annotations

@@ -60,8 +60,6 @@ class TrainingResult(NamedTuple):
     """Key of the setting."""
     seed: int
     """Seed of the training."""
-    policy: str
-    """Folder of the checkpoint. A diverged training has the last checkpoint with finite weights."""
     seconds: float
     """Time of the gradient steps that do not compile [s]."""
     compile_s: float
@@ -105,19 +103,17 @@ def train_all(
     memory *= workspace.workers if isinstance(workspace.workers, int) else 1
     total = Estimate(sum(each.seconds for each in estimates), memory)
     announce(console, f"{len(pieces)} trainings, of which finished ones are reused", total)
-    jobs = [Job(piece, workspace.cache / _training_folder(piece, unseen)) for piece in pieces]
+    # Measurements during a training are in its folder, so they are a part of the folder's name.
+    folders = [
+        Path("schemes", digest([key, config, unseen]))
+        if unseen.measurements
+        else Path("trainings", digest(config))
+        for key, config in pieces
+    ]
+    jobs = [Job(each, workspace.cache / name) for each, name in zip(pieces, folders, strict=True)]
     do = functools.partial(train_setting, unseen=unseen)
     results = do_jobs(do, jobs, workspace.workers, console, "training")
     return [_finished_training(job, *result) for job, result in zip(jobs, results, strict=True)]
-
-
-def _training_folder(piece: tuple[str, Any], unseen: UnseenWorlds) -> Path:
-    """Return the folder of a training within the cache."""
-    key, config = piece
-    # Measurements during a training are in its folder, so they are a part of the folder's name.
-    if unseen.measurements:
-        return Path("schemes", digest([key, config, unseen]))
-    return Path("trainings", digest(config))
 
 
 def train_setting(
@@ -170,7 +166,6 @@ def _finished_training(job: Job, diverged: str, at_end: list[dict[str, float]]) 
     return TrainingResult(
         setting=key,
         seed=config.seed,
-        policy=str(policy),
         seconds=sum(row["seconds"] for row in rows if not row["cold"]),
         compile_s=compile_s,
         commit=training_commit(policy),

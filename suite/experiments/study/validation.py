@@ -1,8 +1,7 @@
 """Measure the success of a policy in the dynamics of the training, on worlds that no training uses.
 
-A world is one simulated scene and drone. The code of the training (`suite/train/rollout.py`)
-computes the flight, the collisions and the passed gates. A collision is a distance to an obstacle
-below `BODY_RADIUS_M`, at one of `PATH_SAMPLES` points on the path of a step.
+A collision is a distance to an obstacle below `BODY_RADIUS_M`, at one of `PATH_SAMPLES` points on
+the path of a step.
 """
 
 from __future__ import annotations

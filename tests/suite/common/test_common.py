@@ -264,9 +264,10 @@ def test_a_folder_of_another_kind_of_run_is_refused(tmp_path):
     refuse_other_run(tmp_path, Collection())  # none of ours
 
 
-def test_progress_without_a_terminal_is_a_plain_line_now_and_then(capsys):
+def test_progress_without_a_terminal_is_a_plain_line_now_and_then(capsys, monkeypatch):
     now = [0.0]
-    with Console().progress("flying", 100, clock=lambda: now[0]) as update:
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    with Console().progress("flying", 100) as update:
         for done in range(101):
             now[0] = done * 0.5
             update(done, "3.1 m/s")
@@ -275,7 +276,7 @@ def test_progress_without_a_terminal_is_a_plain_line_now_and_then(capsys):
     assert lines[0] == "flying: 20 of 100, 40 s left, 3.1 m/s"
     # Only what was done since it began counts.
     now[0] = 0.0
-    with Console().progress("training", 100, clock=lambda: now[0], begun=80) as update:
+    with Console().progress("training", 100, begun=80) as update:
         now[0] = 12.0
         update(90)
     assert capsys.readouterr().err == "training: 90 of 100, 12 s left\n"
@@ -295,7 +296,7 @@ class Recorded(Console):
         self.shown = []
 
     @contextmanager
-    def progress(self, label, total, clock=None, begun=0.0):
+    def progress(self, label, total, begun=0.0):
         yield lambda done, note="": self.shown.append((done, total))
 
 
