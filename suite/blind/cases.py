@@ -58,7 +58,6 @@ class Case:
     """Index in `SEPARATIONS` (pairs of effects, and flights that separate them) for a blurred or
     separated case; -1 for the other kinds."""
     simulator: str = MUJOCO
-    """Simulator of the flights."""
 
 
 def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:

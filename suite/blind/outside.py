@@ -163,7 +163,6 @@ class Kind:
     make: Callable[..., Outside]
     """Function (strength, true mass [kg]) -> the physics."""
     unit: str
-    """Unit of the strength."""
     usual: float
     """Usual strength; a flight with it shows how detectable this physics is."""
     most: float

@@ -38,11 +38,9 @@ class Verdict:
     """The score of one case."""
 
     case: str
-    """Name of the case."""
     kind: str
     """Kind of the case, such as `single`; see `suite.blind.cases.Case`."""
     hidden: tuple[str, ...]
-    """Names of the hidden effects."""
     multiple: float
     """Largest strength of the hidden effects, as a multiple of the just detectable strength."""
     verdict: str
@@ -77,13 +75,10 @@ class Share:
     what: str
     """Description of the counted cases."""
     count: int
-    """Number of counted cases."""
     of: int
     """Number of cases that could have been counted, such as all nulls."""
     low: float
-    """Lower end of the interval, from 0 to 1."""
     high: float
-    """Upper end of the interval, from 0 to 1."""
     wanted: str
     """The goal, as text; "" without a goal."""
 

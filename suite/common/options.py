@@ -63,7 +63,6 @@ class Option(NamedTuple):
     about: str
     """Description of the option, the text below the field."""
     advanced: bool
-    """Whether the option is rare."""
 
     @property
     def notes(self) -> tuple[Any, ...]:

@@ -23,7 +23,6 @@ class Picture:
     """A picture that is embedded in the page."""
 
     png: bytes
-    """Bytes of the PNG file."""
     caption: str
     """Text below the picture, and its alternative text; may be empty."""
 
@@ -43,7 +42,6 @@ class Details:
     summary: str
     """Line that is always visible; a click on it unfolds the text."""
     text: str
-    """The long text, with its line breaks."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,6 @@ class Steps:
     """A numbered list."""
 
     texts: Sequence[str]
-    """Texts of the items."""
 
 
 Part = str | Grid | Picture | Links | Details | Steps
@@ -63,9 +60,7 @@ class Section:
     """A part of a report with a heading."""
 
     title: str
-    """The heading."""
     parts: Sequence[Part]
-    """Items of the section, from top to bottom."""
     folded: bool = False
     """Whether only the heading is shown at first."""
 
@@ -75,13 +70,11 @@ class Report:
     """The contents of a report."""
 
     title: str
-    """The heading."""
     lead: str
     """The result in one or two sentences."""
     facts: Mapping[str, str]
     """Name -> value of the conditions, such as files and versions; shown below the lead."""
     sections: Sequence[Section]
-    """All other contents."""
 
 
 def html(report: Report) -> str:

@@ -66,7 +66,6 @@ class QuadrotorWindows(NamedTuple):
     yaw_rate: np.ndarray
     """(N, T) commanded rate about body z [rad/s]."""
     burn_in: BurnIn
-    """Inputs of the network before each window."""
 
 
 def row_period(logs: Sequence[FlightLog]) -> float:

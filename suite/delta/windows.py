@@ -47,7 +47,6 @@ class PointMassWindows(NamedTuple):
     time_step: np.ndarray
     """(N, T) time between a decision and the next one [s]."""
     burn_in: BurnIn
-    """Inputs of the network before each window."""
 
 
 def _heading(rot_w: np.ndarray) -> np.ndarray:

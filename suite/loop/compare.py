@@ -39,9 +39,7 @@ class Difference(NamedTuple):
     against: str
     """Name of the policy whose rate is subtracted."""
     success: Interval
-    """The difference with Newcombe's paired interval."""
     p_value: float
-    """p-value of the difference."""
 
 
 class PolicyResult(NamedTuple):

@@ -45,7 +45,6 @@ class DeltaModel:
     """A fit of a Delta Action Model, a network that corrects actions to match measured flights."""
 
     folder: str
-    """Name of the model's folder."""
     title: str
     """Description of the fit, for the progress display."""
     diagnosed: bool = False
@@ -57,7 +56,6 @@ class ShownPolicy(NamedTuple):
     """A policy whose flights are in the recording and the pictures."""
 
     variant: str
-    """Name of the policy."""
     label: str
     """Label of its flights in the recording."""
     heading: str
@@ -69,7 +67,6 @@ class Findings:
     """The results of a loop."""
 
     verdict: str
-    """The result in a few sentences."""
     errors: Sequence[str]
     """Tables of the Delta Action Models' errors, as Markdown."""
     numbers: Mapping[str, Any]
@@ -85,7 +82,6 @@ class Loop:
     """A kind of loop."""
 
     title: str
-    """Title of the report."""
     hidden: bool
     """Whether the loop has a hidden vehicle. Then its flights get measurement noise and are
     diagnosed before a fit."""

@@ -60,13 +60,9 @@ class LoopRun:
     """A loop in its folder."""
 
     loop: Loop
-    """The kind of loop."""
     config: LoopConfig
-    """The settings."""
     out: Path
-    """The folder."""
     console: Console
-    """Shows progress."""
     workers: Workers | None = None
     """Number of processes (or a cluster) that fly and fine-tune. None: as many processes as shorten
     the flights, and one fine-tuning after the other."""

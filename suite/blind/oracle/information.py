@@ -54,9 +54,7 @@ class Column(NamedTuple):
     """One component of one parameter; it belongs to a column of the Jacobian."""
 
     effect: str
-    """Name of the effect."""
     parameter: str
-    """Name of the parameter."""
     component: int
     """Index of the component; 0 for a plain number."""
 

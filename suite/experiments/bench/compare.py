@@ -22,7 +22,6 @@ class Figure:
     value: float
     """The rate or time, in `unit`."""
     unit: str
-    """Unit of the value, such as "decisions/s"."""
     less_is_better: bool = False
     """Whether the figure is a time, not a rate."""
 
@@ -32,7 +31,6 @@ class Comparison:
     """The result of a benchmark."""
 
     name: str
-    """Name of the benchmark."""
     ours: Figure
     """Speed of the suite."""
     baseline: Figure

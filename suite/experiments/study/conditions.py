@@ -44,11 +44,9 @@ class Condition:
     size_text: str
     """Size of the disturbance as text, with its unit."""
     vehicle: Vehicle
-    """Vehicle that flies."""
     sensors: SensorSet = PERFECT
     """Errors in what the policies see."""
     simulator: str = "mujoco"
-    """Name of the simulator."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,6 @@ class Setting(NamedTuple):
     """One of the compared configurations, which is trained from every seed."""
 
     key: str
-    """Name of the setting."""
     label: str
     """Label of the setting in tables."""
     recipe: Any
@@ -48,7 +47,6 @@ class UnseenWorlds(NamedTuple):
     trials: int
     """Number of worlds."""
     seed: int
-    """Seed of the worlds."""
     seconds: float
     """Length of a trial, from a standing start [s]."""
 
@@ -59,7 +57,6 @@ class TrainingResult(NamedTuple):
     setting: str
     """Key of the setting."""
     seed: int
-    """Seed of the training."""
     seconds: float
     """Time of the gradient steps that do not compile [s]."""
     compile_s: float
@@ -226,20 +223,15 @@ class Spread(NamedTuple):
     """The values of one measure, such as `v_max`, over the training seeds."""
 
     mean: float
-    """Mean over the seeds."""
     least: float
-    """Smallest value."""
     most: float
-    """Largest value."""
 
 
 class Summary(NamedTuple):
     """One setting over its training seeds; diverged trainings are left out of all numbers."""
 
     key: str
-    """Name of the setting."""
     label: str
-    """Label of the setting in tables."""
     recipe: Any
     """The trained configuration, a `TrainConfig` or a `PpoConfig`."""
     seeds: int
