@@ -24,10 +24,9 @@ from suite.common.charts import curves_chart
 from suite.common.report import Links, Picture, Section
 from suite.delta.run import errors_grid
 from suite.diagnose.report.summary import components, grid
-from suite.loop.charts import COLOURS
 from suite.loop.compare import BEFORE, PolicyResult, points, significance
 from suite.loop.config import EXACT_SIMULATORS, LoopConfig
-from suite.loop.variants import DeltaModel, Findings, Loop, ShownPolicy, Variant
+from suite.loop.variants import COLOURS, DeltaModel, Findings, Loop, ShownPolicy, Variant
 from suite.loop.work import named_effects, read_diagnosis
 from tracks.common.files import to_json
 from tracks.common.grid import Grid, markdown

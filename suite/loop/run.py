@@ -9,16 +9,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib.figure import Figure
+
 from eval.judging.results import read_trials
+from suite.common.charts import dots, legend, png, titled
 from suite.common.console import Console, duration
 from suite.common.report import Details, Links, Picture, Report, Section, html
 from suite.common.stages import claim, run_stages
 from suite.judging.trials import parse_tracks
 from suite.loop import delta_action, hidden_effect
-from suite.loop.charts import success_chart
-from suite.loop.compare import CAVEAT, cell_grid, overall_grid, policy_results
+from suite.loop.compare import CAVEAT, PolicyResult, cell_grid, overall_grid, policy_results
 from suite.loop.config import LoopConfig, loop_by_content
-from suite.loop.variants import Findings
+from suite.loop.variants import COLOURS, Findings
 from suite.loop.work import LoopRun, plan
 from tracks.common.files import plain, to_json, write_json, write_text
 from tracks.common.grid import Grid, markdown, rich_table, table
@@ -164,3 +167,25 @@ def _report(
             Section("Files and configuration", files),
         ],
     )
+
+
+def success_chart(results: Sequence[PolicyResult], labels: Mapping[str, str]) -> bytes:
+    """Return the chart of success rates of any policies, by cell and over all trials.
+
+    `labels` are by the policies' names.
+    """
+    figure = Figure(figsize=(10.4, 4.2), layout="constrained")
+    axes = figure.subplots()
+    cells = [cell.replace(" ", "\nlevel ") for cell in (*results[0].by_cell, "all")]
+    for number, (result, colour) in enumerate(zip(results, COLOURS, strict=False)):
+        # Dots of neighbouring policies are 0.13 widths of a cell apart.
+        x = np.arange(len(cells)) + 0.13 * (number - 0.5 * (len(results) - 1))
+        intervals = [*result.by_cell.values(), result.success]
+        dots(axes, x, intervals, 100, color=colour, label=labels[result.name], ms=5, lw=1.6)
+    titled(axes, "Success [%]")
+    axes.set_xticks(range(len(cells)), cells, fontsize=8)
+    # A line separates the last cell, that of all trials.
+    axes.axvline(len(cells) - 1.5, color="#b8bec8", lw=0.8)
+    axes.set_ylim(-3, 103)
+    legend(figure, axes)
+    return png(figure)

@@ -21,6 +21,9 @@ from suite.common.report import Section
 from suite.loop.compare import PolicyResult
 from suite.loop.config import LoopConfig
 
+COLOURS = ("#8b93a1", "#c0504d", "#e0892b", "#7a5fb5", "#2463c9", "#2e9e6b")
+"""Colours of up to six policies."""
+
 
 @dataclass(frozen=True)
 class Variant:

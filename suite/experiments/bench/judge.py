@@ -24,8 +24,6 @@ from suite.experiments.bench.compare import Comparison, compare_times, in_turn
 from suite.judging.flying import default_policy
 from tracks.families import JUDGED
 
-TRIALS = 128
-"""Number of trials in a timed call."""
 BASELINE = "mujoco, its own rays"
 """Name of the baseline's simulator."""
 
@@ -50,7 +48,7 @@ class OwnRays(MujocoWorld):
         return np.array(images)
 
 
-def run(policy: str = "", trials: int = TRIALS, time_limit_s: float = 20.0) -> Comparison:
+def run(policy: str = "", trials: int = 128, time_limit_s: float = 20.0) -> Comparison:
     """Time both in turn, and count the trials (of at most `time_limit_s` [s]) that end alike."""
     if BASELINE not in WORLDS:
         WORLDS.register(BASELINE, OwnRays)
