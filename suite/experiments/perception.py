@@ -11,8 +11,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
 
-import numpy as np
-
 from eval.judging.statistics import wilson
 from eval.judging.tables import percent
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -149,11 +147,6 @@ def select_sensor_sets(only: Sequence[str]) -> tuple[dict[str, SensorSet], dict[
     )
 
 
-def _median_speed(entry: ConditionResult, policy: str) -> float:
-    """Return the median, over the trials of a policy, of the mean speed [m/s]."""
-    return float(np.median([row.v_mean for row in entry.results[policy]]))
-
-
 def preset_grid(results: Sequence[ConditionResult]) -> Grid:
     """Return a table with a row for each preset and policy.
 
@@ -169,7 +162,7 @@ def preset_grid(results: Sequence[ConditionResult]) -> Grid:
                 success = [trial.success for trial in trials if trial.difficulty == level]
                 row.append(percent(wilson(sum(success), len(success))))
             change = entry.minus(base, name)
-            speed, base_speed = _median_speed(entry, name), _median_speed(base, name)
+            speed, base_speed = entry.median(name, "v_mean"), base.median(name, "v_mean")
             is_perfect = entry.condition.sensors == PERFECT
             row += [percent(entry.success(name)), "" if is_perfect else difference_cell(change)]
             row.append(f"{speed:.2f} ({speed / base_speed - 1:+.1%})")
@@ -189,7 +182,7 @@ def gain_grids(results: Sequence[ConditionResult]) -> list[Grid]:
         cells = []
         for name in others:
             change = difference_cell(entry.minus(entry, name, first))
-            speed_change = _median_speed(entry, name) / _median_speed(entry, first) - 1
+            speed_change = entry.median(name, "v_mean") / entry.median(first, "v_mean") - 1
             cells.append(Cell(f"{change.text}, {speed_change:+.1%}", change.tone))
         rows.append([entry.condition.name, *cells])
     title = f"Success in points and median v_mean against {first}, on the same trials"
@@ -205,7 +198,7 @@ def magnitude_grid(sweeps: Mapping[Sweep, Sequence[ConditionResult]]) -> Grid:
     for sweep, points in sweeps.items():
         for name in points[0].results:
             cells = (
-                f"{percent(p.success(name))}, {_median_speed(p, name):.2f} m/s" for p in points
+                f"{percent(p.success(name))}, {p.median(name, 'v_mean'):.2f} m/s" for p in points
             )
             rows.append([sweep.name, name, *cells])
     magnitudes = next(iter(sweeps)).sizes

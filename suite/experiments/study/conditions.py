@@ -219,6 +219,10 @@ class ConditionResult(NamedTuple):
         """Return whether each trial of a policy succeeded, (n,) bool."""
         return np.array([row.success for row in self.results[policy]])
 
+    def median(self, policy: str, field: str) -> float:
+        """Return the median of a field (such as `v_mean`) over the trials of a policy."""
+        return float(np.median([getattr(row, field) for row in self.results[policy]]))
+
     def minus(self, base: ConditionResult, policy: str, other: str = "") -> PairedDifference:
         """Return the success rate of `policy` minus that of `other` (or the same) under `base`."""
         return paired_success(self.won(policy), base.won(other or policy))
@@ -302,7 +306,7 @@ def tested_numbers(entry: ConditionResult, base: ConditionResult) -> dict[str, A
                 track: float(np.mean([row.success for row in rows if row.track == track]))
                 for track in tracks
             },
-            "v_max": float(np.median([row.v_max for row in rows])),
-            "v_mean": float(np.median([row.v_mean for row in rows])),
+            "v_max": entry.median(name, "v_max"),
+            "v_mean": entry.median(name, "v_mean"),
         }
     return numbers
