@@ -1,7 +1,7 @@
 """Make one blind case from its description: flights with hidden effects, their logs, the answer.
 
 The answer has the names that a diagnosis must give, and the alternatives: other effects that
-explain the flights as well. They come from the oracle (`suite/blind/oracle/`), which expresses a
+explain the flights as well. They come from the oracle (`oracle.py`), which expresses a
 difference as a log-likelihood ratio: half the squared change of the flights in standard deviations
 of the noise.
 """
@@ -24,7 +24,7 @@ from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.blind.cases import CONTINUOUS, ROTORPY, Case
 from suite.blind.continuous.timing import draw_conditions
 from suite.blind.continuous_flight import fly_continuous, logs_of, with_loop_frequency
-from suite.blind.oracle.information import (
+from suite.blind.oracle import (
     LONG_S,
     REQUIRED,
     THRESHOLD,
@@ -34,9 +34,9 @@ from suite.blind.oracle.information import (
     information,
     linearised,
     log_ratio,
+    nominal_vehicle,
     remaining_ratio,
 )
-from suite.blind.oracle.strength import nominal_vehicle
 from suite.blind.outside import KINDS, changed_values, draw_change, true_parameters
 from suite.blind.rotorpy_flight import fly_rotorpy
 from suite.common.errors import WorkFailed

@@ -14,7 +14,7 @@ import numpy as np
 from eval.effects import EFFECTS, nameable_effects
 from eval.flights.simulate import SENSORS
 from eval.worlds.rotorpy_vehicle import ROTORPY_EFFECTS
-from suite.blind.oracle.strength import vehicle_names
+from suite.blind.oracle import vehicle_names
 from suite.blind.outside import KINDS
 from suite.diagnose.plan import SEPARATIONS
 

@@ -19,7 +19,7 @@ from eval.quadrotor.vehicle_file import save_vehicle
 from eval.worlds import world_class
 from suite.blind.build import Built, build
 from suite.blind.cases import DRAWERS, MUJOCO, ROTORPY, Case
-from suite.blind.oracle.strength import TABLE
+from suite.blind.oracle import TABLE
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from tracks.common.files import replacing_folder, write_json

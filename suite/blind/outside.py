@@ -17,7 +17,7 @@ from eval.effects import EFFECTS, all_values
 from eval.effects.interface import GRAVITY
 from eval.quadrotor.plant import Command, Motion, Wrench
 from eval.vehicles.vehicle import Vehicle
-from suite.blind.oracle.strength import columns_in_table, detectable_along
+from suite.blind.oracle import columns_in_table, detectable_along
 from tracks.geometry.rotation import to_local
 
 Law = Callable[[float, float, Motion, Wrench, float], np.ndarray]

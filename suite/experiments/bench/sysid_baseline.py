@@ -69,7 +69,7 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
     from eval.flights.follow import FlightFailed
     from eval.flights.simulate import SENSORS, fly, log_of
     from eval.flights.trajectory import ordinary_flights
-    from suite.blind.oracle.strength import nominal_vehicle
+    from suite.blind.oracle import nominal_vehicle
 
     def attempt(number: int) -> Task:
         """Draw a vehicle, fly it and return its windows."""
