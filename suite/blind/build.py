@@ -160,7 +160,6 @@ def simulator_for(case: Case, rng: np.random.Generator) -> Simulator:
     def fly_in_continuous_time(
         truth: Vehicle, trajectories: Trajectories, rng: Random, extra: Extra | None = None
     ) -> LogFlights:
-        """Fly in the continuous-time engine."""
         flown = fly_continuous(nominal_at_rate, truth, trajectories, conditions, rng, extra)
         return lambda rng: logs_of(flown, trajectories, truth, sensors, conditions, rng)
 

@@ -174,5 +174,4 @@ def _check_options(out: Path, options: dict[str, Any]) -> None:
 
 
 def _hash(path: Path) -> str:
-    """Return the SHA-256 of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()

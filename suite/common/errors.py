@@ -92,7 +92,6 @@ def _explain_os(error: OSError) -> tuple[int, str] | None:
 
 
 def _is_suite_module(module: str | None) -> bool:
-    """Return whether a module with this name belongs to the four packages of the suite."""
     return (module or "").split(".")[0] in {Path(room).name for room in _PACKAGES}
 
 

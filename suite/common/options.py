@@ -104,7 +104,6 @@ class Option(NamedTuple):
 
 
 def _bare(kind: Any) -> Any:
-    """Return a type without annotations."""
     return _bare(get_args(kind)[0]) if get_origin(kind) is Annotated else kind
 
 

@@ -90,7 +90,6 @@ def html(report: Report) -> str:
 
 
 def _section(section: Section) -> str:
-    """Return a section as HTML."""
     title, parts = escape(section.title), "\n".join(_part(part) for part in section.parts)
     if section.folded:
         return f'<details class="section"><summary>{title}</summary>\n{parts}\n</details>'
@@ -98,7 +97,6 @@ def _section(section: Section) -> str:
 
 
 def _part(part: Part) -> str:
-    """Return an item of a section as HTML."""
     if isinstance(part, Grid):
         return html_table(part)
     if isinstance(part, Picture):

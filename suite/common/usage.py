@@ -187,7 +187,6 @@ def with_lists(
 
 
 def _simulator(value: str) -> list[str]:
-    """Return the option that replaces `--world`, whose value was a simulator."""
     return ["--simulator", value]
 
 

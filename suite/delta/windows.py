@@ -178,7 +178,6 @@ def are_consecutive(gaps_s: np.ndarray, period_s: float, row_s: float) -> np.nda
 
 
 def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[PointMassWindows]:
-    """Return the windows of one flight."""
     action, decides = log_decisions(log)
     # Rows with a decision, with all values, and with a next row for the acceleration.
     rows = np.flatnonzero(decides & log.whole)

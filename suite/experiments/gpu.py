@@ -220,7 +220,6 @@ def trainer_speeds(
 
 
 def _operations_per_world(config: Config, model: str) -> float:
-    """Return the floating-point operations of the gradient for one world."""
     phase = last_phase(config, model, COUNTED)
     gradient = make_gradient(phase)
     arguments = (start_state(phase).params, repeated_worlds(phase), jax.random.key(0))

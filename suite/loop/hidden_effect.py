@@ -171,7 +171,6 @@ def hidden_effects(simulated: Vehicle, true: Vehicle) -> str:
 
 
 def _errors_grids(out: Path) -> list[Grid]:
-    """Return a table of the errors of each Delta Action Model."""
     return [
         errors_grid(
             json.loads((out / f"delta-{name}" / "delta.json").read_text(encoding="utf-8")),

@@ -126,8 +126,6 @@ def rotate_attitude(quat_wxyz: np.ndarray, angle_b: np.ndarray) -> np.ndarray:
 
 
 class _NoiseDraws:
-    """Random noise for the rows of one flight."""
-
     def __init__(
         self, rng: np.random.Generator, time_s: np.ndarray, rate_hz: float, conditions: Conditions
     ) -> None:

@@ -58,7 +58,6 @@ def run(policy: str = "", trials: int = 128, time_limit_s: float = 20.0) -> Comp
     results: dict[str, list[TrialResult]] = {}
 
     def judge(simulator: str, slots: int) -> None:
-        """Fly all trials, `slots` at a time, and keep their results."""
         options = JudgeOptions(slots=slots, workers=1, rules=Rules(time_limit_s=time_limit_s))
         results[simulator] = fly(loaded, specs, vehicle, simulator, options)
 

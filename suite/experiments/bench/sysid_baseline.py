@@ -72,7 +72,6 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
     from suite.blind.oracle import nominal_vehicle
 
     def attempt(number: int) -> Task:
-        """Draw a vehicle, fly it and return its windows."""
         rng = np.random.default_rng([seed, number])
         truth = with_effects(nominal, _draw_effects(nominal, rng))
         flights = fly(nominal, truth, ordinary_flights(rng, duration_s), sensors.rate_hz)

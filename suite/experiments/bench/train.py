@@ -90,7 +90,6 @@ def _ours(config: TrainConfig, worlds: Worlds) -> Callable[[], Any]:
     update, state = make_update(config), jax.device_put(start_state(config), jax.devices()[0])
 
     def call() -> Any:
-        """Make one gradient step and wait for its results."""
         nonlocal state
         state, numbers = update(state, worlds)
         return jax.block_until_ready((state, numbers))

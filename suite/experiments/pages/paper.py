@@ -63,7 +63,6 @@ class Ablated(NamedTuple):
 
 
 def _read_table(name: str) -> dict[str, Any]:
-    """Return one of the tables of paper.toml."""
     path = Path(__file__).with_name("paper.toml")
     return tomllib.loads(path.read_text(encoding="utf-8"))[name]
 

@@ -275,5 +275,4 @@ def summaries(settings: Sequence[Setting], runs: Sequence[TrainingResult]) -> li
 
 
 def _spread(values: Sequence[float]) -> Spread:
-    """Return mean, least and most of `values`."""
     return Spread(float(np.mean(values)), min(values), max(values))

@@ -103,7 +103,6 @@ def make_flight(
 
     @jax.jit
     def fly(params: network.Params, worlds: Worlds) -> Scores:
-        """Fly the policy with `params` in all worlds, and return the scores of the trials."""
         embedding_shift = jnp.zeros((episode.steps, episode.batch, config.spec.hidden_size))
         key = jax.random.key(np.uint32(config.seed))
         _, records = rollout(params, embedding_shift, worlds, key, network.encode)
