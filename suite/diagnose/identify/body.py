@@ -13,15 +13,24 @@ drive the rotors. `identify.py` calls both fits.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from suite.diagnose.data.view import FlightRows, WeakForm
 from suite.diagnose.estimate.gauss_newton import TINY
-from suite.diagnose.identify.drive import DRIVES, DrivenVehicle, TrialVehicle
-from suite.diagnose.identify.fit import Z95, Fitted, KnownNumbers, Rows, Unknown, fit, unexplained
+from suite.diagnose.identify.drive import DRIVES, Accelerations, DrivenVehicle
+from suite.diagnose.identify.fit import (
+    Z95,
+    Fitted,
+    KnownNumbers,
+    Residuals,
+    Rows,
+    Unknown,
+    fit,
+    unexplained,
+)
 from suite.diagnose.identify.grid import (
     IMU_ACC,
     LEANING,
@@ -61,7 +70,8 @@ def force_unknowns(
     if driven.drive == "pwm":
         unknowns.append(Unknown("curve", driven.curve, -0.1, 1.0, 0.35, 1e-2, 0.02))
         if voltage:
-            unknowns.append(Unknown("battery", driven.battery, 0.0, 4.0, 0.6, 1e-2, 0.02))
+            exponent = driven.motors.voltage_exponent
+            unknowns.append(Unknown("battery", exponent, 0.0, 4.0, 0.6, 1e-2, 0.02))
     for axis, start in list(zip("xyz", driven.drag({}), strict=True))[2 if leaning else 0 :]:
         unknowns.append(Unknown(f"drag_{axis}", start, -2.0, 5.0, 0.25, 1e-2, 0.004))
     return unknowns
@@ -87,13 +97,13 @@ def fit_force(
     def residuals(numbers: Mapping[str, float]) -> list[Rows]:
         vehicle = driven.at(numbers)
         return [
-            one.residuals(vehicle.accelerations(one.flight, state)[0])
+            one.residuals(vehicle(one.flight, state)[0])
             for one, state in zip(windows, states, strict=True)
         ]
 
     held = _without_motion(windows)
     held = [unknown.name for unknown in unknowns if unknown.name in held]
-    return fit(by_value(residuals, unknowns, fixed), unknowns, held)
+    return fit(residuals, unknowns, held, fixed=fixed)
 
 
 class Windows(NamedTuple):
@@ -122,19 +132,6 @@ class Windows(NamedTuple):
     def means(self, values: np.ndarray) -> np.ndarray:
         """Return the means (M, 3, K) of `values`, (G, 3) or (G, 3 K), over the windows."""
         return np.reshape(self.form.mean @ values, (len(self.form.middle_s), 3, -1))
-
-
-def by_value(
-    residuals: Callable[[dict[str, float]], list[Rows]],
-    unknowns: Sequence[Unknown],
-    fixed: Mapping[str, float],
-) -> Callable[[np.ndarray], list[Rows]]:
-    """Return the `residuals` of numbers by name as a function of the values of `unknowns`.
-
-    `fixed` are the values of the other numbers.
-    """
-    names = [unknown.name for unknown in unknowns]
-    return lambda value: residuals({**fixed, **dict(zip(names, value.tolist(), strict=True))})
 
 
 def _force_windows(flight: FlightGrid, drive: str) -> Windows:
@@ -253,10 +250,10 @@ def fit_torque(
     windows = [_torque_windows(flight, driven.drive) for flight in flights]
     states = [flight.rows(attitude_of_path=False) for flight in flights]
     # Correct the bias by noise of the rotor speeds.
-    start = driven.at({**fixed, **{unknown.name: unknown.start for unknown in unknowns}})
+    starts = {**fixed, **{unknown.name: unknown.start for unknown in unknowns}}
     reliability = np.ones(3)
     if driven.drive == "rotors":
-        reliability = _reliability(windows, states, start)
+        reliability = _reliability(windows, states, driven.at(starts))
     correction: dict[str, float] = dict(zip(NOISE_BIASED, -0.5 * np.log(reliability), strict=True))
     unknowns = [
         u._replace(method_error=float(np.hypot(u.method_error, Z95 * correction.get(u.name, 0.0))))
@@ -270,14 +267,13 @@ def fit_torque(
             for one, state in zip(windows, states, strict=True)
         ]
 
-    compared = by_value(residuals, unknowns, fixed)
     # The fit is linearised, so it needs a start near the right delay.
     if any(unknown.name == "late" for unknown in unknowns):
         measured = [one.measured for one in windows]
-        late_s = _best_correlated_delay(unknowns, compared, measured)
+        late_s = _best_correlated_delay(residuals, starts, measured)
         unknowns = [u._replace(start=late_s) if u.name == "late" else u for u in unknowns]
     while True:
-        fitted = fit(compared, unknowns, held, known)
+        fitted = fit(residuals, unknowns, held, known, fixed=fixed)
         at_limit = [
             u.name
             for u, value in zip(unknowns, fitted.value, strict=True)
@@ -296,19 +292,25 @@ def _torque_windows(flight: FlightGrid, drive: str) -> Windows:
 
 
 def _turning(
-    vehicle: TrialVehicle, flight: FlightGrid, state: FlightRows, reliability: np.ndarray
+    vehicle: Accelerations, flight: FlightGrid, state: FlightRows, reliability: np.ndarray
 ) -> np.ndarray:
     """Return the modelled angular acceleration (G, 3), corrected by `_reliability` (3,)."""
-    _, turn_b = vehicle.accelerations(flight, state)
+    _, turn_b = vehicle(flight, state)
     if (reliability == 1.0).all():
         return turn_b
     # Only the part that the rotors cause is noisy.
-    _, unpowered_b = vehicle.accelerations(flight, state, powered=False)
+    still = np.zeros_like(flight.signals["rotor_speed"])
+    _, unpowered_b = vehicle(_with_rotor_speed(flight, still), state)
     return unpowered_b + reliability * (turn_b - unpowered_b)
 
 
+def _with_rotor_speed(flight: FlightGrid, rotor_speed: np.ndarray) -> FlightGrid:
+    """Return `flight` with other rotor speeds (G, 4)."""
+    return flight._replace(signals={**flight.signals, "rotor_speed": rotor_speed})
+
+
 def _reliability(
-    windows: Sequence[Windows], states: Sequence[FlightRows], vehicle: TrialVehicle
+    windows: Sequence[Windows], states: Sequence[FlightRows], vehicle: Accelerations
 ) -> np.ndarray:
     """Return the share (3,) of the modelled torque's variance that is not rotor-speed noise.
 
@@ -317,31 +319,25 @@ def _reliability(
     noise_power, power = np.zeros(3), np.zeros(3)
     for (flight, form, *_), state in zip(windows, states, strict=True):
         noisier = flight.signals["rotor_speed"] + flight.signals[ROTOR_NOISE]
-        noisy_flight = flight._replace(signals={**flight.signals, "rotor_speed": noisier})
-        turn_b, noisy_turn_b = (
-            form.mean @ vehicle.accelerations(one, state)[1] for one in (flight, noisy_flight)
-        )
+        noisy = _with_rotor_speed(flight, noisier)
+        turn_b, noisy_turn_b = (form.mean @ vehicle(one, state)[1] for one in (flight, noisy))
         noise_power += ((noisy_turn_b - turn_b) ** 2).sum(axis=0)
         power += (turn_b**2).sum(axis=0)
     return np.maximum(1.0 - noise_power / np.maximum(power, TINY), TINY)
 
 
 def _best_correlated_delay(
-    unknowns: Sequence[Unknown],
-    residuals: Callable[[np.ndarray], list[Rows]],
-    measured: Sequence[np.ndarray],
+    residuals: Residuals, numbers: Mapping[str, float], measured: Sequence[np.ndarray]
 ) -> float:
     """Return the delay `late` [s] at which modelled and measured roll and pitch correlate best.
 
     `measured` are the changes of each flight's body rates, (M, 3).
     """
-    value = np.array([unknown.start for unknown in unknowns])
-    late = [unknown.name for unknown in unknowns].index("late")
-    trials = np.array([value[late], *np.arange(0.0, LATEST_S, LATE_STEP_S)])
+    trials = np.array([numbers["late"], *np.arange(0.0, LATEST_S, LATE_STEP_S)])
     scores = np.zeros(len(trials))
-    for k, trial in enumerate(trials):
-        value[late] = max(trial, 0.0)
-        for rows, turned in zip(residuals(value), measured, strict=True):
+    for k, trial in enumerate(trials.tolist()):
+        tried = residuals({**numbers, "late": max(trial, 0.0)})
+        for rows, turned in zip(tried, measured, strict=True):
             if len(turned):
                 # Measured minus residual is the modelled change.
                 model, data = (v - np.median(v, axis=0) for v in (turned - rows.value, turned))

@@ -8,14 +8,14 @@ with the measured ones. G is the number of times on the grid of a flight (`grid.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
 
 from eval.effects import EFFECTS
-from eval.quadrotor.plant import Plant, Wrench, accelerations, make_plant
+from eval.quadrotor.plant import Wrench, accelerations, make_plant
 from eval.vehicles.vehicle import MotorMap, Vehicle, motor_speed
 from eval.vehicles.vehicle_check import check_vehicle
 from suite.diagnose.data.sampling import follow_lag, hold
@@ -56,16 +56,6 @@ def common_drive(flights: Sequence[FlightGrid]) -> str:
     )
 
 
-def with_known_thrust(flights: Sequence[FlightGrid], drive: str) -> list[FlightGrid]:
-    """Return the flights in which the motors' thrust is known best.
-
-    The thrust of a motor command depends on the battery. For this drive, flights without a voltage
-    are therefore left out if other flights have one.
-    """
-    with_voltage = [flight for flight in flights if flight.has("voltage")]
-    return with_voltage if with_voltage and drive == "pwm" else list(flights)
-
-
 def with_motor_map(flights: Sequence[FlightGrid], vehicle: Vehicle) -> Vehicle:
     """Return the vehicle with a table `[motors]`, the map from motor command to thrust.
 
@@ -86,6 +76,10 @@ def _median_volts(flights: Sequence[FlightGrid], default: float) -> float:
     """Return the median voltage of the flights [V], or `default` where none has a voltage."""
     volts = [f.signals["voltage"] for f in flights if f.has("voltage")]
     return float(np.nanmedian(np.concatenate(volts))) if volts else default
+
+
+Accelerations = Callable[[FlightGrid, FlightRows], tuple[np.ndarray, np.ndarray]]
+"""Function that returns dv/dt in world axes and dw/dt in body axes on each row, (G, 3) each."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +109,8 @@ class DrivenVehicle:
     def usual_thrust(self) -> tuple[float, float]:
         """Linear and quadratic term of the start's thrust at the usual command and voltage [N]."""
         first, second = self.motors.thrust
-        applied = self.usual_command * (self.usual_volts / self.motors.voltage) ** self.battery
+        volts_ratio = self.usual_volts / self.motors.voltage
+        applied = self.usual_command * volts_ratio**self.motors.voltage_exponent
         return first * applied, second * applied**2
 
     @property
@@ -123,14 +118,10 @@ class DrivenVehicle:
         """Share of the quadratic term in the start's usual thrust."""
         return self.usual_thrust[1] / sum(self.usual_thrust)
 
-    @property
-    def battery(self) -> float:
-        """The start's voltage exponent."""
-        return self.motors.voltage_exponent
-
     def motor_map(self, numbers: Mapping[str, float]) -> MotorMap:
         """Return the table `[motors]` of a vehicle file with these `numbers`."""
-        curve, battery = numbers.get("curve", self.curve), numbers.get("battery", self.battery)
+        curve = numbers.get("curve", self.curve)
+        battery = numbers.get("battery", self.motors.voltage_exponent)
         thrust = sum(self.usual_thrust) * float(np.exp(numbers.get("thrust", 0.0)))
         per_applied = (self.motors.voltage / self.usual_volts) ** battery / self.usual_command
         first, second = thrust * (1.0 - curve) * per_applied, thrust * curve * per_applied**2
@@ -159,10 +150,11 @@ class DrivenVehicle:
         start = (0.0, 0.0, 0.0) if effect is None else effect.coefficient
         return tuple(float(numbers.get(f"drag_{a}", d)) for a, d in zip("xyz", start, strict=True))
 
-    def at(self, numbers: Mapping[str, float]) -> TrialVehicle:
-        """Return the vehicle with these `numbers`.
+    def at(self, numbers: Mapping[str, float]) -> Accelerations:
+        """Return the equations of the vehicle with these `numbers`.
 
-        It keeps those effects of the start that only depend on the state (`by_state`).
+        It keeps those effects of the start that only depend on the state (`by_state`). Where the
+        rotors' speed is unknown, it is 0.
         """
         effects = {n: v for n, v in self.start.effects.items() if EFFECTS[n].by_state}
         effects["linear_drag"] = EFFECTS["linear_drag"].values(self.drag(numbers))
@@ -176,7 +168,19 @@ class DrivenVehicle:
         )
         inertia = np.asarray(self.start.inertia) * np.exp(log_inertia_ratio(numbers))
         vehicle = replace(self.start, rotors=rotors, inertia=_triple(inertia), effects=effects)
-        return TrialVehicle(self, numbers, make_plant(vehicle, LONGEST_S))
+        plant = make_plant(vehicle, LONGEST_S)
+
+        def accelerations_of(flight: FlightGrid, rows: FlightRows) -> tuple[np.ndarray, np.ndarray]:
+            rows = rows._replace(rotor_speed=np.nan_to_num(self.rotor_speed(flight, numbers)))
+            acc_w, turn_b = accelerations_on(plant, rows, flight.has("voltage"))
+            if self.drive == "torques":
+                commanded = after_delay_and_lag(flight.signals["torque_cmd_b"], numbers)
+                torque_b = np.nan_to_num(commanded)
+                wrench = Wrench(np.zeros_like(torque_b), torque_b)
+                _, turn_b = accelerations(plant, motion_of(plant, rows), wrench)
+            return acc_w, turn_b
+
+        return accelerations_of
 
     def rotor_speed(self, flight: FlightGrid, numbers: Mapping[str, float]) -> np.ndarray:
         """Return the rotor speeds (G, 4) of a flight [rad/s]: measured, or from their commands.
@@ -197,37 +201,6 @@ class DrivenVehicle:
             speed = np.sqrt(thrust / self.start.rotors.thrust_coefficient)
             commanded = speed[:, None] * np.ones(4)  # a thrust command is equal for all rotors
         return after_delay_and_lag(commanded, numbers)
-
-
-@dataclass(frozen=True)
-class TrialVehicle:
-    """A vehicle with trial values of the numbers; its equations are set up once for all flights."""
-
-    driven: DrivenVehicle
-    numbers: Mapping[str, float]
-    plant: Plant
-    """The vehicle with its effects, prepared for the equations of motion."""
-
-    def accelerations(
-        self, flight: FlightGrid, rows: FlightRows, powered: bool = True
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the linear and the angular acceleration of the vehicle on each row.
-
-        If they are not `powered`, and where it is unknown, the rotors' speed is 0.
-
-        Returns:
-            dv/dt in world axes and dw/dt in body axes, (G, 3) each.
-        """
-        if powered:
-            speed = self.driven.rotor_speed(flight, self.numbers)
-            rows = rows._replace(rotor_speed=np.nan_to_num(speed))
-        acc_w, turn_b = accelerations_on(self.plant, rows, flight.has("voltage"))
-        if self.driven.drive == "torques":
-            commanded = after_delay_and_lag(flight.signals["torque_cmd_b"], self.numbers)
-            torque_b = np.nan_to_num(commanded)
-            wrench = Wrench(np.zeros_like(torque_b), torque_b)
-            _, turn_b = accelerations(self.plant, motion_of(self.plant, rows), wrench)
-        return acc_w, turn_b
 
 
 def driven_vehicle(flights: Sequence[FlightGrid], vehicle: Vehicle, drive: str) -> DrivenVehicle:

@@ -11,7 +11,7 @@ flight.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,7 +31,6 @@ from suite.diagnose.identify.drive import (
     KNOWN_MOTORS,
     common_drive,
     driven_vehicle,
-    with_known_thrust,
     with_merged_effects,
     with_motor_map,
 )
@@ -54,6 +53,14 @@ from suite.diagnose.identify.loop import (
 )
 from suite.diagnose.identify.numbers import Number, not_attempted, not_identified, notes_on
 
+PARTS = {
+    "drag": ("drag_",),
+    "motors": FORCE_NUMBERS,
+    "inertia": ("inertia_", "yaw"),
+    "lag": ("lag", "late"),
+    "loop": ("gain_",),
+}
+"""Allowed values of `--leave` -> with what the names of their numbers start."""
 ROUNDS = 2
 """How often force and torque are fitted."""
 NO_LAG_S = 0.004
@@ -172,10 +179,7 @@ class _Fits:
             return
         flights = self.with_known_thrust(flights)
         voltage = all(flight.has("voltage") for flight in flights)
-        unknowns = self.wanted(
-            force_unknowns(self.driven, voltage, leaning, self.log_thrust),
-            {"drag": ("drag_",), "motors": ("thrust", "curve", "battery")},
-        )
+        unknowns = self.wanted(force_unknowns(self.driven, voltage, leaning, self.log_thrust))
         if unknowns:
             fixed = {**self.numbers, "thrust": self.log_thrust}
             self.attempt("force", lambda: fit_force(flights, self.driven, unknowns, fixed))
@@ -185,10 +189,8 @@ class _Fits:
         flights = [flight for flight in self.flights if flight.has("rate_b")]
         if self.drive in ("rates", "thrust") or not flights:  # these commands contain no torques
             return
-        unknowns = self.wanted(
-            torque_unknowns(self.drive, self.numbers["lag"], self.numbers["late"]),
-            {"inertia": ("inertia_", "yaw"), "lag": ("lag", "late")},
-        )
+        starts = torque_unknowns(self.drive, self.numbers["lag"], self.numbers["late"])
+        unknowns = self.wanted(starts)
         if not unknowns:
             return
         flights = self.with_known_thrust(flights)
@@ -230,22 +232,22 @@ class _Fits:
         unknowns = [*gain_unknowns(), *nuisance, *lags]
         self.attempt("loop", lambda: fit_loop(flights, self.start, unknowns, self.numbers, known))
 
-    def wanted(
-        self, unknowns: Sequence[Unknown], prefixes: Mapping[str, tuple[str, ...]]
-    ) -> list[Unknown]:
-        """Return `unknowns` without the parts that the user chose not to fit.
-
-        `prefixes` are the first letters of the names of the numbers, by part.
-        """
-        not_wanted = tuple(prefix for part in self.leave for prefix in prefixes.get(part, ()))
+    def wanted(self, unknowns: Sequence[Unknown]) -> list[Unknown]:
+        """Return `unknowns` without the parts that the user chose not to fit."""
+        not_wanted = tuple(prefix for part in self.leave for prefix in PARTS[part])
         return [u for u in unknowns if not u.name.startswith(not_wanted)]
 
     def with_known_thrust(self, flights: list[FlightGrid]) -> list[FlightGrid]:
-        """Return the flights whose motor thrust is known, and remember those without a voltage."""
-        selected = with_known_thrust(flights, self.drive)
-        if len(selected) < len(flights):
-            self.without_voltage |= {flight.name for flight in flights if not flight.has("voltage")}
-        return selected
+        """Return the flights in which the motors' thrust is known best, and remember the others.
+
+        The thrust of a motor command depends on the battery. For this drive, flights without a
+        voltage are therefore left out if other flights have one.
+        """
+        with_voltage = [flight for flight in flights if flight.has("voltage")]
+        if self.drive != "pwm" or not with_voltage:
+            return flights
+        self.without_voltage |= {flight.name for flight in flights if not flight.has("voltage")}
+        return with_voltage
 
     def attempt(self, name: str, fit: Callable[[], Fitted]) -> Fitted | None:
         """Run `fit`, and keep its result for the following fits and under its name.

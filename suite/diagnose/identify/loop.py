@@ -22,7 +22,7 @@ import numpy as np
 from scipy.signal import cont2discrete, lfilter, lfilter_zi
 
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.identify.body import Windows, by_value
+from suite.diagnose.identify.body import Windows
 from suite.diagnose.identify.drive import LEAST_LAG_S, after_delay_and_lag, delayed, filled, lagged
 from suite.diagnose.identify.fit import Fitted, KnownNumbers, Rows, Unknown, fit
 from suite.diagnose.identify.grid import STEP_S, FlightGrid
@@ -84,7 +84,7 @@ def fit_loop(
     def residuals(numbers: Mapping[str, float]) -> list[Rows]:
         return [one.residuals(loop_rates(one.flight, vehicle, numbers)) for one in windows]
 
-    return fit(by_value(residuals, unknowns, fixed), unknowns, known=known)
+    return fit(residuals, unknowns, known=known, fixed=fixed)
 
 
 def fit_rotor_lag(flights: Sequence[FlightGrid], unknowns: Sequence[Unknown]) -> Fitted:
@@ -102,7 +102,7 @@ def fit_rotor_lag(flights: Sequence[FlightGrid], unknowns: Sequence[Unknown]) ->
             for one in windows
         ]
 
-    return fit(by_value(residuals, unknowns, {}), unknowns)
+    return fit(residuals, unknowns)
 
 
 def _windows(flight: FlightGrid, width_s: float, measured: str, commanded: str) -> Windows:

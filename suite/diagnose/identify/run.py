@@ -14,13 +14,11 @@ from suite.common.provenance import stamp
 from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.estimate.parameters import refuse_own_motion
 from suite.diagnose.identify.drive import unmodelled_effects
-from suite.diagnose.identify.identify import Identified, identify
+from suite.diagnose.identify.identify import PARTS, Identified, identify
 from suite.diagnose.identify.numbers import number_lines, numbers_json
 
 SCHEMA = 1
 """Version of the JSON that `suite identify` prints."""
-PARTS = ("drag", "motors", "inertia", "lag", "loop")
-"""Allowed values of `--leave`."""
 ESTIMATED = ("motor_map", "battery_scaling")
 """Faults of a vehicle file that an identification repairs, so it does not refuse them."""
 MADE_BY = "by suite identify"

@@ -27,8 +27,9 @@ def flights(slopes, noise=0.1, count=200, seed=0):
         x = rng.normal(size=count)
         made.append((x, slope * x + noise * rng.normal(size=count), np.arange(count) // 10))
 
-    def residuals(value):
-        return [Rows((y - value[0] * x)[:, None], block, NONE) for x, y, block in made]
+    def residuals(numbers):
+        slope = numbers["slope"]
+        return [Rows((y - slope * x)[:, None], block, NONE) for x, y, block in made]
 
     return residuals
 
@@ -54,8 +55,8 @@ def test_what_is_known_widens_what_depends_on_it():
     """`y = (slope + other) x`: the slope is off by as much as the other, and by no less."""
     residuals = flights([2.0] * 4)
 
-    def both(value):
-        return residuals(np.array([value[0] + value[1]]))
+    def both(numbers):
+        return residuals({"slope": numbers["slope"] + numbers["other"]})
 
     known = KnownNumbers(("other",), np.array([[0.1**2]]))
     found = fit(both, [SLOPE, Unknown("other", 0.5, -9.0, 9.0, 1.0, 1e-3)], known=known)
@@ -76,8 +77,9 @@ def test_the_methods_own_errors_do_not_cancel_in_a_sum():
         made.append((x, near, 2.0 * x - 1.0 * near + 0.01 * rng.normal(size=200)))
     block = np.arange(200) // 10
 
-    def residuals(value):
-        return [Rows((y - value[0] * x - value[1] * n)[:, None], block, NONE) for x, n, y in made]
+    def residuals(numbers):
+        slope, other = numbers["slope"], numbers["other"]
+        return [Rows((y - slope * x - other * n)[:, None], block, NONE) for x, n, y in made]
 
     numbers = [SLOPE._replace(method_error=0.5), Unknown("other", 0.0, -9.0, 9.0, 1.0, 1e-3, 0.5)]
     found = fit(residuals, numbers)
@@ -100,8 +102,8 @@ def test_missing_values_are_left_out_and_a_fit_without_rows_is_refused():
     with pytest.raises(NoWholeWindow):
         fit(flights([2.0], count=0), [SLOPE])
 
-    def with_holes(value):
-        rows = flights([2.0] * 4)(value)
+    def with_holes(numbers):
+        rows = flights([2.0] * 4)(numbers)
         for one in rows:
             one.value[::3] = np.nan
         return rows
@@ -140,7 +142,7 @@ def rolled(noise, **limits):
     grid = FlightGrid("made", STEP_S * np.arange(count), {"rotor_speed": true})
     true_inertia = (2.0 * PLAIN.inertia[0], *PLAIN.inertia[1:])
     driven = drive.DrivenVehicle(replace(PLAIN, inertia=true_inertia), "rotors")
-    _, turn_b = driven.at(LAGS).accelerations(grid, grid.rows(False))
+    _, turn_b = driven.at(LAGS)(grid, grid.rows(False))
     rate_b = STEP_S * (np.cumsum(turn_b, axis=0) - 0.5 * turn_b)
     drawn = noise * rng.standard_normal((2, count, 4))
     signals = {"rotor_speed": true + drawn[0], ROTOR_NOISE: drawn[1], "rate_b": rate_b}
@@ -178,8 +180,7 @@ def test_flapping_is_within_its_interval_and_none_without_what_it_needs():
 
 def fit_of(names, covariance):
     unknowns = tuple(Unknown(name, 0.0, -1.0, 1.0, 1.0, 1e-3) for name in names)
-    half = 1.96 * np.sqrt(np.diag(covariance))
-    return Fitted(unknowns, np.zeros(len(names)), half, np.asarray(covariance))
+    return Fitted(unknowns, np.zeros(len(names)), np.asarray(covariance))
 
 
 def test_motors_are_off_by_their_covariance_and_inertia_by_its_own():

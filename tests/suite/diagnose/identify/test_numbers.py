@@ -15,9 +15,9 @@ from suite.diagnose.identify import drive, entries, run
 from suite.diagnose.identify.body import lag_unknowns
 from suite.diagnose.identify.fit import Fitted, Unknown
 from suite.diagnose.identify.grid import ROTOR_NOISE, STEP_S, FlightGrid, grid_of
-from suite.diagnose.identify.identify import Identified, identify
+from suite.diagnose.identify.identify import PARTS, Identified, identify
 from suite.diagnose.identify.numbers import Number, not_attempted, not_identified
-from suite.diagnose.identify.run import PARTS, identify_files
+from suite.diagnose.identify.run import identify_files
 from tests.support import identified as known
 from tests.support.log_tables import level
 from tests.support.vehicles import PLAIN, with_effects
@@ -102,7 +102,7 @@ def test_effects_of_the_start_act_on_the_torque():
     moved = with_effects(PLAIN, com_offset=((0.01, 0.0, 0.0),))
     flight = FlightGrid("made", TIME, {"rotor_speed": np.full((400, 4), 1000.0)})
     driven = drive.DrivenVehicle(moved, "rotors").at({})
-    _, turn_b = driven.accelerations(flight, flight.rows(False))
+    _, turn_b = driven(flight, flight.rows(False))
     thrust = 4e6 * PLAIN.rotors.thrust_coefficient
     np.testing.assert_allclose(turn_b[0, 1], 0.01 * thrust / PLAIN.inertia[1], rtol=0.05)
     assert drive.unmodelled_effects(moved) == []
@@ -209,7 +209,7 @@ def test_a_delay_is_no_better_known_than_the_lag_however_well_their_sum_is(half,
     """The widest interval is +-12 ms: a sum within 8 ms minus a lag within 8 ms has 11.3 ms."""
     covariance = np.diag([half**2, half**2]) / 1.96**2
     unknowns = tuple(lag_unknowns(0.03, 0.04))
-    fitted = Fitted(unknowns, np.array([0.05, 0.03]), np.full(2, half), covariance)
+    fitted = Fitted(unknowns, np.array([0.05, 0.03]), covariance)
     (delay,) = [one for one in entries.loop_entries(PLAIN, fitted) if one.key == entries.DELAY]
     assert (delay.ci95 != [None]) == identified == (not delay.follows)
     vehicle = entries.with_entries(PLAIN, [delay])[0]
@@ -221,7 +221,7 @@ def test_a_delay_is_no_better_known_than_the_lag_however_well_their_sum_is(half,
 def found(*names, left=()):
     unknowns = tuple(Unknown(name, 0.0, -1.0, 1.0, 1.0, 0.1) for name in names)
     none = np.zeros(len(names))
-    return Fitted(unknowns, none, none, np.diag(none), tuple(left))
+    return Fitted(unknowns, none, np.diag(none), tuple(left))
 
 
 def test_what_one_fit_leaves_and_another_identifies_is_identified():
