@@ -22,6 +22,7 @@ from suite.diagnose.data.view import FlightRows, WeakForm
 from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.identify.drive import DRIVES, Accelerations, DrivenVehicle
 from suite.diagnose.identify.fit import (
+    NONE_KNOWN,
     Z95,
     Fitted,
     KnownNumbers,
@@ -78,9 +79,9 @@ def force_unknowns(
 
 
 def fit_force(
+    unknowns: Sequence[Unknown],
     flights: Sequence[FlightGrid],
     driven: DrivenVehicle,
-    unknowns: Sequence[Unknown],
     fixed: Mapping[str, float],
 ) -> Fitted:
     """Fit the numbers of thrust and drag.
@@ -218,12 +219,12 @@ def torque_unknowns(drive: str, lag_s: float, late_s: float) -> list[Unknown]:
 
 
 def fit_torque(
+    unknowns: Sequence[Unknown],
     flights: Sequence[FlightGrid],
     driven: DrivenVehicle,
-    unknowns: Sequence[Unknown],
     fixed: Mapping[str, float],
+    known: KnownNumbers = NONE_KNOWN,
     held: Sequence[str] = (),
-    known: KnownNumbers | None = None,
 ) -> Fitted:
     """Fit inertia, lag and delay by `dw/dt = J^-1 (tau - w x J w)`.
 
@@ -241,11 +242,9 @@ def fit_torque(
         NoWholeWindow: if no window has all signals.
     """
     # The known numbers join the unknowns, so that their uncertainty widens the intervals.
-    known, steps = known or KnownNumbers(), {"thrust": 1e-3}
-    unknowns = [
-        *unknowns,
-        *(Unknown(n, fixed[n], -9.0, 9.0, 1.0, steps.get(n, 1e-2)) for n in known.names),
-    ]
+    steps = {"thrust": 1e-3, "curve": 1e-2, "battery": 1e-2}
+    known_unknowns = (Unknown(n, fixed[n], -9.0, 9.0, 1.0, steps[n]) for n in known.names)
+    unknowns = [*unknowns, *known_unknowns]
     held = list(held)
     windows = [_torque_windows(flight, driven.drive) for flight in flights]
     states = [flight.rows(attitude_of_path=False) for flight in flights]

@@ -36,39 +36,35 @@ def inertia_from(vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
     return possible_inertia(np.asarray(vehicle.inertia) * np.exp(log_inertia_ratio(numbers)))
 
 
-def force_entries(driven: DrivenVehicle, fitted: Fitted) -> list[Number]:
-    """Return the entries that the force fit estimates: motors or rotors, and drag."""
-    # For each entry: key, unit, formula, and the number that each value needs.
-    rows: list[tuple[str, str, Formula, Sequence[str]]] = []
-    if "thrust" in fitted.names and driven.drive == "pwm":
-        motor_map = driven.motor_map
-        rows += [
-            ("motors.thrust", "N", lambda n: motor_map(n).thrust, ("thrust", "thrust")),
-            ("motors.voltage_exponent", "1", lambda n: motor_map(n).voltage_exponent, ("battery",)),
-        ]
-    elif "thrust" in fitted.names and driven.drive == "rotors":
-        key, unit = "rotors.thrust_coefficient", "N/(rad/s)^2"
-        rows.append((key, unit, driven.thrust_coefficient, ("thrust",)))
-    elif "thrust" in fitted.names:
-        rows.append(("effects.thrust_scale.scale", "1", lambda n: np.exp(n["thrust"]), ("thrust",)))
-    if "drag_z" in fitted.names:
-        axes = [f"drag_{axis}" for axis in "xyz"]
-        rows.append(("effects.linear_drag.coefficient", "1/s", driven.drag, axes))
-    return [number_from(fitted, *row) for row in rows]
-
-
-def torque_entries(driven: DrivenVehicle, fitted: Fitted, log_thrust: float) -> list[Number]:
-    """Return the entries that the torque fit estimates: inertia, yaw torque, lag and delay.
+def entries_of(driven: DrivenVehicle, fitted: Fitted, log_thrust: float = 0.0) -> list[Number]:
+    """Return the entries of a vehicle file that a fit estimates.
 
     `log_thrust` is the logarithm of the scale of the thrust, from the force fit.
     """
-    entries, vehicle = list[Number](), driven.start
-    if "inertia_x" in fitted.names:
-        inertia = number_from(
-            fitted, "inertia", "kg m^2", lambda n: inertia_from(vehicle, n), INERTIAS
-        )
-        entries.append(inertia)
-    if "yaw" in fitted.names:
+    names = [name for name in fitted.names if name not in fitted.known]
+    vehicle, entries = driven.start, list[Number]()
+
+    def add(
+        key: str, unit: str, formula: Formula, needs: Sequence[str], widest: float = np.inf
+    ) -> None:
+        entries.append(number_from(fitted, key, unit, formula, needs, widest))
+
+    # Thrust and drag.
+    if "thrust" in names and driven.drive == "pwm":
+        add("motors.thrust", "N", lambda n: driven.motor_map(n).thrust, ("thrust", "thrust"))
+        exponent: Formula = lambda n: driven.motor_map(n).voltage_exponent  # noqa: E731
+        add("motors.voltage_exponent", "1", exponent, ("battery",))
+    elif "thrust" in names and driven.drive == "rotors":
+        add("rotors.thrust_coefficient", "N/(rad/s)^2", driven.thrust_coefficient, ("thrust",))
+    elif "thrust" in names:
+        add("effects.thrust_scale.scale", "1", lambda n: np.exp(n["thrust"]), ("thrust",))
+    if "drag_z" in names:
+        axes = [f"drag_{axis}" for axis in "xyz"]
+        add("effects.linear_drag.coefficient", "1/s", driven.drag, axes)
+    # Inertia and yaw torque.
+    if "inertia_x" in names:
+        add("inertia", "kg m^2", lambda n: inertia_from(vehicle, n), INERTIAS)
+    if "yaw" in names:
         # Flights show the ratio of torque to inertia about z. The uncertainty of the inertia counts
         # if the inertia is identified; otherwise the inertia is held fixed.
         identified = [name for name in INERTIAS if fitted.identifies(name)]
@@ -77,25 +73,17 @@ def torque_entries(driven: DrivenVehicle, fitted: Fitted, log_thrust: float) -> 
             numbers = {name: n[name] for name in (*identified, "yaw")}
             return driven.torque_coefficient({**numbers, "thrust": log_thrust})
 
-        key, unit = "rotors.torque_coefficient", "N m/(rad/s)^2"
-        entries.append(number_from(fitted, key, unit, torque_coefficient, ("yaw",)))
-    return [*entries, *loop_entries(vehicle, fitted)]
-
-
-def loop_entries(vehicle: Vehicle, fitted: Fitted) -> list[Number]:
-    """Return the entries of lag, delay and gains of the rate loop, as far as the fit has them."""
-    entries = []
-    if "late" in fitted.names:
-        lag = number_from(fitted, "rotors.time_constant", "s", lambda n: n["lag"], ("lag",))
+        add("rotors.torque_coefficient", "N m/(rad/s)^2", torque_coefficient, ("yaw",))
+    # Lag, delay and gains of the rate loop.
+    if "late" in names:
+        add("rotors.time_constant", "s", lambda n: n["lag"], ("lag",))
         # `late` is the sum of lag and delay. The delay is at least as uncertain as the lag, however
         # exact the sum is. The delay in the file keeps the sum.
         widest = fitted.unknowns[fitted.index("late")].max_half_width
-        delay_s: Formula = lambda n: n["late"] - n["lag"]  # noqa: E731
-        entries += [lag, number_from(fitted, DELAY, "s", delay_s, ("late",), widest)]
-    if "gain_x" in fitted.names:
-        start, names = np.asarray(vehicle.controller.rate_gain), [f"gain_{a}" for a in "xyz"]
-        gains: Formula = lambda n: start * np.exp([n[name] for name in names])  # noqa: E731
-        entries.append(number_from(fitted, "controller.rate_gain", "1/s", gains, names))
+        add(DELAY, "s", lambda n: n["late"] - n["lag"], ("late",), widest)
+    if "gain_x" in names:
+        start, gains = np.asarray(vehicle.controller.rate_gain), [f"gain_{a}" for a in "xyz"]
+        add("controller.rate_gain", "1/s", lambda n: start * np.exp([n[g] for g in gains]), gains)
     return entries
 
 

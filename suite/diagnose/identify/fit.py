@@ -89,6 +89,10 @@ class KnownNumbers(NamedTuple):
     """(K, K) covariance of these numbers in the earlier fit."""
 
 
+NONE_KNOWN = KnownNumbers()
+"""No earlier fit."""
+
+
 @dataclass(frozen=True)
 class Fitted:
     """Result of a fit of P numbers."""
@@ -223,7 +227,7 @@ def fit(
     residuals: Residuals,
     unknowns: Sequence[Unknown],
     held: Sequence[str] = (),
-    known: KnownNumbers | None = None,
+    known: KnownNumbers = NONE_KNOWN,
     noise: np.ndarray | None = None,
     fixed: Mapping[str, float] = MappingProxyType({}),
 ) -> Fitted:
@@ -237,7 +241,7 @@ def fit(
     Raises:
         NoWholeWindow: if the residuals have no window.
     """
-    not_identified, known = list(held), known or KnownNumbers()
+    not_identified = list(held)
     evidence = ResidualEvidence(residuals, tuple(unknowns), fixed, noise)
     at = Estimate(np.array([unknown.start for unknown in unknowns]))
     if not sum(len(rows.value) for rows in evidence.rows(at.theta)):

@@ -23,7 +23,7 @@ from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.identify.body import FORCE_NUMBERS
 from suite.diagnose.identify.drive import DrivenVehicle
-from suite.diagnose.identify.entries import force_entries, inertia_from, with_entry
+from suite.diagnose.identify.entries import entries_of, inertia_from, with_entry
 from suite.diagnose.identify.fit import Z95, Fitted
 from suite.diagnose.identify.numbers import Number
 from suite.diagnose.search.evaluation import SearchResult
@@ -117,7 +117,7 @@ def perturbed_vehicles(
     vehicles = []
     for fitted in one_sigma_off(force, FORCE_NUMBERS):
         other = vehicle
-        for entry in force_entries(driven, fitted):
+        for entry in entries_of(driven, fitted):
             if not entry.key.startswith("effects."):
                 other = with_entry(other, entry)
         vehicles.append(other)

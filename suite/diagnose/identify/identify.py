@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -35,21 +37,18 @@ from suite.diagnose.identify.drive import (
     with_motor_map,
 )
 from suite.diagnose.identify.entries import (
-    force_entries,
-    loop_entries,
-    torque_entries,
+    entries_of,
     with_entries,
     with_reachable_speed,
 )
-from suite.diagnose.identify.fit import Fitted, KnownNumbers, NoWholeWindow, Unknown
+from suite.diagnose.identify.fit import NONE_KNOWN, Fitted, NoWholeWindow, Unknown
 from suite.diagnose.identify.flapping import flapping_of, perturbed_vehicles
 from suite.diagnose.identify.grid import FlightGrid, grid_of
 from suite.diagnose.identify.loop import (
-    air_torque_unknowns,
-    coupling_unknowns,
-    fit_loop,
-    fit_rotor_lag,
-    gain_unknowns,
+    fit_commanded,
+    loop_rates,
+    loop_unknowns,
+    rotor_speeds,
 )
 from suite.diagnose.identify.numbers import Number, not_attempted, not_identified, notes_on
 
@@ -182,7 +181,7 @@ class _Fits:
         unknowns = self.wanted(force_unknowns(self.driven, voltage, leaning, self.log_thrust))
         if unknowns:
             fixed = {**self.numbers, "thrust": self.log_thrust}
-            self.attempt("force", lambda: fit_force(flights, self.driven, unknowns, fixed))
+            self.attempt("force", fit_force, unknowns, flights, self.driven, fixed)
 
     def fit_torque(self) -> None:
         """Fit inertia, yaw torque, lag and delay to the rotation."""
@@ -194,22 +193,18 @@ class _Fits:
         if not unknowns:
             return
         flights = self.with_known_thrust(flights)
-        fixed, known = dict(self.numbers), None
+        fixed, known = dict(self.numbers), NONE_KNOWN
         if "force" in self.results and self.drive in KNOWN_MOTORS:
             fixed |= self.results["force"].values()
             known = self.results["force"].known_numbers(*FORCE_NUMBERS)
-
-        def fitted(unknowns: Sequence[Unknown], held: Sequence[str] = ()) -> Fitted:
-            """Fit the torque; the numbers `held` keep their start."""
-            return fit_torque(flights, self.driven, unknowns, fixed, held, known)
-
-        result = self.attempt("torque", lambda: fitted(unknowns))
+        inputs = (flights, self.driven, fixed, known)
+        result = self.attempt("torque", fit_torque, unknowns, *inputs)
         start_lag_s = self.start.rotors.time_constant
         if result and result.identifies("lag") and result.values()["lag"] < NO_LAG_S < start_lag_s:
             # No rotor follows at once. Commands that are blurred in the log hide its lag, so the
             # start's lag is held and the other numbers are fitted again.
             unknowns = [u._replace(start=start_lag_s) if u.name == "lag" else u for u in unknowns]
-            self.attempt("torque", lambda: fitted(unknowns, ("lag",)))
+            self.attempt("torque", fit_torque, unknowns, *inputs, ("lag",))
 
     def fit_loop(self) -> None:
         """Fit the rotors' lag behind commanded speeds, and the nominal rate loop."""
@@ -218,19 +213,20 @@ class _Fits:
         commanded = [f for f in self.flights if f.has(*speeds) and not {*speeds} & {*f.in_turn}]
         if commanded and "lag" not in self.leave:
             starts = lag_unknowns(self.numbers["lag"], self.numbers["late"])
-            self.attempt("rotors", lambda: fit_rotor_lag(commanded, starts))
+            inputs = (commanded, "rotor_speed", rotor_speeds, starts, self.numbers)
+            self.attempt("rotors", fit_commanded, *inputs)
         flights = [f for f in self.flights if f.has("rate_b", "rate_cmd_b")]
         if not flights or self.start.controller.kind != "p" or "loop" in self.leave:
             return
         # If the motors are known, other fits identify lag and delay better: hold them fixed here.
-        lags, known = lag_unknowns(self.numbers["lag"], self.numbers["late"]), None
+        lags, known = lag_unknowns(self.numbers["lag"], self.numbers["late"]), NONE_KNOWN
         if "rotors" in self.results or self.drive == "pwm" or "lag" in self.leave:
             source = self.results.get("rotors", self.results.get("torque"))
-            known = source.known_numbers("late", "lag") if source else KnownNumbers()
+            known = source.known_numbers("late", "lag") if source else NONE_KNOWN
             lags = [u for u in lags if u.name in known.names]
-        nuisance = [*coupling_unknowns(self.start), *air_torque_unknowns(flights)]
-        unknowns = [*gain_unknowns(), *nuisance, *lags]
-        self.attempt("loop", lambda: fit_loop(flights, self.start, unknowns, self.numbers, known))
+        unknowns = [*loop_unknowns(self.start, flights), *lags]
+        model = partial(loop_rates, self.start)
+        self.attempt("loop", fit_commanded, flights, "rate_b", model, unknowns, self.numbers, known)
 
     def wanted(self, unknowns: Sequence[Unknown]) -> list[Unknown]:
         """Return `unknowns` without the parts that the user chose not to fit."""
@@ -249,13 +245,13 @@ class _Fits:
         self.without_voltage |= {flight.name for flight in flights if not flight.has("voltage")}
         return with_voltage
 
-    def attempt(self, name: str, fit: Callable[[], Fitted]) -> Fitted | None:
-        """Run `fit`, and keep its result for the following fits and under its name.
+    def attempt(self, name: str, fit: Callable[..., Fitted], *inputs: Any) -> Fitted | None:
+        """Run `fit` on `inputs`, and keep its result for the following fits and under its name.
 
         Without a complete window there is none, and the name is added to `broken`.
         """
         try:
-            result = fit()
+            result = fit(*inputs)
         except NoWholeWindow:
             self.broken.add(name)
             return None
@@ -272,19 +268,15 @@ class _Fits:
 
     def identified(self, original: Vehicle) -> Identified:
         """Return the result of all fits; `original` is the vehicle before any change."""
-        results, entries = self.results, list[Number]()
-        if "force" in results:
-            entries += force_entries(self.driven, results["force"])
-        if "torque" in results:
-            entries += torque_entries(self.driven, results["torque"], self.numbers["thrust"])
-        for name in ("rotors", "loop"):
-            if name in results:
-                entries += loop_entries(self.start, results[name])
-        by_key: dict[str, Number] = {}
-        for entry in entries:
-            # Several fits may estimate lag and delay. Later fits observe them more directly.
-            if entry.key not in by_key or entry.is_identified:
-                by_key[entry.key] = entry
+        results, by_key = self.results, dict[str, Number]()
+        # Several fits may estimate lag and delay. Later fits in this order observe them more
+        # directly.
+        for name in ("force", "torque", "rotors", "loop"):
+            if name not in results:
+                continue
+            for entry in entries_of(self.driven, results[name], self.numbers["thrust"]):
+                if entry.key not in by_key or entry.is_identified:
+                    by_key[entry.key] = entry
         vehicle, numbers, notes = with_entries(self.start, by_key.values())
         if self.drive == "rotors":
             speeds = [f.signals["rotor_speed"] for f in self.flights]

@@ -125,7 +125,7 @@ def test_the_thrust_is_what_path_and_gravity_need_in_fast_windows_with_an_attitu
         vel_w = np.outer(time_s, [2.0, 0.0, 0.0]) + [speed - 1.0, 0.0, 0.0]
         signals = {"vel_w": vel_w, "rotor_speed": np.full((500, 4), 1000.0), name: rot_w}
         unknowns = body.force_unknowns(driven, False, leaning=name == LEANING)[:1]
-        return body.fit_force([FlightGrid("made", time_s, signals)], driven, unknowns, LAGS)
+        return body.fit_force(unknowns, [FlightGrid("made", time_s, signals)], driven, LAGS)
 
     by_rotors = 4e6 * PLAIN.rotors.thrust_coefficient / PLAIN.mass
     for name in ("rot_w", LEANING):
@@ -148,7 +148,7 @@ def rolled(noise, **limits):
     signals = {"rotor_speed": true + drawn[0], ROTOR_NOISE: drawn[1], "rate_b": rate_b}
     unknowns = [body.torque_unknowns("rotors", 0.0, 0.0)[0]._replace(**limits)]
     grid = grid._replace(signals=signals)
-    return body.fit_torque([grid], drive.DrivenVehicle(PLAIN, "rotors"), unknowns, LAGS)
+    return body.fit_torque(unknowns, [grid], drive.DrivenVehicle(PLAIN, "rotors"), LAGS)
 
 
 def test_noise_of_the_rotor_speeds_widens_the_interval_and_makes_no_body_heavier():
@@ -198,7 +198,8 @@ def test_motors_are_off_by_their_covariance_and_inertia_by_its_own():
     assert all(v.motors == start.motors for v in found[2:])
 
 
-COUPLED = {unknown.name: unknown.start for unknown in loop.coupling_unknowns(PLAIN)}
+BARE = FlightGrid("made", np.zeros(0), {})
+COUPLED = {unknown.name: unknown.start for unknown in loop.loop_unknowns(PLAIN, [BARE])}
 
 
 def test_the_loop_follows_its_equations_integrated_by_another_method():
@@ -221,7 +222,7 @@ def test_the_loop_follows_its_equations_integrated_by_another_method():
     command = np.stack([wanted(t) for t in time_s])
     flight = FlightGrid("made", time_s, {"rate_cmd_b": command})
     # The command is joined here, not held: `delayed` takes it for half a step later.
-    rate = loop.loop_rates(flight, fast, {"lag": lag_s, "late": lag_s - 0.5 * STEP_S, **COUPLED})
+    rate = loop.loop_rates(fast, flight, {"lag": lag_s, "late": lag_s - 0.5 * STEP_S, **COUPLED})
     # The plain linear loop is 0.085 rad/s off.
     assert np.abs(rate - exact)[200:].max() < 0.02
 
@@ -234,9 +235,9 @@ def test_moving_air_turns_by_its_torque_over_the_gain():
     vel_w = np.where(np.arange(400)[:, None] < 100, 0.0, [-2.0, -3.0, 0.0])
     bare = FlightGrid("made", time_s, {"rate_cmd_b": still})
     flight = bare._replace(signals={"rate_cmd_b": still, "vel_w": vel_w, "rot_w": rot_w})
-    assert [one.name for one in loop.air_torque_unknowns([flight])] == ["air_x", "air_y"]
+    assert [one.name for one in loop.loop_unknowns(PLAIN, [flight])][-2:] == ["air_x", "air_y"]
     numbers = {"lag": 0.03, "late": 0.03, **COUPLED, "air_x": 0.5, "air_y": 0.4}
-    rate = loop.loop_rates(flight, PLAIN, numbers)
+    rate = loop.loop_rates(PLAIN, flight, numbers)
     gain = PLAIN.controller.rate_gain
     np.testing.assert_allclose(rate[-1], [0.5 * 2.0 / gain[0], 0.4 * 3.0 / gain[1], 0.0], rtol=1e-3)
-    assert loop.air_torque_unknowns([flight, bare]) == []
+    assert "air_x" not in [one.name for one in loop.loop_unknowns(PLAIN, [flight, bare])]

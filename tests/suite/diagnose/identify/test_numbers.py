@@ -210,7 +210,7 @@ def test_a_delay_is_no_better_known_than_the_lag_however_well_their_sum_is(half,
     covariance = np.diag([half**2, half**2]) / 1.96**2
     unknowns = tuple(lag_unknowns(0.03, 0.04))
     fitted = Fitted(unknowns, np.array([0.05, 0.03]), covariance)
-    (delay,) = [one for one in entries.loop_entries(PLAIN, fitted) if one.key == entries.DELAY]
+    _, delay = entries.entries_of(drive.DrivenVehicle(PLAIN, "pwm"), fitted)
     assert (delay.ci95 != [None]) == identified == (not delay.follows)
     vehicle = entries.with_entries(PLAIN, [delay])[0]
     assert vehicle.effects["command_delay"].delay == pytest.approx(0.02), "the file keeps the sum"
