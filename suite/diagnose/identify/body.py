@@ -1,14 +1,11 @@
 """Fits thrust and drag to the body's translation, and inertia, lag and delay to its rotation.
 
-The lag is the time constant with which the rotors follow their commands. The fitted parameters are
-called numbers here; they have names such as `thrust` and `drag_x`.
-
 Force fit: the model is compared with the measured acceleration, given the measured attitude. If no
 flight has an attitude, the thrust is assumed to point along the path's acceleration minus gravity,
 and only its size is compared (differential flatness; Mellinger and Kumar 2011).
 
 Torque fit: the model is compared with changes of the measured body rates, given the signals that
-drive the rotors. `identify.py` calls both fits.
+drive the rotors.
 """
 
 from __future__ import annotations
@@ -73,7 +70,7 @@ def force_unknowns(
         if voltage:
             exponent = driven.motors.voltage_exponent
             unknowns.append(Unknown("battery", exponent, 0.0, 4.0, 0.6, 1e-2, 0.02))
-    for axis, start in list(zip("xyz", driven.drag({}), strict=True))[2 if leaning else 0 :]:
+    for axis, start in list(zip("xyz", driven.drag, strict=True))[2 if leaning else 0 :]:
         unknowns.append(Unknown(f"drag_{axis}", start, -2.0, 5.0, 0.25, 1e-2, 0.004))
     return unknowns
 
@@ -93,14 +90,10 @@ def fit_force(
         NoWholeWindow: if no window has all signals.
     """
     windows = [_force_windows(flight, driven.drive) for flight in flights]
-    states = [flight.rows(attitude_of_path=True) for flight in flights]
 
     def residuals(numbers: Mapping[str, float]) -> list[Rows]:
-        vehicle = driven.at(numbers)
-        return [
-            one.residuals(vehicle(one.flight, state)[0])
-            for one, state in zip(windows, states, strict=True)
-        ]
+        vehicle = driven.accelerations(numbers)
+        return [one.residuals(vehicle(one.flight, one.rows)[0]) for one in windows]
 
     held = _without_motion(windows)
     held = [unknown.name for unknown in unknowns if unknown.name in held]
@@ -111,6 +104,8 @@ class Windows(NamedTuple):
     """M windows of one flight, over which C measured values are averaged."""
 
     flight: FlightGrid
+    rows: FlightRows
+    """The flight as rows of a view, with the attitude that the fit uses."""
     form: WeakForm
     """Weights of the windows: `form.mean @ values` are means of `values` over the windows."""
     measured: np.ndarray
@@ -141,16 +136,16 @@ def _force_windows(flight: FlightGrid, drive: str) -> Windows:
     motion = IMU_ACC if flight.has(IMU_ACC) else "vel_w"
     attitude = "rot_w" if flight.has("rot_w") else LEANING
     needs = (motion, DRIVES[drive][0], attitude)
-    form = flight.form(FORCE_WIDTH_S, needs)
+    rows, form = flight.rows(attitude_of_path=True), flight.form(FORCE_WIDTH_S, needs)
     axes = slice(0, 3)
     if attitude == LEANING:  # only along the thrust, and only slow flight
-        speed = np.linalg.norm(flight.rows(attitude_of_path=True).vel_w, axis=1)
+        speed = np.linalg.norm(rows.vel_w, axis=1)
         slow, axes = form.mean @ speed < SLOW_M_S, slice(2, 3)
         form = form.take(slow)
     to_acceleration = form.mean if motion == IMU_ACC else form.change
     measured_w = to_acceleration @ np.nan_to_num(flight.signals[motion])
     to_body = np.swapaxes(flight.signals[attitude][form.middle_row], 1, 2)[:, axes]
-    windows = Windows(flight, form, measured_w, FORCE_OFFSETS[axes], to_body)
+    windows = Windows(flight, rows, form, measured_w, FORCE_OFFSETS[axes], to_body)
     if not flight.has(POSE_SLOPE):
         return windows
     return windows._replace(nuisance=windows.means(flight.signals[POSE_SLOPE])[:, axes])
@@ -167,8 +162,7 @@ def _without_motion(flights: Sequence[Windows]) -> list[str]:
     for one in flights:
         if one.nuisance is None:
             continue
-        vel_b = one.flight.rows(attitude_of_path=True).vel_b
-        signals = (vel_b, one.flight.signals[VELOCITY_NOISE])
+        signals = (one.rows.vel_b, one.flight.signals[VELOCITY_NOISE])
         values = np.concatenate([one.means(signal) for signal in signals], axis=2)
         values, slopes = ((v - v.mean(axis=0))[:, :2] for v in (values, one.nuisance))
         values = unexplained(slopes, values, np.full(values.shape[:2], FORCE_ERROR**-2))
@@ -208,14 +202,12 @@ def torque_unknowns(drive: str, lag_s: float, late_s: float) -> list[Unknown]:
     of the other two, and keeps this ratio if it is not identifiable. `yaw` is the yaw torque over
     the inertia about z. It is missing if torques are commanded.
     """
-    lags = lag_unknowns(lag_s, late_s)
-    inertia = [Unknown(f"inertia_{a}", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015) for a in "xy"]
+    unknowns = [Unknown(f"inertia_{a}", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015) for a in "xy"]
     widest_z = 0.5 if drive == "torques" else 0.25
-    inertia.append(Unknown("inertia_z", 0.0, -1.0, 1.0, widest_z, 1e-2, 0.015))
-    if drive == "torques":
-        return [*inertia, *lags]
-    yaw = Unknown("yaw", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015)
-    return [*inertia, yaw] if drive == "rotors" else [*inertia, yaw, *lags]
+    unknowns.append(Unknown("inertia_z", 0.0, -1.0, 1.0, widest_z, 1e-2, 0.015))
+    if drive != "torques":
+        unknowns.append(Unknown("yaw", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015))
+    return unknowns if drive == "rotors" else [*unknowns, *lag_unknowns(lag_s, late_s)]
 
 
 def fit_torque(
@@ -247,24 +239,19 @@ def fit_torque(
     unknowns = [*unknowns, *known_unknowns]
     held = list(held)
     windows = [_torque_windows(flight, driven.drive) for flight in flights]
-    states = [flight.rows(attitude_of_path=False) for flight in flights]
     # Correct the bias by noise of the rotor speeds.
     starts = {**fixed, **{unknown.name: unknown.start for unknown in unknowns}}
     reliability = np.ones(3)
     if driven.drive == "rotors":
-        reliability = _reliability(windows, states, driven.at(starts))
+        reliability = _reliability(windows, driven.accelerations(starts))
     correction: dict[str, float] = dict(zip(NOISE_BIASED, -0.5 * np.log(reliability), strict=True))
-    unknowns = [
-        u._replace(method_error=float(np.hypot(u.method_error, Z95 * correction.get(u.name, 0.0))))
-        for u in unknowns
-    ]
+    for k, u in enumerate(unknowns):
+        of_noise = Z95 * correction.get(u.name, 0.0)
+        unknowns[k] = u._replace(method_error=float(np.hypot(u.method_error, of_noise)))
 
     def residuals(numbers: Mapping[str, float]) -> list[Rows]:
-        vehicle = driven.at(numbers)
-        return [
-            one.residuals(TO_RATE_S * _turning(vehicle, one.flight, state, reliability))
-            for one, state in zip(windows, states, strict=True)
-        ]
+        vehicle = driven.accelerations(numbers)
+        return [one.residuals(TO_RATE_S * _turning(vehicle, one, reliability)) for one in windows]
 
     # The fit is linearised, so it needs a start near the right delay.
     if any(unknown.name == "late" for unknown in unknowns):
@@ -287,19 +274,19 @@ def _torque_windows(flight: FlightGrid, drive: str) -> Windows:
     """Return the windows of `flight` for changes of its rates, where all signals are present."""
     form = flight.form(TORQUE_WIDTH_S, ("rate_b", DRIVES[drive][-1]), slope=True)
     measured = np.asarray(TO_RATE_S * (form.change @ np.nan_to_num(flight.signals["rate_b"])))
-    return Windows(flight, form, measured, np.zeros(3, bool))  # without free constants
+    no_offset = np.zeros(3, bool)
+    return Windows(flight, flight.rows(False), form, measured, no_offset)
 
 
-def _turning(
-    vehicle: Accelerations, flight: FlightGrid, state: FlightRows, reliability: np.ndarray
-) -> np.ndarray:
+def _turning(vehicle: Accelerations, windows: Windows, reliability: np.ndarray) -> np.ndarray:
     """Return the modelled angular acceleration (G, 3), corrected by `_reliability` (3,)."""
-    _, turn_b = vehicle(flight, state)
+    flight = windows.flight
+    _, turn_b = vehicle(flight, windows.rows)
     if (reliability == 1.0).all():
         return turn_b
     # Only the part that the rotors cause is noisy.
     still = np.zeros_like(flight.signals["rotor_speed"])
-    _, unpowered_b = vehicle(_with_rotor_speed(flight, still), state)
+    _, unpowered_b = vehicle(_with_rotor_speed(flight, still), windows.rows)
     return unpowered_b + reliability * (turn_b - unpowered_b)
 
 
@@ -308,18 +295,16 @@ def _with_rotor_speed(flight: FlightGrid, rotor_speed: np.ndarray) -> FlightGrid
     return flight._replace(signals={**flight.signals, "rotor_speed": rotor_speed})
 
 
-def _reliability(
-    windows: Sequence[Windows], states: Sequence[FlightRows], vehicle: Accelerations
-) -> np.ndarray:
+def _reliability(windows: Sequence[Windows], vehicle: Accelerations) -> np.ndarray:
     """Return the share (3,) of the modelled torque's variance that is not rotor-speed noise.
 
     Further noise of the same size is added to the rotor speeds, to see how much it changes.
     """
     noise_power, power = np.zeros(3), np.zeros(3)
-    for (flight, form, *_), state in zip(windows, states, strict=True):
-        noisier = flight.signals["rotor_speed"] + flight.signals[ROTOR_NOISE]
-        noisy = _with_rotor_speed(flight, noisier)
-        turn_b, noisy_turn_b = (form.mean @ vehicle(one, state)[1] for one in (flight, noisy))
+    for flight, rows, form, *_ in windows:
+        speed = flight.signals["rotor_speed"]
+        noisy = _with_rotor_speed(flight, speed + flight.signals[ROTOR_NOISE])
+        turn_b, noisy_turn_b = (form.mean @ vehicle(one, rows)[1] for one in (flight, noisy))
         noise_power += ((noisy_turn_b - turn_b) ** 2).sum(axis=0)
         power += (turn_b**2).sum(axis=0)
     return np.maximum(1.0 - noise_power / np.maximum(power, TINY), TINY)

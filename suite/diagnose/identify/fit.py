@@ -1,10 +1,10 @@
 """Robust least squares for `suite identify`; numbers that are not identifiable keep their start.
 
-A number is a parameter of the vehicle that is fitted; P is the count of all. Gauss-Newton steps
-with Huber's weights minimise the residuals of flights. Intervals come from the disagreement between
-flights, and between blocks (pieces of a flight). Numbers from an earlier fit are held fixed, with
-the covariance of that fit (Murphy and Topel 1985). If an interval is too wide, the least
-identifiable number is reset to its start, and the others are fitted again.
+A number is a fitted parameter; P is the count of all. Gauss-Newton steps with Huber's weights
+minimise the residuals of flights. Intervals come from the disagreement between flights, and between
+blocks (pieces of a flight). Numbers from an earlier fit are held fixed, with the covariance of that
+fit (Murphy and Topel 1985). If an interval is too wide, the least identifiable number is reset to
+its start, and the others are fitted again.
 """
 
 from __future__ import annotations
@@ -33,11 +33,9 @@ ROUNDS = 6
 """Largest number of rounds; each computes new weights and takes some Gauss-Newton steps."""
 DIFFER_P = 0.05
 """P-value below which flights differ more than their blocks explain. Intervals are then wider."""
-LEAST_SIGMA, LEAST_ERROR, LEAST_WEIGHT = 1e-9, 1e-9, 1e-12
-"""Lower limits that avoid a division by zero: of the noise, of an error divided by the noise, and
-of a sum of weights."""
-LEAST_VARIANCE = 1e-30
-"""Lower limit of a product of two standard deviations, for the same reason."""
+LEAST_SIGMA, LEAST_ERROR, LEAST_WEIGHT, LEAST_VARIANCE = 1e-9, 1e-9, 1e-12, 1e-30
+"""Lower limits that avoid a division by zero: of the noise, of an error divided by the noise, of a
+sum of weights, and of a product of two standard deviations."""
 
 
 class NoWholeWindow(ValueError):

@@ -2,22 +2,21 @@
 
 These parameters are called numbers here. There are four fits: force (thrust and drag), torque
 (inertia, lag and delay), rotors (lag and delay of measured rotor speeds), and loop (gains of the
-rate loop). The lag is the time constant with which the rotors follow their commands.
-
-Force and torque are fitted alternately, each with the result of the other, since the rotors' lag
-acts on both. The mass is never fitted: scaling it together with inertia and thrust changes no
-flight.
+rate loop). Force and torque are fitted alternately, each with the result of the other, since the
+rotors' lag acts on both. The mass is never fitted: scaling it together with inertia and thrust
+changes no flight.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from eval.effects import all_values
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.inertial import posed
@@ -34,22 +33,12 @@ from suite.diagnose.identify.drive import (
     common_drive,
     driven_vehicle,
     with_merged_effects,
-    with_motor_map,
 )
-from suite.diagnose.identify.entries import (
-    entries_of,
-    with_entries,
-    with_reachable_speed,
-)
+from suite.diagnose.identify.entries import entries_of, with_entries, with_reachable_speed
 from suite.diagnose.identify.fit import NONE_KNOWN, Fitted, NoWholeWindow, Unknown
 from suite.diagnose.identify.flapping import flapping_of, perturbed_vehicles
 from suite.diagnose.identify.grid import FlightGrid, grid_of
-from suite.diagnose.identify.loop import (
-    fit_commanded,
-    loop_rates,
-    loop_unknowns,
-    rotor_speeds,
-)
+from suite.diagnose.identify.loop import fit_commanded, loop_rates, loop_unknowns, rotor_speeds
 from suite.diagnose.identify.numbers import Number, not_attempted, not_identified, notes_on
 
 PARTS = {
@@ -113,6 +102,7 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
         fits.fit_torque()
     if drive in KNOWN_MOTORS:
         fits.fit_loop()
+    lacking = not_attempted(flights, fits.start, drive, fits.results, leave, fits.broken)
     if not fits.results:
         names = ", ".join(flight.name for flight in flights)
         if not leave:
@@ -120,25 +110,9 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
                 f"{names}: no stretch of a second with positions or body rates and the signals "
                 "that drive the motors; import these flights again and read the report"
             )
-        lacking = "; ".join(fits.lacking()) or "no stretch of a second with the needed signals"
-        raise ValueError(f"{names}: without {', '.join(leave)} nothing is identifiable: {lacking}")
-    identified = fits.identified(vehicle)
-    # Blade flapping needs the results of both fits, and motors whose thrust is known.
-    if drive not in KNOWN_MOTORS or "drag" in leave or not {"force", "torque"} <= {*fits.results}:
-        return identified
-    force, torque = fits.results["force"], fits.results["torque"]
-    perturbed = perturbed_vehicles(identified.vehicle, fits.driven, force, torque)
-    with_voltage = [log for log in logs if log.name not in fits.without_voltage]
-    entry = flapping_of(with_voltage, identified.vehicle, perturbed)
-    if entry is None:
-        return identified
-    with_flapping, numbers, notes = with_entries(identified.vehicle, [entry])
-    return replace(
-        identified,
-        vehicle=with_flapping,
-        numbers=(*identified.numbers, *numbers),
-        notes=(*identified.notes, *notes),
-    )
+        why = "; ".join(lacking) or "no stretch of a second with the needed signals"
+        raise ValueError(f"{names}: without {', '.join(leave)} nothing is identifiable: {why}")
+    return fits.identified(vehicle, logs, lacking)
 
 
 class _Fits:
@@ -147,25 +121,20 @@ class _Fits:
     def __init__(
         self, flights: list[FlightGrid], vehicle: Vehicle, drive: str, leave: tuple[str, ...]
     ) -> None:
-        self.flights, self.start, self.drive, self.leave = flights, vehicle, drive, leave
-        if drive == "pwm" and (vehicle.motors is None or "motors" not in leave):
-            self.start = with_motor_map(flights, vehicle)
-        self.driven = driven_vehicle(flights, self.start, drive)
+        self.flights, self.drive, self.leave = flights, drive, leave
+        self.driven = driven_vehicle(flights, vehicle, drive, keep_motors="motors" in leave)
+        self.start = self.driven.start
         self.results: dict[str, Fitted] = {}
         """Results by the name of the fit: force, torque, rotors or loop."""
         self.broken: set[str] = set()
         """Names of fits without a complete window."""
         self.without_voltage: set[str] = set()
         """Names of flights without a voltage, if others have one."""
-        lag_s: float = vehicle.rotors.time_constant
-        delay, scale = (vehicle.effects.get(name) for name in ("command_delay", "thrust_scale"))
-        self.log_thrust = 0.0 if scale is None else float(np.log(scale.scale))
+        effects, lag_s = all_values(vehicle), vehicle.rotors.time_constant
+        self.log_thrust = float(np.log(effects["thrust_scale"].scale))
         """Logarithm of the thrust's scale at the start."""
-        self.numbers = {
-            "thrust": self.log_thrust,
-            "lag": lag_s,
-            "late": lag_s + (0.0 if delay is None else delay.delay),
-        }
+        late_s = lag_s + float(effects["command_delay"].delay)
+        self.numbers = {"thrust": self.log_thrust, "lag": lag_s, "late": late_s}
         """Present values of the numbers on which several fits depend, by name."""
 
     def fit_force(self) -> None:
@@ -260,14 +229,13 @@ class _Fits:
         self.numbers |= {number: values[number] for number in self.numbers if number in values}
         return result
 
-    def lacking(self) -> list[str]:
-        """Return a line for people for each number that was not fitted."""
-        return not_attempted(
-            self.flights, self.start, self.drive, self.results, self.leave, self.broken
-        )
+    def identified(
+        self, original: Vehicle, logs: Sequence[FlightLog], lacking: Sequence[str]
+    ) -> Identified:
+        """Return the result of all fits to `logs`; `original` is the vehicle before any change.
 
-    def identified(self, original: Vehicle) -> Identified:
-        """Return the result of all fits; `original` is the vehicle before any change."""
+        `lacking` has a line for people for each number that was not fitted.
+        """
         results, by_key = self.results, dict[str, Number]()
         # Several fits may estimate lag and delay. Later fits in this order observe them more
         # directly.
@@ -281,10 +249,19 @@ class _Fits:
         if self.drive == "rotors":
             speeds = [f.signals["rotor_speed"] for f in self.flights]
             vehicle = with_reachable_speed(vehicle, speeds)
+        # Blade flapping needs the results of both fits, and motors whose thrust is known.
+        known_motors = self.drive in KNOWN_MOTORS and {"force", "torque"} <= {*results}
+        if known_motors and "drag" not in self.leave:
+            fits = (results["force"], results["torque"])
+            perturbed = perturbed_vehicles(vehicle, self.driven, *fits)
+            with_voltage = [log for log in logs if log.name not in self.without_voltage]
+            flapping = flapping_of(with_voltage, vehicle, perturbed)
+            vehicle, more, further = with_entries(vehicle, [flapping] if flapping else [])
+            numbers, notes = [*numbers, *more], [*notes, *further]
         return Identified(
             vehicle,
             tuple(numbers),
-            (*not_identified(results, by_key), *self.lacking()),
+            (*not_identified(results, by_key), *lacking),
             self.drive,
             {
                 name: results[name].residual_rms.tolist()

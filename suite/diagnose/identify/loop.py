@@ -71,7 +71,8 @@ def fit_commanded(
     for flight in flights:
         form, values = flight.form(width_s, (measured, commanded)), flight.signals[measured]
         means = form.mean @ np.nan_to_num(values)
-        windows.append(Windows(flight, form, means, np.ones(values.shape[1], dtype=bool)))
+        constants = np.ones(values.shape[1], dtype=bool)
+        windows.append(Windows(flight, flight.rows(False), form, means, constants))
 
     def residuals(numbers: Mapping[str, float]) -> list[Rows]:
         return [one.residuals(model(one.flight, numbers)) for one in windows]

@@ -306,12 +306,8 @@ def _variograms(flights: Sequence[Series], lag_s: np.ndarray | None) -> _Variogr
 def _half_widths(slope: np.ndarray, residual: np.ndarray, flight: np.ndarray) -> np.ndarray:
     """Return the half-widths (K,) of the 95 % intervals of K parameters.
 
-    They follow from the disagreement between stretches and between flights.
-
-    Args:
-        slope: (B, L, K) slopes of the model along the parameters.
-        residual: (B * L,) residuals of the fit.
-        flight: (B,) number of the flight of each stretch.
+    `slope` (B, L, K) and `residual` (B * L,) are those of the fit, and `flight` (B,) is the number
+    of each stretch's flight.
     """
     residual = residual.reshape(*slope.shape[:2], 1)
     chi2 = (residual[..., 0] ** 2).sum(axis=1)

@@ -190,8 +190,14 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
         raise ValueError("no flight can be used:\n" + "\n".join(refused))
     warnings += [*kept_lines(used), *(f"not used: {text}" for text in refused)]
     console.say(f"{len(used)} flights with an estimate and a reference, {seconds:.0f} s in all")
-    # Fit, and check on held-out flights.
-    used, clocks_s = _on_gyro_clock(used)
+    # Move each reference to the gyro's clock, fit, and check on held-out flights.
+    clocks = [clock_of(log) for log in used]
+    clocks_s = {
+        log.name: [float(clock.shift_s.min()), float(clock.shift_s.max())]
+        for log, clock in zip(used, clocks, strict=True)
+        if clock.shift_s.any()
+    }
+    used = [on_gyro_clock(log, clock) for log, clock in zip(used, clocks, strict=True)]
     fitted, checked = fit_sensors(used), held_out(used)
     if not fitted.axes:
         raise ValueError(
@@ -228,22 +234,6 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
         "warnings": warnings,
         **stamp(SCHEMA, None),
     }
-
-
-def _on_gyro_clock(logs: Sequence[FlightLog]) -> tuple[list[FlightLog], dict[str, list[float]]]:
-    """Move the reference of each flight to the gyro's clock.
-
-    Returns:
-        The flights, and the least and largest shift [s] by the name of each flight that has one.
-    """
-    clocks = [clock_of(log) for log in logs]
-    moved = [on_gyro_clock(log, clock) for log, clock in zip(logs, clocks, strict=True)]
-    shifts_s = {
-        log.name: [float(clock.shift_s.min()), float(clock.shift_s.max())]
-        for log, clock in zip(logs, clocks, strict=True)
-        if clock.shift_s.any()
-    }
-    return moved, shifts_s
 
 
 def say_held_out(result: Mapping[str, Any], console: Console) -> None:

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from suite.diagnose.identify import body, drive, flapping, loop
-from suite.diagnose.identify.fit import Fitted, KnownNumbers, NoWholeWindow, Rows, Unknown, fit
+from suite.diagnose.identify.fit import KnownNumbers, NoWholeWindow, Rows, Unknown, fit
 from suite.diagnose.identify.grid import LEANING, ROTOR_NOISE, STEP_S, FlightGrid
 from tests.support import identified as known
 from tests.support import real_flights
@@ -142,7 +142,7 @@ def rolled(noise, **limits):
     grid = FlightGrid("made", STEP_S * np.arange(count), {"rotor_speed": true})
     true_inertia = (2.0 * PLAIN.inertia[0], *PLAIN.inertia[1:])
     driven = drive.DrivenVehicle(replace(PLAIN, inertia=true_inertia), "rotors")
-    _, turn_b = driven.at(LAGS)(grid, grid.rows(False))
+    _, turn_b = driven.accelerations(LAGS)(grid, grid.rows(False))
     rate_b = STEP_S * (np.cumsum(turn_b, axis=0) - 0.5 * turn_b)
     drawn = noise * rng.standard_normal((2, count, 4))
     signals = {"rotor_speed": true + drawn[0], ROTOR_NOISE: drawn[1], "rate_b": rate_b}
@@ -178,15 +178,10 @@ def test_flapping_is_within_its_interval_and_none_without_what_it_needs():
         assert flapping.flapping_of(logs, real_flights.VEHICLE) is None
 
 
-def fit_of(names, covariance):
-    unknowns = tuple(Unknown(name, 0.0, -1.0, 1.0, 1.0, 1e-3) for name in names)
-    return Fitted(unknowns, np.zeros(len(names)), np.asarray(covariance))
-
-
 def test_motors_are_off_by_their_covariance_and_inertia_by_its_own():
     start, covariance = known.start(), [[4e-4, 0, -1e-4], [0, 0.1, 0], [-1e-4, 0, 9e-4]]
-    force = fit_of(("thrust", "drag_x", "curve"), covariance)
-    torque = fit_of(("inertia_x", "inertia_y"), np.diag([0.01, 0.0004]))
+    force = known.fitted(("thrust", "drag_x", "curve"), covariance)
+    torque = known.fitted(("inertia_x", "inertia_y"), np.diag([0.01, 0.0004]))
     driven = drive.DrivenVehicle(start, "pwm", usual_command=0.5, usual_volts=15.0)
     found = flapping.perturbed_vehicles(start, driven, force, torque)
     assert len(found) == 4
