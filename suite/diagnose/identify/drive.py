@@ -65,9 +65,9 @@ class DrivenVehicle:
     """The start of a fit (the vehicle before it), and the drive of its flights.
 
     Methods take `numbers`, the values of fitted numbers by name. A missing number keeps its value
-    in the start. `thrust` is the logarithm of the ratio of the thrust to the start's. With
-    motor commands, this is the thrust at the usual command and voltage, and `curve` is the share of
-    the quadratic term in it.
+    in the start. `thrust` is the logarithm of the ratio of the thrust to the start's. With motor
+    commands, this is the thrust at the usual command and voltage, and `curve` is the share of the
+    quadratic term in it.
     """
 
     start: Vehicle
@@ -116,11 +116,10 @@ class DrivenVehicle:
         effects["linear_drag"] = EFFECTS["linear_drag"].values(tuple(drag))
         if self.drive not in KNOWN_MOTORS:
             effects["thrust_scale"] = EFFECTS["thrust_scale"].values(scale)
-        if self.drive == "rotors":
-            coefficient = rotors.thrust_coefficient * scale
-            rotors = replace(rotors, thrust_coefficient=coefficient)
         log_twist = numbers.get("yaw", 0.0) + log_inertia[2]
-        log_twist += log_thrust if self.drive == "rotors" else 0.0
+        if self.drive == "rotors":
+            rotors = replace(rotors, thrust_coefficient=rotors.thrust_coefficient * scale)
+            log_twist += log_thrust
         twist = rotors.torque_coefficient * float(np.exp(log_twist))
         return replace(
             start,

@@ -97,7 +97,7 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
     vel_w, rot_w = vel_w[-len(grid) :], rot_w[-len(grid) :]
     # Estimate minus reference, part by part.
     then_s = grid - late_s
-    value, rate_b = np.full((len(grid), 9), np.nan), np.full((len(grid), 3), np.nan)
+    value = np.full((len(grid), 9), np.nan)
     for k, (part, estimate) in enumerate(estimates.items()):
         if estimate is None:
             continue
@@ -111,8 +111,7 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
         value[:, 3 * k : 3 * k + 3] = error
     # The time derivative of the reference is velocity, acceleration and body rates.
     acc_b = to_local(rot_w, _differentiated(vel_w, step_s))
-    if np.isfinite(log.rate_b).any():
-        rate_b = interpolate(then_s, log.time_s, log.rate_b, holes=True)
+    rate_b = interpolate(then_s, log.time_s, log.rate_b, holes=True)
     slope = np.concatenate([vel_w, acc_b, rate_b], axis=1)
     return Errors(step_s, value, slope, to_local(rot_w, vel_w), rot_w, lean_w)
 

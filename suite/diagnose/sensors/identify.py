@@ -215,7 +215,7 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
             "reference; the reference was moved to the gyro's times."
         )
         console.say(text)
-        header.insert(1, text)
+        header.append(text)
     numbers = [
         Number(key, unit, [interval.value], [(interval.low, interval.high)])
         for key, (interval, unit) in parameters.items()
