@@ -18,12 +18,6 @@ class Inflow(NamedTuple):
     """(...,) k: thrust that a rotor loses, per climb speed and rotor speed [N s^2/(m rad)]."""
 
 
-def inflow_thrust(values: Inflow, flow: Flow, thrust: Array) -> Array:
-    """Return the thrusts (..., 4) [N], each reduced by k Omega_i v_b . e3."""
-    climb = flow.air_vel_b[..., 2]
-    return thrust - per_axis(values.coefficient * climb) * flow.rotor_speed
-
-
 INFLOW = Effect(
     name="inflow",
     summary="Thrust decreases in a climb and increases in a descent",
@@ -35,7 +29,9 @@ INFLOW = Effect(
             "coefficient", "N s^2/(m rad)", neutral=0.0, low=0.0, high=1e-3, typical=(3e-5, 1.2e-4)
         ),
     ),
-    thrust=inflow_thrust,
+    thrust=lambda values, flow, thrust: (
+        thrust - per_axis(values.coefficient * flow.air_vel_b[..., 2]) * flow.rotor_speed
+    ),
 )
 
 
@@ -72,11 +68,6 @@ class BladeFlapping(NamedTuple):
     """(...,) k: torque per airspeed and sum of the rotor speeds [N s^2/rad]."""
 
 
-def blade_flapping_torque(values: BladeFlapping, flow: Flow) -> Array:
-    """Return k (sum Omega_i) (v_b x e3) (..., 3) [N m]."""
-    return per_axis(values.coefficient * flow.rotor_speed.sum(axis=-1)) * cross_e3(flow.air_vel_b)
-
-
 BLADE_FLAPPING = Effect(
     name="blade_flapping",
     summary="The rotors tilt away from the airflow and pitch the body up",
@@ -88,7 +79,9 @@ BLADE_FLAPPING = Effect(
             "coefficient", "N s^2/rad", neutral=0.0, low=-1e-5, high=1e-5, typical=(1e-7, 1e-6)
         ),
     ),
-    torque=blade_flapping_torque,
+    torque=lambda values, flow: (
+        per_axis(values.coefficient * flow.rotor_speed.sum(axis=-1)) * cross_e3(flow.air_vel_b)
+    ),
 )
 
 
