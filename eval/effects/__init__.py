@@ -92,15 +92,6 @@ EFFECTS: Registry[Effect] = Registry(
 """All effects by name, those of other packages included."""
 
 
-def find_effect(name: str) -> Effect:
-    """Return the effect called `name`.
-
-    Raises:
-        ValueError: for an unknown name; the message has the most similar known name.
-    """
-    return EFFECTS.find(name)
-
-
 def nameable_effects() -> list[str]:
     """Return the names of the effects that a diagnosis may name, in the catalogue's order."""
     return [name for name, effect in EFFECTS.items() if effect.nameable]

@@ -12,21 +12,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.effects.interface import as_arrays
+from eval import sensors
+from eval.effects.interface import GRAVITY, as_arrays
 from eval.sensors import SENSORS
 from eval.sensors.draws import blank_model_draws, draw
 from eval.sensors.filter.delayed import Delayed, current_state, start_delayed, step
 from eval.sensors.filter.kalman import (
-    GRAVITY,
     SIZE,
     Corners,
-    FilterSettings,
     FilterState,
+    ImuNoise,
     project,
     start,
     update_gate,
 )
-from eval.sensors.interface import Inertial, Moment, markov_step, rotation_since
+from eval.sensors.gate_filter import GateFilter
+from eval.sensors.interface import Inertial, markov_step, rotation_since
 from eval.sensors.sensors_file import SensorSet
 from eval.worlds.slots import SENSED, generator_of
 from eval.worlds.trial import TrialSpec
@@ -72,14 +73,17 @@ class Filtered:
                 f"sensors {wanted.name!r}: delay.state is {wanted.ages.state_s:g} s, but the "
                 "estimator has a delay itself: leave delay.state out"
             )
-        settings: FilterSettings = wanted.estimator
-        if settings.frame_hz * dt > 1 + 1e-9:
+        settings: GateFilter = wanted.estimator
+        if settings.rate * dt > 1 + 1e-9:
             raise ValueError(
-                f"sensors {wanted.name!r}: gate_filter.rate is {settings.frame_hz:g} Hz; allowed "
+                f"sensors {wanted.name!r}: gate_filter.rate is {settings.rate:g} Hz; allowed "
                 f"is up to the {1 / dt:g} Hz of the physics (the vehicle's controller.frequency): "
                 "lower the rate"
             )
         self._settings, self._dt, self._camera = settings, dt, camera
+        sigmas = settings.position, settings.velocity, settings.attitude
+        sigmas = (*sigmas, settings.acc_bias, settings.gyro_bias)
+        self._start_sigma = np.repeat(np.array(sigmas, float), 3)  # in the order of the error state
         self._imu = {
             name: as_arrays(values)
             for name, values in wanted.models.items()
@@ -87,10 +91,10 @@ class Filtered:
         }
         used = (SENSORS[name] for name in self._imu)
         self._trial, self._sample = blank_model_draws(used, slots, camera)
-        self._delay_steps = round(settings.delay_s / dt)
-        self._period = 1.0 / (settings.frame_hz * dt)
+        self._delay_steps = round(settings.delay / dt)
+        self._period = 1.0 / (settings.rate * dt)
         self._half_view = np.tan(np.deg2rad(np.asarray(camera.fov_deg)) / 2.0)
-        self._sigma = settings.corner_sigma * 2.0 * self._half_view[0] / settings.width
+        self._sigma = settings.pixel * 2.0 * self._half_view[0] / settings.width
         pitch = np.deg2rad(camera.pitch_deg)
         cos, sin = np.cos(pitch), np.sin(pitch)
         self._camera_b = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
@@ -115,7 +119,7 @@ class Filtered:
     def start(self, slot: int, trial: TrialSpec, gates: Gates) -> None:
         """Start `trial` in `slot`, on a track with these gates."""
         rng = generator_of(trial, SENSED, "gate_filter")
-        self._error[slot] = rng.standard_normal(SIZE) * self._settings.start_sigma
+        self._error[slot] = rng.standard_normal(SIZE) * self._start_sigma
         self._lost[slot] = rng.random() < self._settings.dropout
         self._frame_rngs[slot] = rng
         self._imu_rngs[slot] = generator_of(trial, SENSED, "imu")
@@ -148,7 +152,7 @@ class Filtered:
         truth = truth._replace(depth_m=None, gate_number=None)
         pose = View(*truth[:3], *(np.zeros(len(starting)),) * 4)
         self._truth = pose if self._truth is None else select(starting, pose, self._truth)
-        error, sigma = self._error, self._settings.start_sigma
+        error, sigma = self._error, self._start_sigma
         # Truth = estimate + error; the attitude error is in the body axes of the estimate.
         initial = start(
             pose.pos_w - error[:, :3],
@@ -159,12 +163,7 @@ class Filtered:
         started = start_delayed(initial, self._delay_steps)
         filters = started if self.filters is None else select(starting, started, self.filters)
         self.filters = make_contiguous(filters)
-        memory = {
-            name: start_of(values, Moment(truth, self._trial[name], self._dt, self._camera))
-            if (start_of := SENSORS[name].start)
-            else ()
-            for name, values in self._imu.items()
-        }
+        memory = sensors.start(self._imu, truth, self._trial, self._dt, self._camera)
         self._memory = memory if self._memory is None else select(starting, memory, self._memory)
 
     def follow(self, view: View, flew: np.ndarray) -> None:
@@ -185,7 +184,8 @@ class Filtered:
                 sample, memory = measure(values, memory, sample, self._sample[name], self._dt)
                 self._memory[name] = select(flew, memory, self._memory[name])
             imu = sample.rate_b, sample.acc_b, dt, flew
-            self.filters = make_contiguous(step(self.filters, *imu, self._settings.imu))
+            noise = ImuNoise(*self._settings[-4:])
+            self.filters = make_contiguous(step(self.filters, *imu, noise))
         truth_now = View(view.pos_w, view.rot_w, view.vel_w, *truth_before[3:])
         self._truth = select(flew, truth_now, truth_before)
         self._steps += flew
@@ -202,13 +202,13 @@ class Filtered:
         with np.errstate(divide="ignore", invalid="ignore"):
             image, forward = project(truth[0], truth[1], self._camera_b, corner_w)
         inside = (np.abs(image) <= self._half_view).all(-1)
-        seen = self._exists[rows] & inside & (forward > NEAR_M) & (forward < settings.range_m)
+        seen = self._exists[rows] & inside & (forward > NEAR_M) & (forward < settings.range)
         chance, noise = np.zeros(len(rows)), np.zeros(image.shape)
         for k, slot in enumerate(rows.tolist()):
             rng, count = self._frame_rngs[slot], int(self._exists[slot].sum())
             chance[k], noise[k, :count] = rng.random(), rng.standard_normal((count, 2))
-        share, length_s = np.asarray(settings.dropout), np.asarray(settings.dropout_s)
-        lost = markov_step(self._lost[rows], chance, share, length_s, 1.0 / settings.frame_hz)
+        share, length_s = np.asarray(settings.dropout), np.asarray(settings.dropout_length)
+        lost = markov_step(self._lost[rows], chance, share, length_s, 1.0 / settings.rate)
         self._lost[rows] = lost
         # Frames are stored in turn in the entries of `_pending`, a ring buffer.
         entry = self._frame[rows] % len(self._pending)

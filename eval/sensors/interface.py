@@ -131,7 +131,7 @@ class Sensor:
     ages: Callable[[Values], Ages] | None = None
     """For a delay: returns the ages of the observation."""
     estimate: Callable[[Values], Any] | None = None
-    """For a state estimator: returns its `eval.sensors.filter.kalman.FilterSettings`."""
+    """For a state estimator: returns its settings, an `eval.sensors.gate_filter.GateFilter`."""
     measure: Callable[[Values, Memory, Inertial, Draws, Any], tuple[Inertial, Memory]] | None = None
     """For an inertial sensor: (values, state, truth, draws, dt_s) -> measurement, state."""
 
@@ -211,11 +211,3 @@ def rotation_since(rot_w: Array, before_w: Array) -> Array:
 def product(a: Array, b: Array) -> Array:
     """Return the matrix products a b (..., 3, 3), with the same rounding at every batch size."""
     return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
-
-
-def yaw_matrix(angle: Array) -> Array:
-    """Return rotation matrices (..., 3, 3) about z by `angle` (...,) [rad]."""
-    xp = angle.__array_namespace__()
-    cos, sin, zero = xp.cos(angle), xp.sin(angle), xp.zeros_like(angle)
-    rows = ((cos, -sin, zero), (sin, cos, zero), (zero, zero, zero + 1.0))
-    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)

@@ -24,7 +24,7 @@ from eval.quadrotor.autopilot import AutopilotState, autopilot_step, make_autopi
 from eval.quadrotor.model import compile_quadrotor
 from eval.quadrotor.plant import Motion, uses_noise
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds import Rows
+from eval.worlds import Rows, rows_of
 from eval.worlds.collision import NEAR_STEPS, box_distances, near_solids
 from eval.worlds.engine import start_state
 from eval.worlds.slots import IDLE, GustDraws, Layout, empty_course, pad_gates
@@ -337,12 +337,8 @@ class MjxWorld:
 
     def _rows(self, due: Array, state: SlotStates, rotor_speed: Array) -> Rows:
         """Return the rows of the flight logs, for the slots in `due` (N,) bool."""
-        command = state.loops.command
-        return Rows(
-            due, state.progress.step * self.dt, state.qpos[:, :3], state.qpos[:, 3:],
-            state.qvel[:, :3], state.qvel[:, 3:], command.thrust, command.rate_b, rotor_speed,
-            state.progress.gates,
-        )  # fmt: skip
+        qpos, qvel, loops, progress = state
+        return rows_of(due, progress, self.dt, qpos, qvel, loops.command, rotor_speed)
 
 
 @jax.jit

@@ -19,7 +19,7 @@ from mujoco.batch import Batch
 from eval.quadrotor.autopilot import AutopilotState, make_autopilot, start_autopilot
 from eval.quadrotor.plant import MAX_DELAY, Motion, make_plant, uses_noise
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds import Rows
+from eval.worlds import Rows, rows_of
 from eval.worlds.engine import BODY, DepthCamera, compile_model, contact_name, start_state
 from eval.worlds.slots import IDLE, GustDraws, Layout, empty_course, pad_gates
 from eval.worlds.trial import (
@@ -278,19 +278,5 @@ class SceneSlots(ABC):
         """Return the rows of the flight logs at this step; [] if no slot is `due` (N,) bool."""
         if not due.any():
             return []
-        loops = self._loops
-        qpos, qvel = self._qpos.copy(), self._qvel.copy()
-        return [
-            Rows(
-                due,
-                self._progress.step * self.dt,
-                qpos[:, :3],
-                qpos[:, 3:],
-                qvel[:, :3],
-                qvel[:, 3:],
-                loops.command.thrust,
-                loops.command.rate_b,
-                rotor_speed,
-                self._progress.gates,
-            )
-        ]
+        joint, command = (self._qpos.copy(), self._qvel.copy()), self._loops.command
+        return [rows_of(due, self._progress, self.dt, *joint, command, rotor_speed)]

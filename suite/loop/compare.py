@@ -16,8 +16,7 @@ import numpy as np
 
 from eval.judging.statistics import (
     Interval,
-    bootstrap_mean,
-    bootstrap_median,
+    bootstrap,
     paired_success,
     wilson,
 )
@@ -84,8 +83,8 @@ def policy_results(
                     f"{track} {level}": success_rate(success[indices])
                     for (track, level), indices in cells.items()
                 },
-                gates=bootstrap_mean(np.array([row.gates_passed for row in rows]), seed),
-                v_mean=bootstrap_median(np.array([row.v_mean for row in rows]), seed),
+                gates=bootstrap(np.array([row.gates_passed for row in rows]), seed, np.mean),
+                v_mean=bootstrap(np.array([row.v_mean for row in rows]), seed),
                 differences=[
                     Difference(reference, Interval(*pair[:3]), pair.p_value)
                     for reference, pair in pairs.items()

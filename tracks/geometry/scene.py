@@ -94,11 +94,6 @@ class Counts(NamedTuple):
     triangles: int = 0
 
 
-def no_rods() -> Rods:
-    """Return an empty set of cylinders or capsules."""
-    return Rods(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
-
-
 def counts(scene: Scene) -> Counts:
     """Return the numbers of solids of each kind in `scene` (not batched)."""
     return Counts(

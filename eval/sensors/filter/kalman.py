@@ -21,11 +21,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from eval.effects.interface import GRAVITY
 from tracks.geometry.rotation import cross, exp_rot, to_local, to_world
 from tracks.geometry.scene import Array
 
-GRAVITY = 9.81
-"""Gravity [m/s^2]."""
 SIZE = 15
 """Size of the error state: position, velocity, attitude, accelerometer bias, gyro bias."""
 
@@ -41,29 +40,6 @@ class ImuNoise(NamedTuple):
     """Random walk of the accelerometer's bias [m/s^3/sqrt(Hz)]."""
     gyro_walk: Array
     """Random walk of the gyro's bias [rad/s^2/sqrt(Hz)]."""
-
-
-class FilterSettings(NamedTuple):
-    """Settings of a state estimator that feeds a policy: of the filter and of gate detections."""
-
-    corner_sigma: float
-    """Noise of a corner in the image, along each axis, standard deviation [pixel]."""
-    width: float
-    """Width of the image that covers the camera's field of view [pixel]."""
-    frame_hz: float
-    """Frames per second [Hz]."""
-    dropout: float
-    """Share of the frames without a gate detection."""
-    dropout_s: float
-    """Mean duration of a gap without detections [s]."""
-    delay_s: float
-    """Delay from a frame to the filter [s]."""
-    range_m: float
-    """Corners further away are not detected [m]."""
-    start_sigma: Array
-    """(15,) standard deviations of the error at the start, in the order of the error state."""
-    imu: ImuNoise
-    """The IMU's errors as assumed by the filter."""
 
 
 class FilterState(NamedTuple):
@@ -237,27 +213,6 @@ def _corrected(state: FilterState, error: Array, covariance: Array) -> FilterSta
         state.gyro_bias_b + error[:, 12:15],
         0.5 * (covariance + xp.matrix_transpose(covariance)),
     )
-
-
-def error_of(state: FilterState, truth: FilterState) -> Array:
-    """Return the error of the state (N, 15): truth minus estimate, in the order of the error state.
-
-    The attitude error is the axis times the sine of the angle, in body axes. The covariance in
-    `truth` is not used.
-    """
-    xp = state.pos_w.__array_namespace__()
-    relative = xp.matmul(xp.matrix_transpose(state.rot_w), truth.rot_w)
-    sine_b = 0.5 * xp.stack(
-        [
-            relative[:, 2, 1] - relative[:, 1, 2],
-            relative[:, 0, 2] - relative[:, 2, 0],
-            relative[:, 1, 0] - relative[:, 0, 1],
-        ],
-        axis=-1,
-    )
-    parts = [truth.pos_w - state.pos_w, truth.vel_w - state.vel_w, sine_b]
-    parts += [truth.acc_bias_b - state.acc_bias_b, truth.gyro_bias_b - state.gyro_bias_b]
-    return xp.concatenate(parts, axis=-1)
 
 
 def _skew(vector: Array) -> Array:

@@ -13,7 +13,8 @@ from eval.judging.filtered import Filtered, inertial
 from eval.judging.judge import JudgeOptions, fly
 from eval.judging.sensors import Sensors
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.sensors.filter.kalman import error_of, update_gate
+from eval.sensors.filter.kalman import update_gate
+from eval.sensors.interface import rotation_since
 from eval.sensors.sensors_file import PERFECT, load_sensors, scale_sensors, sensor_set
 from eval.worlds.trial import Rules, TrialSpec
 from policies.observation import View
@@ -145,8 +146,8 @@ def filtered_flights(wanted, trials, monkeypatch, slots=40, seconds=1.6):
             past.append(View(*self._truth))
             if len(past) > 1:
                 state, (pos_w, rot_w, vel_w, *_) = self.filters.state, past[-2]
-                true = state._replace(pos_w=pos_w, rot_w=rot_w, vel_w=vel_w)
-                error = error_of(state, true)[:, :9, None]
+                turned_b = rotation_since(rot_w, state.rot_w)
+                error = np.hstack([pos_w - state.pos_w, vel_w - state.vel_w, turned_b])[..., None]
                 covariance = state.covariance[:, :9, :9]
                 value = (error * np.linalg.solve(covariance, error)).sum((1, 2))
                 found.append(np.where(flying, value, np.nan))
