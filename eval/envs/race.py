@@ -5,8 +5,6 @@ A race is one trial (flight) by the rules of the judge, which flies policies and
 
 from __future__ import annotations
 
-import math
-
 import mujoco
 import numpy as np
 
@@ -15,7 +13,7 @@ from eval.quadrotor.autopilot import AutopilotState, autopilot_step, make_autopi
 from eval.quadrotor.plant import uses_noise
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.engine import DepthCamera, compile_model, motion_of, start_state
-from eval.worlds.slots import gust_draws, layout_of
+from eval.worlds.slots import GustDraws, layout_of
 from eval.worlds.trial import (
     ENDINGS,
     FLYING,
@@ -71,17 +69,14 @@ class Race:
             )
         layout = layout_of([track])
         self.model = compile_model(track, vehicle, self.autopilot.dt, layout.solids)
-        period = 1 / (spec.rate_hz * self.autopilot.dt)
-        self.steps_a_decision = max(1, round(period))
+        self.steps_a_decision = max(1, round(1 / (spec.rate_hz * self.autopilot.dt)))
         """Number of physics steps between decisions, rounded to a constant."""
         self._start = start_state(track)
         gates = Gates(*(np.asarray(field)[None] for field in track.scene.gates))
         self._course = Course(gates, np.array([gates.center_w.shape[1]], np.int32))
-        self._noise: np.ndarray | None = None
+        self._gusts: GustDraws | None = None
         if uses_noise(self.autopilot.plant):
-            trial = TrialSpec(track.family, track.level, track.seed)
-            steps = round(rules.time_limit_s / self.autopilot.dt)
-            self._noise = gust_draws(trial, steps + math.ceil(period) + 2)
+            self._gusts = GustDraws(TrialSpec(track.family, track.level, track.seed))
         self._eye = DepthCamera(spec.camera)
         self._loops: AutopilotState
         self.progress: Progress
@@ -98,7 +93,7 @@ class Race:
         data.qpos[:], data.qvel[:] = self._start, 0.0
         mujoco.mj_step1(self.model, data)
         motion = motion_of(data)
-        noise = None if self._noise is None else self._noise[:1]
+        noise = self._gusts and self._gusts.at(0, 1)
         self._loops = start_autopilot(self.autopilot, motion, noise)
         self.progress = start_progress(motion.pos_w)
         self.action_b = np.zeros((1, 3))
@@ -129,7 +124,7 @@ class Race:
             progress_before = self.progress
             motion, step = motion_of(data), progress_before.step
             gate_w = next_centre(self._course, progress_before.gates)
-            noise = None if self._noise is None else self._noise[step + 1]
+            noise = self._gusts and self._gusts.at(int(step[0]) + 1, 1)
             self._loops, wrench = autopilot_step(
                 self.autopilot, self._loops, motion, self.action_b, gate_w, step, noise
             )

@@ -190,8 +190,8 @@ def ordinary_flights(rng: np.random.Generator, duration_s: float = 10.0) -> list
     ]
 
 
-def long_flights(rng: np.random.Generator, count: int = 3) -> list[Trajectory]:
-    """Return `count` random flights of a minute, for effects that change slowly."""
+def long_flights(rng: np.random.Generator) -> list[Trajectory]:
+    """Return three random flights of a minute, for effects that change slowly."""
     return [
         Trajectory(
             "figure_eight",
@@ -201,5 +201,5 @@ def long_flights(rng: np.random.Generator, count: int = 3) -> list[Trajectory]:
             direction=float(rng.uniform(0.0, 2.0 * np.pi)),
             turn="wobble",
         )
-        for _ in range(count)
+        for _ in range(3)
     ]

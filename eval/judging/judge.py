@@ -159,9 +159,7 @@ def check_records(world: str) -> None:
         )
 
 
-def pieces_of(
-    trials: Sequence[Trial], processes: int, most: int = MOST_A_PIECE
-) -> list[Sequence[Trial]]:
+def pieces_of(trials: Sequence[Trial], processes: int, most: int) -> list[Sequence[Trial]]:
     """Divide trials into pieces of at most `most` trials, with equally many pieces a process.
 
     Small pieces lose little when a process dies, but at the end of each piece some slots are empty.

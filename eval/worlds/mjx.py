@@ -49,7 +49,7 @@ from tracks.formats.mujoco_scene import GROUND
 from tracks.geometry.camera import Camera, cast_rays_b, nearest
 from tracks.geometry.depth import depth_image
 from tracks.geometry.rotation import quat_to_rot, to_world
-from tracks.geometry.scene import Array, Scene, pad, stack
+from tracks.geometry.scene import Array, Scene, counts, pad, stack
 from tracks.track import Track
 
 with contextlib.redirect_stdout(io.StringIO()):  # the import prints a list of missing packages
@@ -371,14 +371,11 @@ def _motion(qpos: Array, qvel: Array) -> Motion:
 
 def _solid_names(track: Track, layout: Layout) -> list[str]:
     """Return a name for every column of `box_distances` on the padded scene."""
-    names, remaining = [], list(track.names)
-    scene = track.scene
-    kinds = (scene.boxes, scene.cylinders, scene.capsules, scene.spheres)
-    for solids, padded_count in zip(kinds, layout.solids, strict=False):
-        count = len(solids[0])
+    names, remaining, present = [], list(track.names), counts(track.scene)
+    for count, padded_count in zip(present[:4], layout.solids, strict=False):
         names += remaining[:count] + ["parked"] * (padded_count - count)
         remaining = remaining[count:]
     for mesh, size in zip(remaining, track.mesh_sizes, strict=True):
         names += [mesh] * size
-    names += ["parked"] * (layout.solids.triangles - len(scene.triangles))
+    names += ["parked"] * (layout.solids.triangles - present.triangles)
     return [*names, GROUND]

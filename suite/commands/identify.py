@@ -63,7 +63,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
     if not config.vehicle:
         raise ValueError("--vehicle is missing: the vehicle file to start from, or a shipped name")
-    check_no_input(out, [config.vehicle], "--out")
+    check_no_input(out, [config.vehicle])
     result = identify_files(
         config.flights, config.vehicle, out, config.leave, console, config.accept
     )

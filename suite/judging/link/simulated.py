@@ -16,7 +16,7 @@ from eval.quadrotor.plant import Command, Motion, uses_noise
 from eval.quadrotor.stepper import Inputs, plant_step
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.engine import DepthCamera, compile_model, contact_name, motion_of, start_state
-from eval.worlds.slots import gust_draws, layout_of
+from eval.worlds.slots import GustDraws, layout_of
 from eval.worlds.trial import (
     FLYING,
     Course,
@@ -69,11 +69,9 @@ class SimulatedVehicle:
         self._data = mujoco.MjData(self._model)
         self._data.qpos[:] = start_state(track)
         mujoco.mj_step1(self._model, self._data)
-        self._draws = None
-        if uses_noise(self._autopilot.plant):
-            self._draws = gust_draws(trial, round(self._rules.time_limit_s / self.dt) + 2)
+        self._gusts = GustDraws(trial) if uses_noise(self._autopilot.plant) else None
         motion = motion_of(self._data)
-        first = None if self._draws is None else self._draws[:1]
+        first = self._gusts and self._gusts.at(0, 1)
         self._plant = start_autopilot(self._autopilot, motion, first).plant
         # The judging, as a batch of one trial.
         gates = track.scene.gates
@@ -144,7 +142,7 @@ class SimulatedVehicle:
         step = int(self._progress.step[0])
         if (step - self._command_step) * self.dt > LOST_S:
             command = self._brake_command(motion)
-        noise = None if self._draws is None else self._draws[None, step + 1]
+        noise = self._gusts and self._gusts.at(step + 1, 1)
         plant, wrench = plant_step(
             self._autopilot.plant,
             self._plant,
