@@ -17,6 +17,21 @@ PT3_SCALE = 1.961459177
 1 / sqrt(2^(1/3) - 1)."""
 
 
+class Request(NamedTuple):
+    """Inputs of an update of a firmware's rate loop."""
+
+    throttle: Array
+    """(...,) motor command without roll, pitch and yaw, from 0 to 1."""
+    rate_cmd_b: Array
+    """(..., 3) commanded body rates [rad/s]."""
+    rate_b: Array
+    """(..., 3) current body rates [rad/s]."""
+    dt: Array
+    """Time since the last update [s]."""
+    scale: Array
+    """(..., 3) factor on the outputs, by the effect `rate_gain`."""
+
+
 class Pair(NamedTuple):
     """State of a second-order filter in direct form II: its last two inner values."""
 
