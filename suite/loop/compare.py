@@ -14,12 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eval.judging.statistics import (
-    Interval,
-    bootstrap,
-    paired_success,
-    wilson,
-)
+from eval.judging.statistics import Interval, bootstrap, paired_success, wilson
 from eval.worlds.trial import TrialResult, TrialSpec
 
 BEFORE = "before"
