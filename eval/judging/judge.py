@@ -17,11 +17,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 from eval.judging.ages import Delays
-from eval.judging.filtered import Filtered, single_steps
 from eval.judging.guard import ActionLimits, call_policy, check_rate, first_action, limits_of
 from eval.judging.outputs import Outputs
 from eval.judging.recorder import Recorder
-from eval.judging.sensors import Sensors
+from eval.judging.sensors import Filtered, Sensors, single_steps
 from eval.logs.flight import Flight
 from eval.sensors import view_models
 from eval.sensors.sensors_file import PERFECT, SensorSet

@@ -8,13 +8,18 @@ magnitudes of one model use the same numbers.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from policies.observation import View
 from tracks.geometry.camera import Camera
 from tracks.geometry.scene import Array
+
+if TYPE_CHECKING:
+    import jax
 
 Values = Any
 """The parameters of a model: its NamedTuple of floats or arrays (...,)."""
@@ -211,3 +216,51 @@ def rotation_since(rot_w: Array, before_w: Array) -> Array:
 def product(a: Array, b: Array) -> Array:
     """Return the matrix products a b (..., 3, 3), with the same rounding at every batch size."""
     return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
+
+
+def blank_draws(needs: Needs, rows: int, camera: Camera) -> Draws:
+    """Return arrays of zeros for the draws `needs` of `rows` drones."""
+    shape = camera.height, camera.width
+    return Draws(
+        np.zeros((rows, needs.normal)),
+        np.zeros((rows, needs.uniform)),
+        np.zeros((rows, needs.grain, *shape)),
+        np.zeros((rows, needs.chance, *shape)),
+    )
+
+
+def blank_model_draws(
+    models: Iterable[Sensor], rows: int, camera: Camera
+) -> tuple[dict[str, Draws], dict[str, Draws]]:
+    """Return arrays of zeros for the draws of a trial and of an observation, by model."""
+    models = list(models)
+    trial = {model.name: blank_draws(model.trial, rows, camera) for model in models}
+    observation = {model.name: blank_draws(model.observation, rows, camera) for model in models}
+    return trial, observation
+
+
+def draw(into: Draws, row: int, generator: np.random.Generator) -> None:
+    """Draw the random numbers of drone `row`, in place: see `Draws` for the distributions."""
+    fills = {
+        "normal": generator.standard_normal,
+        "uniform": generator.random,
+        "grain": generator.standard_normal,
+        "chance": generator.random,
+    }
+    for field, numbers in into._asdict().items():
+        if numbers[row].size:
+            fills[field](out=numbers[row])
+
+
+def keyed_draws(needs: Needs, key: jax.Array, camera: Camera) -> Draws:
+    """Return the random numbers of one drone from a JAX `key`."""
+    import jax
+
+    shape = camera.height, camera.width
+    keys = jax.random.split(key, 4)
+    return Draws(
+        jax.random.normal(keys[0], (needs.normal,)),
+        jax.random.uniform(keys[1], (needs.uniform,)),
+        jax.random.normal(keys[2], (needs.grain, *shape)),
+        jax.random.uniform(keys[3], (needs.chance, *shape)),
+    )

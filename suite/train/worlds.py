@@ -17,8 +17,7 @@ import jax
 import numpy as np
 
 from eval.sensors import SENSORS, view_models
-from eval.sensors.draws import blank_draws, draw
-from eval.sensors.interface import Draws
+from eval.sensors.interface import Draws, blank_draws, draw
 from suite.train.config import TrainConfig
 from suite.train.dynamics import interface as dynamics
 from suite.train.dynamics import point_mass

@@ -7,11 +7,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from eval.judging import filtered, judge
+from eval.judging import judge, sensors
 from eval.judging import judge as module
-from eval.judging.filtered import Filtered, inertial
 from eval.judging.judge import JudgeOptions, fly
-from eval.judging.sensors import Sensors
+from eval.judging.sensors import Filtered, Sensors, inertial
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors.filter.kalman import update_gate
 from eval.sensors.interface import rotation_since
@@ -169,7 +168,7 @@ def test_nees_is_within_its_bounds_if_the_corners_variance_is_right(
     def sure(state, corners, variance, camera_b):
         return update_gate(state, corners, believed * variance, camera_b)
 
-    monkeypatch.setattr(filtered, "update_gate", sure)
+    monkeypatch.setattr(sensors, "update_gate", sure)
     # From a second after the start on.
     late = filtered_flights(filtering(delay=DELAY_S), TWO_TRACKS[:trials], monkeypatch)[1][30:]
     flying = np.isfinite(late).sum(axis=1)
