@@ -275,7 +275,7 @@ def _variograms(
         lags = np.rint(lag_s / flight.step_s).astype(int)
         squares = [0.5 * (flight.value[k:] - flight.value[:-k]) ** 2 for k in lags]
         if about_mean:
-            squares.append((flight.value - np.nanmean(flight.value)) ** 2)
+            squares += [(flight.value - np.nanmean(flight.value)) ** 2]
         # Sum the squares and count them, by stretch, for each lag.
         totals, pairs = [], []
         for square in squares:
