@@ -23,7 +23,7 @@ from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
 from eval.logs.faults.check import DRIVE, POSE, CheckContext, run_checks
 from eval.logs.faults.clock import check_time
 from eval.logs.faults.finding import Finding, finding_lines
-from eval.logs.faults.jumps import check_jumps
+from eval.logs.faults.position import check_jumps
 from eval.logs.faults.reading import BY_ATTITUDE, MOTORS, read_rows
 from eval.logs.faults.vehicle import check_vehicle_name
 from eval.logs.flight_log import FlightLog, log_from_columns

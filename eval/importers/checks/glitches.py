@@ -14,7 +14,7 @@ from eval.importers.frames import conjugate, multiply, rotation_vector
 from eval.importers.rows import continuous
 from eval.importers.signals import MAD_TO_SD, Recording, Signal, median_step
 from eval.logs.faults.finding import Finding
-from eval.logs.faults.jumps import ACC_MAX
+from eval.logs.faults.position import ACC_MAX
 from eval.logs.faults.relation import rms
 from eval.logs.velocity import velocity_from_position
 

@@ -119,7 +119,7 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
                 turned[base] * [1.0, -1.0, -1.0] if frd else turned[base], gyro
             )
         seen = seen_as.get((base, frd))
-        turns = None if seen is None else _misfit_of(seen)
+        turns = None if seen is None else seen.misfit(seen.alike)
         forces: dict[tuple[str, float], tuple[float, float]] = {}
         if path is not None:
             forces = _force_misfits(_axes_of(time_s, read, every), path)
@@ -289,13 +289,6 @@ def turns_of(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
         no_row_missing = step < 1.5 * (2 * count) * float(np.median(np.diff(time_s)))
         rates[count:-count] = np.where(no_row_missing, rotation_vector(relative) / step, np.nan)
     return rates
-
-
-def _misfit_of(seen: Match) -> float:
-    """Return the share of the attitude's body rates that the gyro's best axes do not explain."""
-    weight = seen.level**2
-    unexplained = weight * (1.0 - np.clip(seen.alike, 0.0, 1.0) ** 2)
-    return float(np.sqrt(unexplained.sum() / max(weight.sum(), 1e-12)))
 
 
 def _axes_of(time_s: np.ndarray, quat: np.ndarray, every: int) -> np.ndarray:

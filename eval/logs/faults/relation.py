@@ -6,6 +6,7 @@ the signal to check (`given`), such as the gyro, whose axes may be swapped or in
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import permutations
 from typing import NamedTuple
 
@@ -65,6 +66,12 @@ class Match(NamedTuple):
         worse = self.seen & (self.alike - self.as_given > UNLIKE) & (self.alike > ALIKE)
         return bool(worse.any() and "".join(self.axes.split(",")).replace("-", "") == "xyz")
 
+    def misfit(self, correlations: np.ndarray) -> float:
+        """Return the relative residual at these correlations (3,), after the scale is fitted."""
+        weight = self.level**2
+        unexplained = weight * (1.0 - np.clip(correlations, 0.0, 1.0) ** 2)
+        return float(np.sqrt(unexplained.sum() / max(weight.sum(), 1e-12)))
+
 
 def match(wanted: np.ndarray, given: np.ndarray) -> Match:
     """Return the relation of `given` (N, 3) to `wanted` (N, 3); rows with a NaN are not used."""
@@ -118,6 +125,11 @@ def pooled_scale(found: Match) -> tuple[float, float, float]:
         for value in (found.scale, found.low, found.high)
     ]
     return mean[0], mean[1], mean[2]
+
+
+def within(table: Mapping[str, float], limit: float, factor: float) -> list[str]:
+    """Return the names in `table` whose value is within the ratio `limit` of `factor`."""
+    return [n for n, wrong in table.items() if abs(np.log(factor / wrong)) < np.log(limit)]
 
 
 def smooth(time_s: np.ndarray, value: np.ndarray, width_s: float) -> np.ndarray:

@@ -15,7 +15,7 @@ from eval.importers.frames import conjugate, rotate
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows, turns_of
 from eval.logs.faults.reading import option, read_as
-from eval.logs.faults.relation import LEAST, SEEN, Match, match, pooled_scale, rms, smooth
+from eval.logs.faults.relation import LEAST, SEEN, Match, match, pooled_scale, rms, smooth, within
 from eval.logs.velocity import velocity_from_position
 
 DEG = float(np.pi / 180.0)
@@ -88,12 +88,11 @@ def check_gyro(rows: Rows) -> list[Finding]:
         return [*unknown, *_gyro_scale_alone(rows, text)]
     found = match(turns, gyro)
     world = match(rotate(rows["quat"], turns), gyro)
-    in_world = not found.is_turned and _left(world) < GOOD and _left(found) > max(
-        BAD, TIMES_BETTER * _left(world))  # fmt: skip
-    if in_world:
+    in_body, in_world = found.misfit(found.as_given), world.misfit(world.as_given)
+    if not found.is_turned and in_world < GOOD and in_body > max(BAD, TIMES_BETTER * in_world):
         text = (
-            f"its turns are off the attitude's by {100 * _left(found):.0f} % in body axes and by "
-            f"{100 * _left(world):.0f} % in world axes"
+            f"its turns are off the attitude's by {100 * in_body:.0f} % in body axes and by "
+            f"{100 * in_world:.0f} % in world axes"
         )
         fix = option(("rate", "from-world"))
         return [Finding("corrected", "gyro", text, "gyro_frame", None, 0.98, fix)]
@@ -126,11 +125,10 @@ def _gyro_scale_alone(rows: Rows, why: str) -> list[Finding]:
     text = f"it reads up to {top:.4g} rad/s, and no gyro of a drone measures that; {why}"
     command = rms(rows["cmd_rate"]) if "cmd_rate" in rows else 0.0
     ratio = rms(rows["rate"]) / command if command > CALM_RATE else 0.0
-    for words, factor in RATES.items():
-        if ratio > 0.0 and abs(np.log(ratio / factor)) < np.log(1.5):
-            text = f"{text}. It is {ratio:.3g} times the commanded rates: {words}"
-            about = ("gyro_scale", factor, 0.95, option(("rate", f"{1.0 / factor:.10g}")))
-            return [Finding("corrected", "gyro", text, *about)]
+    for words in within(RATES, 1.5, ratio) if ratio > 0.0 else ():
+        text = f"{text}. It is {ratio:.3g} times the commanded rates: {words}"
+        fix = option(("rate", f"{1.0 / RATES[words]:.10g}"))
+        return [Finding("corrected", "gyro", text, "gyro_scale", RATES[words], 0.95, fix)]
     fix = f"{option(('rate', f'{DEG:.6g}'))} for deg/s, or {DEG / COUNTS:.6g} for raw counts"
     return [Finding("doubt", "gyro", text, "gyro_scale", None, 0.95, fix)]
 
@@ -206,7 +204,7 @@ def check_velocity(rows: Rows) -> list[Finding]:
     for way in ways:
         value = read_as("vel", rows["vel"], way, lambda: rows["quat"]) if way else rows["vel"]
         matches[way] = match(path, smooth(time_s, value, WIDTH_S))
-    residual = {way: _left(matched) for way, matched in matches.items()}
+    residual = {way: matched.misfit(matched.as_given) for way, matched in matches.items()}
     best = min(residual, key=lambda way: residual[way])
     here = matches[""]
     figures = f"it is off the path's derivative by {100 * residual['']:.0f} %, its scale left out"
@@ -378,13 +376,6 @@ def upwards(acc: np.ndarray) -> tuple[np.ndarray, float]:
     known = acc[np.isfinite(acc).all(axis=1)]
     mean = np.median(known, axis=0) if len(known) else np.array([0.0, 0.0, 1.0])
     return mean, float(mean[2]) / max(float(np.linalg.norm(mean)), 1e-9)
-
-
-def _left(found: Match) -> float:
-    """Return the relative residual of a signal in the axes as given, after its scale is fitted."""
-    weight = found.level**2
-    unexplained = weight * (1.0 - np.clip(found.as_given, 0.0, 1.0) ** 2)
-    return float(np.sqrt(unexplained.sum() / max(weight.sum(), 1e-12)))
 
 
 def _middle(value: np.ndarray) -> float:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eval.logs.faults.drive.motors import FITS, force_without_drag
+from eval.logs.faults.drive.motors import FITS, fit_force
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import WIDTH_S, Rows
 from eval.logs.faults.relation import jackknife_error, shift_rows, smooth
@@ -145,9 +145,10 @@ def _measured(rows: Rows, drive: Drive, vehicle: Vehicle | None) -> np.ndarray |
     """
     if drive.name == "pwm" and "motor" in rows and vehicle is not None:
         return vehicle.rotors.thrust_coefficient * rows["motor"] ** 2
-    total = np.sum(drive.thrust(drive.motors, None), axis=1)
-    force = force_without_drag(rows, total)
-    return None if force is None else force[:, None] * (1.0 if vehicle is None else vehicle.mass)
+    if not ({"quat", "pos"} <= rows.keys() or "acc" in rows):
+        return None
+    force, ratio = fit_force(rows, np.sum(drive.thrust(drive.motors, None), axis=1))
+    return force[:, None] * (1.0 if vehicle is None else vehicle.mass) if ratio > 0.0 else None
 
 
 def _ratio(
@@ -310,7 +311,7 @@ def _averaged(
     """Return the file's thrust, summed and averaged in the same way as the measured thrust.
 
     It is NaN where a command is at a limit. A measured total force is already averaged once by
-    `force_without_drag`, so the file's total is averaged twice as well.
+    `fit_force`, so the file's total is averaged twice as well.
     """
     at_limit = (drive.command < USED[0]) | (drive.command > USED[1])
     if measured.shape[1] > 1:
