@@ -11,9 +11,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from eval.importers.checks.airborne import airborne
-from eval.importers.checks.glitches import clean, without_lost
-from eval.importers.checks.late import OF_POSE, check_delay
+from eval.importers.cleaning import OF_POSE, airborne, check_delay, clean, without_lost
 from eval.importers.commands import order_motors, rates_wanted, thrust_command
 from eval.importers.mapping import KEPT
 from eval.importers.options import ImportOptions

@@ -17,12 +17,10 @@ import numpy as np
 from eval.importers.frames import conjugate, multiply, rotation_vector
 from eval.importers.options import ImportOptions
 from eval.importers.signals import MAD_TO_SD
+from eval.logs.faults.drive.motors import SHIPPED_ORDER
 from eval.logs.faults.finding import Finding
-from eval.vehicles.vehicle import MotorMap, Vehicle, motor_thrust
+from eval.vehicles.vehicle import Vehicle, motor_thrust
 
-SHIPPED_ORDER = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
-"""Motor positions (x forward, y left) in the order of the shipped vehicles: front right, rear
-right, rear left, front left."""
 FULL_THRUST_RANGE = (8.0, 200.0)
 """Possible thrust per mass of a multirotor at full throttle [m/s^2]."""
 
@@ -41,7 +39,10 @@ def order_motors(
         return []
     hubs = SHIPPED_ORDER if vehicle is None else [hub[:2] for hub in vehicle.rotors.position]
     # The best order is the one in which the hubs' directions from the centre agree best.
-    file_hubs, wanted_hubs = _directions(motor_side), _directions(hubs)
+    file_hubs, wanted_hubs = (
+        np.asarray(side) / np.linalg.norm(side, axis=1, keepdims=True)
+        for side in (motor_side, hubs)
+    )
     order = max(permutations(range(4)), key=lambda p: np.sum(file_hubs[list(p)] * wanted_hubs))
     for name in ("motor", "motor_cmd", "pwm"):
         if name in rows:
@@ -49,12 +50,6 @@ def order_motors(
     numbers = ", ".join(str(k + 1) for k in order)
     owner = "the shipped vehicles" if vehicle is None else f"vehicle {vehicle.name!r}"
     return [Finding("note", "motors", f"put in the order of {owner}: the file's {numbers}")]
-
-
-def _directions(hubs: Sequence[Sequence[float]]) -> np.ndarray:
-    """Return unit vectors (4, 2) from the centre to the hubs."""
-    array = np.asarray(hubs, dtype=np.float64)
-    return array / np.linalg.norm(array, axis=1, keepdims=True)
 
 
 def thrust_command(
@@ -68,23 +63,19 @@ def thrust_command(
     if "cmd_thrust" in rows or "throttle" not in rows:
         return []
     throttle = rows["throttle"][:, 0]
-    if options.full_thrust is None and options.vehicle and options.vehicle.motors:
-        return [_by_motors(rows, options.vehicle, options.vehicle.motors)]
+    vehicle = options.vehicle
+    if options.full_thrust is None and vehicle and vehicle.motors:
+        voltage = rows["voltage"][:, 0] if "voltage" in rows else None
+        thrust = 4.0 * motor_thrust(vehicle.motors, rows["throttle"], voltage)[:, 0] / vehicle.mass
+        rows["cmd_thrust"] = thrust[:, None]
+        with_battery = "without a voltage" if voltage is None else "with the battery's voltage"
+        text = f"normalised; by [motors] of vehicle {vehicle.name!r}, {with_battery}"
+        return [Finding("note", "thrust", text)]
     full, findings = _full_thrust(rows, throttle, options, by_acc)
     if full is None:
         return findings
     rows["cmd_thrust"] = full * throttle[:, None]
     return findings
-
-
-def _by_motors(rows: dict[str, np.ndarray], vehicle: Vehicle, motors: MotorMap) -> Finding:
-    """Convert a throttle to thrust by the vehicle's `[motors]`, in place; return the finding."""
-    voltage = rows["voltage"][:, 0] if "voltage" in rows else None
-    thrust = 4.0 * motor_thrust(motors, rows["throttle"], voltage)[:, 0] / vehicle.mass
-    rows["cmd_thrust"] = thrust[:, None]
-    with_battery = "with the battery's voltage" if voltage is not None else "without a voltage"
-    text = f"normalised; by [motors] of vehicle {vehicle.name!r}, {with_battery}"
-    return Finding("note", "thrust", text)
 
 
 def _full_thrust(

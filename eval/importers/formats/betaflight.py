@@ -87,11 +87,11 @@ class Blackbox:
         else:
             self.columns, _, warnings = read_columns(path)
             self.findings += [Finding("note", "file", text) for text in warnings]
-        self._units: dict[str, tuple[str, str]] = {}  # name without unit -> full name, unit
+        self.units: dict[str, tuple[str, str]] = {}  # name without unit -> full name, unit
         for column in self.columns:
             match = _UNIT.match(column)
             if match:
-                self._units[match["name"]] = (column, match["unit"] or "")
+                self.units[match["name"]] = (column, match["unit"] or "")
 
     def settings(self, name: str, default: tuple[float, ...]) -> tuple[float, ...]:
         """Return the numbers of a header setting, or `default` if it has not as many numbers."""
@@ -102,11 +102,7 @@ class Blackbox:
 
     def has(self, *names: str) -> bool:
         """Return whether the file has all these columns."""
-        return all(name in self._units for name in names)
-
-    def unit(self, name: str) -> str:
-        """Return the unit in a column's name, "" where there is none."""
-        return self._units[name][1]
+        return all(name in self.units for name in names)
 
     def values(self, names: list[str], factor: Mapping[str, float]) -> np.ndarray:
         """Return columns (N, C) in the suite's unit.
@@ -119,10 +115,10 @@ class Blackbox:
         """
         out = []
         for name in names:
-            if name not in self._units:
+            if name not in self.units:
                 reason = "missing; was the file made by blackbox_decode?"
                 raise FlightLogError(self.name, name, None, reason)
-            column, unit = self._units[name]
+            column, unit = self.units[name]
             if unit not in factor:
                 known = ", ".join(repr(u) for u in factor if u)
                 reason = f"has the unit {unit!r}; known are {known}"
@@ -158,7 +154,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
         text = "no setpoint columns: stick positions are not rates, so there is no rate command"
         findings.append(Finding("doubt", "command", text))
     if box.has("vbatLatest"):
-        unit = box.unit("vbatLatest")
+        _, unit = box.units["vbatLatest"]
         parts["voltage"] = _volts(box.values(["vbatLatest"], _VOLT), unit, options.fix, findings)
     poles = options.motor_poles
     if poles is None:

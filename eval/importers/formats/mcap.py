@@ -16,8 +16,8 @@ import numpy as np
 
 from eval.importers.mapping_file import map_file, motor_side_of
 from eval.importers.options import ImportOptions
-from eval.importers.rows import in_world
-from eval.importers.signals import Recording, Signal, collect, without_empty
+from eval.importers.rows import turn_axes
+from eval.importers.signals import Recording, Signal, collect
 from eval.logs.columns import FlightLogError, quoted
 from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import Finding
@@ -203,9 +203,8 @@ def _signals(
     take("voltage", "battery", lambda m: [m.voltage])
     signals, findings = collect(parts, name)
     if "vel" in signals:
-        vel_b = signals.pop("vel")
-        signals |= {"vel": in_world(vel_b, signals["quat"])} if "quat" in signals else {}
-    return without_empty(signals), findings
+        turn_axes(signals, "vel", to_world=True)
+    return signals, findings
 
 
 def _xyz(vector: Any) -> list[float]:

@@ -80,9 +80,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
     findings += _motor_count(log.initial_parameters, topics)
     batteries = [d.data for d in log.data_list if d.name == "battery_status" and d.multi_id > 0]
     findings += _other_battery(parts, batteries)
-    findings += _no_position(topics)
-    if "vehicle_local_position" in topics:
-        findings += _resets(topics["vehicle_local_position"])
+    findings += _check_position(topics.get("vehicle_local_position", {}))
     signals, more_findings = collect(parts, str(path))
     info = log.msg_info_dict
     about = {key: str(info[key]) for key in ("sys_name", "ver_hw", "ver_sw") if key in info}
@@ -270,12 +268,17 @@ def _other_battery(parts: dict[str, Part], others: Sequence[Topic]) -> list[Find
     return []
 
 
-def _no_position(topics: Mapping[str, Topic]) -> list[Finding]:
-    """Return a note where the estimator's flags mark the local position as never valid."""
-    topic = topics.get("vehicle_local_position", {})
-    invalid = [f for f in ("xy_valid", "z_valid") if f in topic and not np.any(topic[f])]
-    text = f"{' and '.join(invalid)} of vehicle_local_position are false throughout"
-    return [Finding("note", "position", text)] if invalid else []
+def _check_position(topic: Topic) -> list[Finding]:
+    """Return findings where the local position is never valid, or was reset by the estimator."""
+    findings = []
+    if invalid := [f for f in ("xy_valid", "z_valid") if f in topic and not np.any(topic[f])]:
+        text = f"{' and '.join(invalid)} of vehicle_local_position are false throughout"
+        findings.append(Finding("note", "position", text))
+    counters = [topic[f] for f in ("xy_reset_counter", "z_reset_counter") if f in topic]
+    if jumps := sum(int(np.count_nonzero(np.diff(np.asarray(counter)))) for counter in counters):
+        text = f"the estimator moved the position {jumps} times in the log; it jumps there"
+        findings.append(Finding("doubt", "position", text))
+    return findings
 
 
 def _parameter(parameters: Mapping[str, Any], name: str) -> float:
@@ -314,13 +317,3 @@ def _check_file(log: Any) -> list[Finding]:
         )
         findings.append(Finding("note", "thrust", text))
     return findings
-
-
-def _resets(topic: Topic) -> list[Finding]:
-    """Return a doubt where the estimator has reset the position."""
-    jumps = 0
-    for name in ("xy_reset_counter", "z_reset_counter"):
-        if name in topic:
-            jumps += int(np.count_nonzero(np.diff(np.asarray(topic[name]))))
-    text = f"the estimator moved the position {jumps} times in the log; it jumps there"
-    return [Finding("doubt", "position", text)] if jumps else []

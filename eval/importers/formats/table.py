@@ -47,16 +47,11 @@ def read(path: Path, options: ImportOptions) -> Recording:
         FlightLogError: for a file that is no table, or lacks a column of the mapping.
         ValueError: for a mapping file that cannot be used.
     """
-    return read_table(path, options.map, options)
-
-
-def read_table(path: Path, map_path: Path | None, options: ImportOptions) -> Recording:
-    """Return the signals of the table at `path`, by the mapping at `map_path`; see `read`."""
-    file_map = None if map_path is None else read_map(map_path)
+    file_map = None if options.map is None else read_map(options.map)
     columns, text, warnings = read_columns(path)
     mapping = file_map or own_map(columns)
     name, about = str(path), {}
-    if map_path is None:  # a flight log has metadata
+    if file_map is None:  # a flight log has metadata
         about, more_warnings = flight_metadata(text, name)
         warnings += more_warnings
     flag = "--pose-map" if path == options.pose else "--map"

@@ -9,14 +9,15 @@ Second, the attitude rotates at the gyro's rates, in any axes and unit of the gy
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.frames import conjugate, multiply, rotate, rotation_vector
+from eval.importers.frames import rates_between, rotate
 from eval.logs.faults.finding import Finding, unseen
-from eval.logs.faults.reading import ORDERS, axes_matrix, option, read_as
+from eval.logs.faults.reading import ANGLES, ORDERS, axes_matrix, option, read_as
 from eval.logs.faults.relation import Match, match, rms, rms_of_squares, smooth
 from eval.logs.velocity import velocity_from_position
 
@@ -37,10 +38,9 @@ EACH = 0.06
 """Penalty on the misfit for each step of a reading, so that the simplest good one is chosen."""
 DRAG, BIAS = 1.2, 1.0
 """Largest drag [1/s] and constant side force [m/s^2] that are removed from a measured force."""
-# Steps of a reading of the attitude (see `reading`), "" for none: direction, frames, signs.
+# Steps of a reading of the attitude (see `reading`), "" for none: direction, frames.
 _SENSES = ("", "inverse")
 _FRAMES = ("", "ned", "frd", "ned+frd")
-_ANGLES = ("-roll", "-pitch", "-yaw")
 SHOWN = (
     *("attitude", "attitude_sign", "quaternion_order", "quaternion_direction", "world_frame"),
     *("body_frame", "position_axes", "position_unit"),
@@ -105,10 +105,9 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
     seen_as: dict[tuple[str, bool], Match] = {}
     gyro = smooth(time_s, rows["rate"], WIDTH_S)[::every] if "rate" in rows else None
     path = _path(time_s, rows["pos"], every) if "pos" in rows else None
+    rate = 0.0 if gyro is None else rms(gyro)
     found, level = [], 0.0
     for steps in _attitudes():
-        if len(found) == 1 and _is_right(found[0]):
-            break
         base = "+".join(step for step in steps.split("+") if step not in ("ned", "frd"))
         frames = {"ned", "frd"} & set(steps.split("+"))
         read, frd = read_as("quat", quat, steps) if steps else quat, "frd" in frames
@@ -125,39 +124,34 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
             forces = _force_misfits(_axes_of(time_s, read, every), path)
         # A wrong frame is one mistake, of the attitude alone or of attitude and gyro.
         count = sum(step not in ("", "ned", "frd") for step in steps.split("+")) + bool(frames)
-        apart = 0 if seen is None else int(seen.axes != "x,y,z")
-        apart = 0 if "frd" in frames and seen is not None and seen.axes == "x,-y,-z" else apart
-        for pos in POSITIONS if path is not None else POSITIONS[:1]:
-            for length in LENGTHS if path is not None else (1.0,):
-                if len(found) == 1 and _is_right(found[0]):
-                    break
-                if (steps and pos in SWAPS) or (length > 1.0 and (steps or pos)):
-                    continue
-                force, size = forces.get((pos, length), (None, 0.0))
-                level = max(level, size) if not steps and not pos and length == 1.0 else level
-                taken = count + apart + (pos != "") + (length != 1.0)
-                if frames == {"ned", "frd"} and pos == "x,-y,-z":
-                    taken -= 1  # one mistake: the whole log is north-east-down
-                parts = [part for part in (force, turns) if part is not None]
-                misfit = float(np.sqrt(np.mean(np.square(parts)))) if parts else 0.0
-                found.append(Reading(steps, pos, length, taken, misfit, force, turns, seen))
+        axes = "x,y,z" if seen is None else seen.axes
+        taken = count + (axes != "x,y,z" and not ("frd" in frames and axes == "x,-y,-z"))
+        for pos, length in product(POSITIONS, LENGTHS) if path is not None else [("", 1.0)]:
+            if (steps and pos in SWAPS) or (length > 1.0 and (steps or pos)):
+                continue
+            force, size = forces.get((pos, length), (None, 0.0))
+            # The whole log is north-east-down: one mistake.
+            whole = frames == {"ned", "frd"} and pos == "x,-y,-z"
+            changes = taken + (pos != "") + (length != 1.0) - whole
+            parts = [part for part in (force, turns) if part is not None]
+            misfit = float(np.sqrt(np.mean(np.square(parts)))) if parts else 0.0
+            one = Reading(steps, pos, length, changes, misfit, force, turns, seen)
+            if not found:
+                level, is_turned = size, seen is not None and seen.is_turned
+                if force is not None and misfit < RIGHT and not is_turned:  # no other need be tried
+                    return PoseFits(one, one, np.inf, (), level, rate)
+            found.append(one)
     best = min(found, key=lambda one: one.misfit + EACH * one.steps)
     others = [one for one in found if one is not best and one.steps <= best.steps + 1]
     second = min((o.misfit + EACH * (o.steps - best.steps) for o in others), default=np.inf)
     alike = (one for one in others if one.misfit < best.misfit + 0.5 * EACH)
     rivals = tuple(one for one in alike if one is not found[0])
-    rate = 0.0 if gyro is None else rms(gyro)
     return PoseFits(found[0], best, second, rivals, level, rate)
 
 
-def _is_right(one: Reading) -> bool:
-    """Return whether the given reading fits, so that no other need be tried."""
-    turned = one.gyro is not None and one.gyro.is_turned
-    return one.force is not None and one.misfit < RIGHT and not turned
-
-
-def check_pose(rows: Rows, fits: PoseFits | None) -> list[Finding]:
+def check_pose(rows: Rows) -> list[Finding]:
     """Return the findings on attitude and position."""
+    fits = fit_pose_readings(rows)
     if fits is None:
         return unseen("attitude", "the log has no attitude", *SHOWN) if "pos" in rows else []
     given, best = fits.given, fits.best
@@ -175,7 +169,7 @@ def check_pose(rows: Rows, fits: PoseFits | None) -> list[Finding]:
         if given.misfit < BAD or (given.gyro is not None and given.gyro.is_turned):
             noisy = given.misfit > GOOD
             found = Finding("note" if noisy else "ok", "attitude", figures)
-            return [found, *_same_fit([r for r in fits.rivals if r.quat in _ANGLES])]
+            return [found, *_same_fit([r for r in fits.rivals if r.quat in ANGLES])]
         text = f"{figures}: no other order, direction, sign or frame of it fits"
         sure = 0.9 if given.misfit > 1.0 else 0.6
         return [Finding("doubt", "attitude", text, "attitude", given.misfit, sure, "see --pose")]
@@ -271,7 +265,7 @@ def _attitudes() -> Iterator[str]:
     for base in ("+".join(s for s in (o, i) if s) for o in ("", *ORDERS) for i in _SENSES):
         for frames in _FRAMES:
             yield "+".join(s for s in (base, frames) if s)
-    yield from _ANGLES
+    yield from ANGLES
 
 
 def _unit(quat: np.ndarray) -> np.ndarray:
@@ -284,10 +278,9 @@ def turns_of(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
     count = max(1, round(0.5 * SPAN_S / float(np.median(np.diff(time_s)))))
     rates = np.full((len(time_s), 3), np.nan)
     if len(time_s) > 2 * count:
-        step = (time_s[2 * count :] - time_s[: -2 * count])[:, None]
-        relative = multiply(conjugate(quat[: -2 * count]), quat[2 * count :])
-        no_row_missing = step < 1.5 * (2 * count) * float(np.median(np.diff(time_s)))
-        rates[count:-count] = np.where(no_row_missing, rotation_vector(relative) / step, np.nan)
+        span_s, turns = rates_between(time_s, quat, 2 * count)
+        no_row_missing = span_s < 1.5 * (2 * count) * float(np.median(np.diff(time_s)))
+        rates[count:-count] = np.where(no_row_missing[:, None], turns, np.nan)
     return rates
 
 

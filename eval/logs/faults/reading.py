@@ -26,12 +26,13 @@ forward-left-up axes."""
 # How the texts of steps look: axes such as `x,-y,-z`, and an order of motors such as `2,1,4,3`.
 _AXES = re.compile(r"^-?[xyz],-?[xyz],-?[xyz]$")
 _ORDER = re.compile(r"^[1-4](,[1-4]){3}$")
-_ANGLES = ("-roll", "-pitch", "-yaw")
+ANGLES = ("-roll", "-pitch", "-yaw")
+"""Steps that change the sign of an angle."""
 ORDERS = ("xyzw", "wxyz", "ned-xyzw", "ned-wxyz")
 """Steps that change the order of a quaternion's columns."""
 BY_ATTITUDE = ("from-body", "from-world", "plus-gravity")
 """Steps that need an attitude."""
-_QUAT_STEPS = (*ORDERS, "inverse", "ned", "frd", *_ANGLES)
+_QUAT_STEPS = (*ORDERS, "inverse", "ned", "frd", *ANGLES)
 Readings = tuple[tuple[str, str], ...]
 """(signal, steps) in the order of application."""
 
@@ -167,5 +168,5 @@ def _quat_as(value: np.ndarray, step: str) -> np.ndarray:
     known = np.isfinite(value).all(axis=1) & (np.linalg.norm(value, axis=1) > 0.0)
     angles = np.zeros((len(value), 3))
     angles[known] = Rotation.from_quat(value[known], scalar_first=True).as_euler("ZYX")[:, ::-1]
-    angles[:, _ANGLES.index(step)] *= -1.0
+    angles[:, ANGLES.index(step)] *= -1.0
     return np.where(known[:, None], from_euler(angles), np.nan)

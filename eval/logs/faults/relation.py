@@ -74,8 +74,15 @@ class Match(NamedTuple):
 
 
 def match(wanted: np.ndarray, given: np.ndarray) -> Match:
-    """Return the relation of `given` (N, 3) to `wanted` (N, 3); rows with a NaN are not used."""
-    wanted, given = _clear(wanted, given)
+    """Return the relation of `given` (N, 3) to `wanted` (N, 3).
+
+    Rows with a NaN or an outlier are not used.
+    """
+    good = np.isfinite(wanted).all(axis=1) & np.isfinite(given).all(axis=1)
+    for size in (np.linalg.norm(value, axis=1) for value in (wanted, given)):
+        if good.any():
+            good = good & (size <= 8.0 * np.quantile(size[good], 0.9) + 1e-12)
+    wanted, given = wanted[good], given[good]
     if len(wanted) < LEAST:
         wanted = given = np.zeros((LEAST, 3))
     # Correlation of every axis with every other, and the order of axes with the largest ones.
@@ -184,14 +191,3 @@ def jackknife_error(left_out: np.ndarray) -> float:
     """Return the jackknife's standard error from estimates (B,), each without one of B blocks."""
     count = len(left_out)
     return float(np.sqrt((count - 1) / count * np.sum((left_out - left_out.mean()) ** 2)))
-
-
-def _clear(wanted: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return both measurements in the rows in which both are finite and neither is an outlier."""
-    good = np.isfinite(wanted).all(axis=1) & np.isfinite(given).all(axis=1)
-    for value in (wanted, given):
-        size = np.linalg.norm(value, axis=1)
-        known = size[good]
-        if len(known):
-            good = good & (size <= 8.0 * np.quantile(known, 0.9) + 1e-12)
-    return wanted[good], given[good]

@@ -62,8 +62,8 @@ POLES = {
     if 0.5 <= mine / true <= 2.0 and mine != true
 }
 """Wrong number of poles -> factor by which speeds from electrical rpm (eRPM) are then too large."""
-X_SHAPE = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
-"""Positions (x, y) without a vehicle file, in the order of the shipped vehicles: front right, rear
+SHIPPED_ORDER = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
+"""Motor positions (x forward, y left) in the order of the shipped vehicles: front right, rear
 right, rear left, front left."""
 X_SPIN = (1, -1, 1, -1)
 """Directions of rotation in the same order."""
@@ -145,7 +145,7 @@ def _torques(
     The torque by the gyro is the change of the angular momentum. Without a vehicle file the inertia
     is set to 1. If the flight is too short or too calm, the result is the reason in words.
     """
-    hubs = np.array(X_SHAPE if vehicle is None else [h[:2] for h in vehicle.rotors.position])
+    hubs = np.array(SHIPPED_ORDER if vehicle is None else [h[:2] for h in vehicle.rotors.position])
     spin = np.array(X_SPIN if vehicle is None else vehicle.rotors.spin, dtype=float)
     mixer = np.stack([hubs[:, 1], -hubs[:, 0], -spin * np.abs(hubs).max()], axis=0)
     time_s, rate = rows["time"], rows["rate"]
