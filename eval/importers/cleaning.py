@@ -167,11 +167,12 @@ def _without_interpolated(quat: Signal) -> tuple[Signal, list[Finding]]:
 
 def _without_jumps(pos: Signal) -> tuple[Signal, list[Finding]]:
     """Remove positions further from the running median than the largest acceleration allows."""
+    from scipy.ndimage import median_filter
+
     half = MEDIAN_SAMPLES // 2
-    padded = np.concatenate([pos.value[:1]] * half + [pos.value] + [pos.value[-1:]] * half)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, MEDIAN_SAMPLES, axis=0)
     reach_s = half * median_step(pos.time_s)
-    jump_m = np.abs(pos.value - np.median(windows, axis=-1)).max(axis=1)
+    usual = median_filter(pos.value, (MEDIAN_SAMPLES, 1), mode="nearest")
+    jump_m = np.abs(pos.value - usual).max(axis=1)
     bad = jump_m > POS_LEAST + 0.5 * ACC_MAX * reach_s**2
     bad[:half] = bad[len(bad) - half :] = False  # the padded median is no reference at the ends
     if not bad.any():

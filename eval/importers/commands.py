@@ -71,25 +71,24 @@ def thrust_command(
         with_battery = "without a voltage" if voltage is None else "with the battery's voltage"
         text = f"normalised; by [motors] of vehicle {vehicle.name!r}, {with_battery}"
         return [Finding("note", "thrust", text)]
-    full, findings = _full_thrust(rows, throttle, options, by_acc)
-    if full is None:
-        return findings
-    rows["cmd_thrust"] = full * throttle[:, None]
-    return findings
+    full, finding = _full_thrust(rows, throttle, options, by_acc)
+    if full is not None:
+        rows["cmd_thrust"] = full * throttle[:, None]
+    return [finding]
 
 
 def _full_thrust(
     rows: dict[str, np.ndarray], throttle: np.ndarray, options: ImportOptions, by_acc: bool
-) -> tuple[float | None, list[Finding]]:
-    """Return thrust per mass at full throttle [m/s^2] (None if unknown), and findings."""
+) -> tuple[float | None, Finding]:
+    """Return thrust per mass at full throttle [m/s^2] (None if unknown), and the finding."""
     linear = "taking thrust as proportional to throttle"
     if options.full_thrust is not None:
         text = f"normalised; full throttle is {options.full_thrust:g} m/s^2 as given, {linear}"
-        return options.full_thrust, [Finding("note", "thrust", text)]
+        return options.full_thrust, Finding("note", "thrust", text)
     if options.vehicle is not None:
         full = options.vehicle.full_thrust
         text = f"normalised; full throttle is {full:.4g} m/s^2 by the vehicle file, {linear}"
-        return full, [Finding("note", "thrust", text)]
+        return full, Finding("note", "thrust", text)
     if "acc" in rows and by_acc:
         full, residual = _fit_full_thrust(throttle, rows["acc"][:, 2])
         low, high = FULL_THRUST_RANGE
@@ -99,20 +98,20 @@ def _full_thrust(
                 f"{residual:.2g} m/s^2), {linear}. A wrong thrust scale is not identifiable from "
                 "this log; with --vehicle it is"
             )
-            return full, [Finding("note", "thrust", text)]
+            return full, Finding("note", "thrust", text)
         if np.isfinite(full):
             text = (
                 f"normalised; full throttle would be {full:.3g} m/s^2 by the accelerometer, and "
                 f"{low:g} to {high:g} is possible: left out; give --vehicle FILE or "
                 "--full-thrust M/S^2"
             )
-            return None, [Finding("doubt", "thrust", text, "thrust_scale", full, 0.95,
-                                  "--full-thrust M/S^2")]  # fmt: skip
+            about = ("thrust_scale", full, 0.95, "--full-thrust M/S^2")
+            return None, Finding("doubt", "thrust", text, *about)
     text = (
         "normalised, and the thrust at full throttle is unknown: left out; "
         "give --vehicle FILE or --full-thrust M/S^2"
     )
-    return None, [Finding("doubt", "thrust", text)]
+    return None, Finding("doubt", "thrust", text)
 
 
 def _fit_full_thrust(throttle: np.ndarray, acc_z: np.ndarray) -> tuple[float, float]:

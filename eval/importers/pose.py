@@ -27,8 +27,6 @@ from tracks.geometry.rotation import rot_to_quat
 
 FIRST_REACH_S = 15.0
 """The fit first uses only the samples within this time of the middle of the flight [s]."""
-COARSE_HZ = 100.0
-"""Largest row rate for the checks of the path."""
 GRID_S = 0.005
 """Step of the cross-correlation [s]."""
 SPAN_S = 0.025
@@ -152,8 +150,8 @@ def _join(recording: Recording, pose: Recording, quat: Signal, alignment: Alignm
 
 def _has_wrong_sign(recording: Recording) -> bool:
     """Return whether the path shows that one angle of the attitude has the wrong sign."""
-    times = row_times(recording, COARSE_HZ, 0.0, None)
-    fits = fit_pose_readings({k: v for k, v in rows_at(recording, times).items() if k != "rate"})
+    rows = rows_at(recording, row_times(recording))
+    fits = fit_pose_readings({k: v for k, v in rows.items() if k != "rate"})
     if fits is None or fits.given.force is None or fits.best.force is None:
         return False
     better = fits.best.force < GOOD and fits.given.force > TIMES_BETTER * fits.best.force
@@ -169,9 +167,9 @@ def _in_seconds(pose: Recording) -> tuple[Recording, list[Finding]]:
     unit = min(units, key=lambda name: abs(np.log(step * TIMES[name] / USUAL_STEP_S)))
     if unit == "s":
         return pose, []
-    scaled = {n: Signal(s.time_s * TIMES[unit], s.value) for n, s in pose.signals.items()}
     text = f"rows are {step:.4g} apart, so time is in {unit}"
-    return replace(pose, signals=scaled), [Finding("corrected", "pose time", text, "time_unit")]
+    finding = Finding("corrected", "pose time", text, "time_unit")
+    return with_readings(pose, (("time", unit),)), [finding]
 
 
 def _align_pose(

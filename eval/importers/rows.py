@@ -20,6 +20,8 @@ from eval.logs.files import MOST_ROWS
 
 LEAST_HZ = 20.0
 """Least row rate; for slower signals rows are added between the samples."""
+COARSE_HZ = 100.0
+"""Largest row rate for the checks of the pose [Hz]."""
 SMOOTH = ("pos", "quat", "vel")
 """Signals that are interpolated by a cubic spline; the others linearly."""
 SPARSE = ("pos", "quat", "vel", "rate", "acc")
@@ -79,9 +81,9 @@ def slowest(recording: Recording) -> str:
 
 def row_times(
     recording: Recording,
-    rate_hz: float,
-    start_s: float,
-    end_s: float | None,
+    rate_hz: float = COARSE_HZ,
+    start_s: float = 0.0,
+    end_s: float | None = None,
     within: tuple[float, float] = (-np.inf, np.inf),
     origin_s: float | None = None,
 ) -> np.ndarray:

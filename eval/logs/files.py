@@ -247,7 +247,8 @@ def _lines_before(lines: list[list[str]]) -> int:
     for k in range(1, len(lines) - 2):
         width = len(lines[k])
         alike = width == len(lines[k + 1]) == len(lines[k + 2]) and width > len(lines[0])
-        if alike and not any(map(_is_number, lines[k])) and _numbers(lines[k + 1]) > 0.5:
+        numeric = sum(not cell.strip() or _is_number(cell) for cell in lines[k + 1])
+        if alike and not any(map(_is_number, lines[k])) and numeric > 0.5 * width:
             return k
     return 0
 
@@ -258,11 +259,6 @@ def _is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _numbers(row: list[str]) -> float:
-    """Return the share of numeric or empty cells of a row."""
-    return sum(not cell.strip() or _is_number(cell) for cell in row) / max(len(row), 1)
 
 
 def _arrays(table: pa.Table, path: Path) -> dict[str, np.ndarray]:

@@ -20,22 +20,20 @@ from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording
 from eval.logs.columns import FlightLogError, as_numbers
 from eval.logs.faults.finding import Finding
-from eval.logs.files import first_line, read_columns
+from eval.logs.files import PARQUET_MAGIC, first_line, read_columns
 from eval.logs.flight_log import flight_metadata
 from tracks.common.names import closest
 
 SUMMARY = "CSV or Parquet, described by a mapping file (--map)"
 ASKED_LAST = True
 """Other formats are tried before this one, which accepts any table."""
-PARQUET = b"PAR1"
-"""First bytes of a Parquet file."""
 _LIST_ENTRY = re.compile(r"^(.*)\[(\d)\]$")
 """Name of one number of a list column, such as `pos[0]`."""
 
 
 def detect(head: bytes, options: ImportOptions) -> bool:
     """Return whether a file with these first bytes is Parquet, or text that may be a table."""
-    if head.startswith(PARQUET):
+    if head.startswith(PARQUET_MAGIC):
         return True
     return b"\0" not in head and (options.map is not None or b"," in first_line(head))
 

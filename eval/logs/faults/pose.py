@@ -176,58 +176,42 @@ def check_pose(rows: Rows) -> list[Finding]:
     better = given.misfit / max(best.misfit, 1e-3)
     clear = fits.second - best.misfit
     sure = best.misfit < GOOD and better > TIMES_BETTER and clear > 0.5 * EACH
-    readings = _readings(best, rows)
     text = f"{figures}; {_figures(best)} if {_words(best)}"
     if given.misfit < BAD and not sure:
         return [Finding("ok", "attitude", figures)]
     confidence = 0.99 if sure and clear > 2.0 * EACH else 0.95 if better > TIMES_BETTER else 0.7
-    names = list(_names(best))
+    status, changes = "corrected" if sure else "doubt", list(_changes(best))
     found = [
-        Finding("corrected" if sure else "doubt", signal, text, name, None, confidence,
-                option(*(r for r in readings if r[0] in of)))
-        for name, signal, of in names
-        if any(r[0] in of for r in readings)
+        Finding(status, signal, text, fault, None, confidence,
+                option(*(r for r in readings if r[0] in rows)))
+        for fault, signal, readings in changes
     ]  # fmt: skip
     more = _same_fit([one for one in fits.rivals if one.steps <= best.steps])
-    return found + [one for one in more if one.fault not in {name for name, *_ in names}]
+    return found + [one for one in more if one.fault not in {fault for fault, *_ in changes}]
 
 
 def _same_fit(rivals: Sequence[Reading]) -> list[Finding]:
     """Return "not identifiable" findings for the faults of readings that fit as well."""
-    words = {name: _words(one) for one in rivals for name, *_ in _names(one)}
+    words = {fault: _words(one) for one in rivals for fault, *_ in _changes(one)}
     text = "it fits as well if {}"
-    return [one for name, w in words.items() for one in unseen("attitude", text.format(w), name)]
+    return [one for fault, w in words.items() for one in unseen("attitude", text.format(w), fault)]
 
 
-def _names(best: Reading) -> Iterator[tuple[str, str, tuple[str, ...]]]:
-    """Yield (fault, subject, signals to correct) for each change of a reading."""
-    steps = set(best.quat.split("+")) - {""}
-    pose, world = ("quat", "cmd_quat"), ("pos", "vel")
-    if steps:
-        name = "attitude_sign"
+def _changes(best: Reading) -> Iterator[tuple[str, str, list[tuple[str, str]]]]:
+    """Yield (fault, subject, readings that correct it) for each change of a reading."""
+    if best.quat:
+        steps, fault = set(best.quat.split("+")), "attitude_sign"
         if {"ned", "frd"} & steps:
-            name = "body_frame" if "frd" in steps and "ned" not in steps else "world_frame"
-        name = "quaternion_direction" if "inverse" in steps else name
-        name = "quaternion_order" if steps & set(ORDERS) else name
-        yield name, "attitude", pose
+            fault = "body_frame" if "ned" not in steps else "world_frame"
+        fault = "quaternion_direction" if "inverse" in steps else fault
+        fault = "quaternion_order" if steps & set(ORDERS) else fault
+        yield fault, "attitude", [(name, best.quat) for name in ("quat", "cmd_quat")]
+    axes = [best.pos] if best.pos else []
     if best.length != 1.0:
-        yield "position_unit", "position", world
+        yield "position_unit", "position", [("pos", "+".join([*axes, f"{best.length:g}"]))]
     elif best.pos:
-        yield (
-            "world_frame" if best.pos in ("x,-y,-z", "y,x,-z") else "position_axes",
-            "position",
-            world,
-        )
-
-
-def _readings(best: Reading, rows: Rows) -> list[tuple[str, str]]:
-    """Return (signal, steps) of a reading, for options of `suite import`."""
-    found = [(name, best.quat) for name in ("quat", "cmd_quat") if best.quat and name in rows]
-    steps = [best.pos] if best.pos else []
-    steps += [f"{best.length:g}"] if best.length != 1.0 else []
-    if steps:
-        found.append(("pos", "+".join(steps)))
-    return found
+        fault = "world_frame" if best.pos in ("x,-y,-z", "y,x,-z") else "position_axes"
+        yield fault, "position", [("pos", best.pos)]
 
 
 def _words(best: Reading) -> str:

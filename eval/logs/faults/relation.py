@@ -107,11 +107,7 @@ def match(wanted: np.ndarray, given: np.ndarray) -> Match:
         and score[p] > score[order] - CLEAR
         and all(abs(corr[k, p[k]]) > ALIKE for k in range(3) if p[k] != order[k])
     ]
-    rival = (
-        ",".join("xyz"[k] for k in max(alternatives, key=lambda p: score[p]))
-        if alternatives
-        else ""
-    )
+    rival = ",".join("xyz"[k] for k in max(alternatives, key=lambda p: score[p], default=()))
     ratio = other[list(order)] / np.maximum(level, 1e-12)
     r = np.clip(np.abs(best), 1e-3, 1.0)
     alike = best * sign
