@@ -11,9 +11,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from eval.importers.checks.airborne import airborne
-from eval.importers.checks.glitches import clean, without_lost
-from eval.importers.checks.late import OF_POSE, check_delay
+from eval.importers.cleaning import OF_POSE, airborne, check_delay, clean, without_lost
 from eval.importers.commands import order_motors, rates_wanted, thrust_command
 from eval.importers.mapping import KEPT
 from eval.importers.options import ImportOptions
@@ -23,13 +21,11 @@ from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
 from eval.logs.faults.check import DRIVE, POSE, CheckContext, run_checks
 from eval.logs.faults.clock import check_time
 from eval.logs.faults.finding import Finding, finding_lines
-from eval.logs.faults.jumps import check_jumps
+from eval.logs.faults.position import check_jumps
 from eval.logs.faults.reading import BY_ATTITUDE, MOTORS, read_rows
 from eval.logs.faults.vehicle import check_vehicle_name
 from eval.logs.flight_log import FlightLog, log_from_columns
 
-COARSE_HZ = 100.0
-"""Largest row rate for the checks of the pose [Hz]."""
 SLOW_HZ = 40.0
 """A signal below this rate gets a note [Hz]."""
 END_S = 0.5
@@ -116,8 +112,8 @@ def assemble(
         recording, more_findings = without_lost(recording)
         findings += more_findings
     # Checks of the frames of position, attitude and gyro.
-    coarse = row_times(recording, COARSE_HZ, 0.0, None)
-    more_findings, readings, _ = run_checks(rows_at(recording, coarse), POSE, context, options.fix)
+    coarse = rows_at(recording, row_times(recording))
+    more_findings, readings, _ = run_checks(coarse, POSE, context, options.fix)
     findings += more_findings
     if options.fix:
         recording = with_readings(recording, readings)
@@ -159,7 +155,9 @@ def assemble(
     for name, is_sample in sampled_rows(recording, time_s).items():
         rows[name] = np.where(is_sample[:, None], rows[name], np.nan)
     columns = _columns(rows)
-    missing = _missing_groups(rows)
+    missing = [name for name in NEEDED if name not in rows]
+    if not any(all(group in rows for group in groups) for groups in COMMANDS):
+        missing.append("command")
     if missing == ["command"] and not options.partial:
         lines = "".join(f"\n{line}" for line in finding_lines(tuple(findings)))
         reason = (
@@ -272,13 +270,6 @@ def _drop_half_commands(rows: dict[str, np.ndarray], partial: bool) -> list[Find
         del rows[name]
     text = f"{' and '.join(dropped)} left out, as the other half of the command is missing"
     return [Finding("note", "command", text)] if dropped else []
-
-
-def _missing_groups(rows: dict[str, np.ndarray]) -> list[str]:
-    """Return the required groups that `rows` lack; `command` means any of `COMMANDS`."""
-    missing = [name for name in NEEDED if name not in rows]
-    has_command = any(all(group in rows for group in groups) for groups in COMMANDS)
-    return missing if has_command else [*missing, "command"]
 
 
 def _columns(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -17,12 +17,10 @@ import numpy as np
 from eval.importers.frames import conjugate, multiply, rotation_vector
 from eval.importers.options import ImportOptions
 from eval.importers.signals import MAD_TO_SD
+from eval.logs.faults.drive.motors import SHIPPED_ORDER
 from eval.logs.faults.finding import Finding
-from eval.vehicles.vehicle import MotorMap, Vehicle, motor_thrust
+from eval.vehicles.vehicle import Vehicle, motor_thrust
 
-SHIPPED_ORDER = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
-"""Motor positions (x forward, y left) in the order of the shipped vehicles: front right, rear
-right, rear left, front left."""
 FULL_THRUST_RANGE = (8.0, 200.0)
 """Possible thrust per mass of a multirotor at full throttle [m/s^2]."""
 
@@ -41,7 +39,10 @@ def order_motors(
         return []
     hubs = SHIPPED_ORDER if vehicle is None else [hub[:2] for hub in vehicle.rotors.position]
     # The best order is the one in which the hubs' directions from the centre agree best.
-    file_hubs, wanted_hubs = _directions(motor_side), _directions(hubs)
+    file_hubs, wanted_hubs = (
+        np.asarray(side) / np.linalg.norm(side, axis=1, keepdims=True)
+        for side in (motor_side, hubs)
+    )
     order = max(permutations(range(4)), key=lambda p: np.sum(file_hubs[list(p)] * wanted_hubs))
     for name in ("motor", "motor_cmd", "pwm"):
         if name in rows:
@@ -49,12 +50,6 @@ def order_motors(
     numbers = ", ".join(str(k + 1) for k in order)
     owner = "the shipped vehicles" if vehicle is None else f"vehicle {vehicle.name!r}"
     return [Finding("note", "motors", f"put in the order of {owner}: the file's {numbers}")]
-
-
-def _directions(hubs: Sequence[Sequence[float]]) -> np.ndarray:
-    """Return unit vectors (4, 2) from the centre to the hubs."""
-    array = np.asarray(hubs, dtype=np.float64)
-    return array / np.linalg.norm(array, axis=1, keepdims=True)
 
 
 def thrust_command(
@@ -68,37 +63,32 @@ def thrust_command(
     if "cmd_thrust" in rows or "throttle" not in rows:
         return []
     throttle = rows["throttle"][:, 0]
-    if options.full_thrust is None and options.vehicle and options.vehicle.motors:
-        return [_by_motors(rows, options.vehicle, options.vehicle.motors)]
-    full, findings = _full_thrust(rows, throttle, options, by_acc)
-    if full is None:
-        return findings
-    rows["cmd_thrust"] = full * throttle[:, None]
-    return findings
-
-
-def _by_motors(rows: dict[str, np.ndarray], vehicle: Vehicle, motors: MotorMap) -> Finding:
-    """Convert a throttle to thrust by the vehicle's `[motors]`, in place; return the finding."""
-    voltage = rows["voltage"][:, 0] if "voltage" in rows else None
-    thrust = 4.0 * motor_thrust(motors, rows["throttle"], voltage)[:, 0] / vehicle.mass
-    rows["cmd_thrust"] = thrust[:, None]
-    with_battery = "with the battery's voltage" if voltage is not None else "without a voltage"
-    text = f"normalised; by [motors] of vehicle {vehicle.name!r}, {with_battery}"
-    return Finding("note", "thrust", text)
+    vehicle = options.vehicle
+    if options.full_thrust is None and vehicle and vehicle.motors:
+        voltage = rows["voltage"][:, 0] if "voltage" in rows else None
+        thrust = 4.0 * motor_thrust(vehicle.motors, rows["throttle"], voltage)[:, 0] / vehicle.mass
+        rows["cmd_thrust"] = thrust[:, None]
+        with_battery = "without a voltage" if voltage is None else "with the battery's voltage"
+        text = f"normalised; by [motors] of vehicle {vehicle.name!r}, {with_battery}"
+        return [Finding("note", "thrust", text)]
+    full, finding = _full_thrust(rows, throttle, options, by_acc)
+    if full is not None:
+        rows["cmd_thrust"] = full * throttle[:, None]
+    return [finding]
 
 
 def _full_thrust(
     rows: dict[str, np.ndarray], throttle: np.ndarray, options: ImportOptions, by_acc: bool
-) -> tuple[float | None, list[Finding]]:
-    """Return thrust per mass at full throttle [m/s^2] (None if unknown), and findings."""
+) -> tuple[float | None, Finding]:
+    """Return thrust per mass at full throttle [m/s^2] (None if unknown), and the finding."""
     linear = "taking thrust as proportional to throttle"
     if options.full_thrust is not None:
         text = f"normalised; full throttle is {options.full_thrust:g} m/s^2 as given, {linear}"
-        return options.full_thrust, [Finding("note", "thrust", text)]
+        return options.full_thrust, Finding("note", "thrust", text)
     if options.vehicle is not None:
         full = options.vehicle.full_thrust
         text = f"normalised; full throttle is {full:.4g} m/s^2 by the vehicle file, {linear}"
-        return full, [Finding("note", "thrust", text)]
+        return full, Finding("note", "thrust", text)
     if "acc" in rows and by_acc:
         full, residual = _fit_full_thrust(throttle, rows["acc"][:, 2])
         low, high = FULL_THRUST_RANGE
@@ -108,20 +98,20 @@ def _full_thrust(
                 f"{residual:.2g} m/s^2), {linear}. A wrong thrust scale is not identifiable from "
                 "this log; with --vehicle it is"
             )
-            return full, [Finding("note", "thrust", text)]
+            return full, Finding("note", "thrust", text)
         if np.isfinite(full):
             text = (
                 f"normalised; full throttle would be {full:.3g} m/s^2 by the accelerometer, and "
                 f"{low:g} to {high:g} is possible: left out; give --vehicle FILE or "
                 "--full-thrust M/S^2"
             )
-            return None, [Finding("doubt", "thrust", text, "thrust_scale", full, 0.95,
-                                  "--full-thrust M/S^2")]  # fmt: skip
+            about = ("thrust_scale", full, 0.95, "--full-thrust M/S^2")
+            return None, Finding("doubt", "thrust", text, *about)
     text = (
         "normalised, and the thrust at full throttle is unknown: left out; "
         "give --vehicle FILE or --full-thrust M/S^2"
     )
-    return None, [Finding("doubt", "thrust", text)]
+    return None, Finding("doubt", "thrust", text)
 
 
 def _fit_full_thrust(throttle: np.ndarray, acc_z: np.ndarray) -> tuple[float, float]:

@@ -89,3 +89,16 @@ def rotation_vector(quat_wxyz: np.ndarray) -> np.ndarray:
     nonzero = sin_half > 1e-12
     factor = np.where(nonzero, angle / np.where(nonzero, sin_half, 1.0), 2.0)
     return factor * shortest[..., 1:]
+
+
+def rates_between(
+    time_s: np.ndarray, quat_wxyz: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the time from each row to the one `count` rows later, and the mean body rate.
+
+    `time_s` (N,) [s], unit quaternions (N, 4) from body to world. The results have N - count rows:
+    spans of time [s], and body rates (N - count, 3) [rad/s].
+    """
+    span_s = time_s[count:] - time_s[:-count]
+    relative = multiply(conjugate(quat_wxyz[:-count]), quat_wxyz[count:])
+    return span_s, rotation_vector(relative) / span_s[:, None]

@@ -7,20 +7,23 @@ readers of tables and of Crazyflie logs use it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.checks.angles import check_angles
-from eval.importers.frames import attitude, body_vector, conjugate, from_euler, rotate, world_vector
+from eval.importers.frames import attitude, body_vector, conjugate, from_euler, world_vector
 from eval.importers.mapping_file import MIXERS, Column, LogMap
 from eval.importers.options import ImportOptions
-from eval.importers.rows import continuous, in_world, measured
-from eval.importers.signals import Recording, Signal, collect, make_signal, without_empty
+from eval.importers.rows import continuous, measured, turn_axes
+from eval.importers.signals import Recording, Signal, collect, make_signal
 from eval.logs.columns import ESTIMATE, GROUPS, FlightLogError
 from eval.logs.faults.finding import Finding
+from eval.logs.faults.pose import BAD, CALM_RATE, TIMES_BETTER, WIDTH_S, turns_of
+from eval.logs.faults.relation import match, rms, smooth
+from eval.logs.faults.vectors import DEG, GOOD
 
 Part = tuple[np.ndarray, np.ndarray]
 """Times (N,) [s] and values (N, C)."""
@@ -30,6 +33,14 @@ KEPT = "kept:"
 """Prefix of the name of a column that is kept unchanged."""
 ESTIMATED = ("pos", "quat", "vel")
 """Signals that may come as motion capture and as on-board estimate."""
+ANGLES = ("roll", "pitch", "yaw")
+"""The order in which angles are read."""
+ANGLE_UNITS = {
+    1.0 / DEG: ("rad, read as deg", (0.0, 1.05 * np.pi * DEG)),
+    DEG: ("deg, read as rad", (2.1 * np.pi, np.inf)),
+}
+"""Factor that corrects the angles -> their unit in words, and the range of the largest angle as
+read [rad]. Within it the gyro's unit is less likely to be wrong than that of the angles."""
 
 
 def recording_of(
@@ -91,7 +102,6 @@ def recording_of(
     for signal in ("vel", "rate", "acc"):
         if signal in signals and used_columns[signal].other_axes:
             _change_axes(signals, signal, used_columns[signal])
-    signals = without_empty(signals)
     if "quat" in euler and not has_quat and {"quat", "rate"} <= signals.keys():
 
         def quat_of(angles: np.ndarray) -> np.ndarray:
@@ -189,23 +199,15 @@ def _change_axes(signals: dict[str, Signal], signal: str, column: Column) -> Non
 
     An acceleration in world axes is kept as `acc_w_x`, ... where there is no attitude.
     """
-    samples = signals.pop(signal)
-    value = samples.value
+    time_s, value = signals[signal]
     if signal == "acc" and not column.gravity:
         value = value + [0.0, 0.0, GRAVITY]  # a specific force is 9.81 m/s^2 upwards at rest
-    if "quat" not in signals:
-        if signal == "acc":
-            for k, axis in enumerate("xyz"):
-                kept = (value - [0.0, 0.0, GRAVITY])[:, k : k + 1]
-                signals[f"{KEPT}acc_w_{axis}"] = Signal(samples.time_s, kept)
-        return
-    if signal == "vel":
-        signals["vel"] = in_world(samples, signals["quat"])
-        return
-    quat = measured(signals["quat"], samples.time_s, smooth=True)
-    known = np.isfinite(quat).all(axis=1)
-    unit = quat[known] / np.linalg.norm(quat[known], axis=1, keepdims=True)
-    signals[signal] = Signal(samples.time_s[known], rotate(conjugate(unit), value[known]))
+    if signal == "acc" and "quat" not in signals:
+        for k, axis in enumerate("xyz"):
+            kept = (value - [0.0, 0.0, GRAVITY])[:, k : k + 1]
+            signals[f"{KEPT}acc_w_{axis}"] = Signal(time_s, kept)
+    signals[signal] = Signal(time_s, value)
+    turn_axes(signals, signal, to_world=signal == "vel")
 
 
 def _per_mass(signals: dict[str, Signal], file_mass: Any, options: ImportOptions) -> list[Finding]:
@@ -252,3 +254,55 @@ def _number_or_text(text: str) -> float | str:
         return float(text)
     except ValueError:
         return text
+
+
+def check_angles(
+    angles: Signal, quat_of: Callable[[np.ndarray], np.ndarray], rate: Signal, fix_order: bool
+) -> tuple[np.ndarray | None, list[Finding]]:
+    """Return corrected angles (N, 3) [rad], None where the given ones are kept, and the finding.
+
+    Another order must explain its rates better than other axes of the gyro do. Another unit is only
+    reported, since small angles in a wrong unit look like a gyro in a wrong unit.
+
+    Args:
+        angles: roll, pitch and yaw as read from the file [rad].
+        quat_of: converts angles to quaternions wxyz (N, 4) in the log's frames.
+        rate: body rates of the gyro [rad/s].
+        fix_order: correct the order; False: only report it.
+    """
+    time_s, value = angles
+    if len(time_s) < 4:
+        return None, []
+    gyro = smooth(time_s, measured(rate, time_s, smooth=False), WIDTH_S)
+    size = max(rms(gyro), CALM_RATE)
+
+    def turns(value: np.ndarray) -> np.ndarray:
+        return smooth(time_s, turns_of(time_s, quat_of(value)), WIDTH_S)
+
+    as_given = turns(value)
+    given = rms(as_given - gyro) / size
+    if not given > BAD:
+        return None, []
+    largest = float(np.nanmax(np.abs(value)))
+    units = [f for f, (_, (low, high)) in ANGLE_UNITS.items() if low < largest < high]
+    tried = {
+        **{(order, 1.0): value[:, order] for order in permutations(range(3))},
+        **{((0, 1, 2), factor): factor * value for factor in units},
+    }
+    misfit = {key: rms(turns(angles) - gyro) / size for key, angles in tried.items()}
+    order, factor = min(misfit, key=lambda key: misfit[key])
+    best = misfit[order, factor]
+    if factor == 1.0:  # other axes of the gyro may explain as much
+        alike = np.clip(match(as_given, gyro).alike.min(), 0.0, 1.0)
+        given = min(given, float(np.sqrt(1.0 - alike**2)))
+    if best > GOOD or best * TIMES_BETTER > given:
+        return None, []
+    text = f"its turns are off the gyro's by {100 * given:.0f} %, but by {100 * best:.0f} % if the "
+    if factor != 1.0:
+        text += f"angles are in {ANGLE_UNITS[factor][0]}"
+        fix = "unit of [euler] in the mapping file, or the gyro's unit"
+        return None, [Finding("doubt", "attitude", text, "attitude", None, 0.95, fix)]
+    text += f"columns are {', '.join(ANGLES[order.index(k)] for k in range(3))}"
+    about = ("attitude", None, 0.98, "columns of [euler] in the mapping file")
+    status = "corrected" if fix_order else "doubt"
+    return (value[:, order] if fix_order else None), [Finding(status, "attitude", text, *about)]

@@ -123,11 +123,6 @@ class LogMap:
     """Key of the mass [kg] in the text file."""
 
 
-def shipped_maps() -> list[str]:
-    """Return the names of the mapping files that come with the suite."""
-    return shipped_names(SHIPPED)
-
-
 def map_file(path: Path) -> Path:
     """Return the mapping file that `path` names: a file, or a shipped one by its name.
 
@@ -136,8 +131,8 @@ def map_file(path: Path) -> Path:
     """
     if path.suffix or len(path.parts) > 1 or path.is_file():
         return path
-    if path.name not in shipped_maps():
-        raise unknown_name("mapping (or file)", path.name, shipped_maps())
+    if path.name not in (known := shipped_names(SHIPPED)):
+        raise unknown_name("mapping (or file)", path.name, known)
     return SHIPPED / f"{path.name}.toml"
 
 
@@ -163,7 +158,11 @@ def read_map(path: Path) -> LogMap:
     if top.has("about"):
         about = top.table("about")
         text_file = about.text("file")
-        _check_placeholders(about, text_file)
+        try:
+            text_file.format(stem="", number="")
+        except (KeyError, IndexError, ValueError, AttributeError):
+            allowed = "a name with no braces but {stem} and {number}"
+            raise about.error("file", text_file, allowed) from None
         mass_key = about.text("mass") if about.has("mass") else ""
         about.close()
     optional = top.has("optional") and top.choice("optional", ("no", "yes")) == "yes"
@@ -204,14 +203,6 @@ def own_map(columns: Mapping[str, np.ndarray]) -> LogMap:
     return LogMap(present, keep=tuple(name for name in others if name != "throttle"))
 
 
-def _check_placeholders(about: Table, name: str) -> None:
-    """Reject a file name with placeholders other than {stem} and {number}."""
-    try:
-        name.format(stem="", number="")
-    except (KeyError, IndexError, ValueError, AttributeError):
-        raise about.error("file", name, "a name with no braces but {stem} and {number}") from None
-
-
 def _alternatives(signal: str, top: Table) -> tuple[Column, ...]:
     """Return the alternatives of one signal: its list of tables, or its only table."""
     try:
@@ -228,7 +219,9 @@ def _column(signal: str, table: Table) -> Column:
     """Read one table of a mapping: columns, unit, sign and scale, and the keys of its signal."""
     width = WIDTHS[signal]
     is_list_column = width == 1 or table.has("column")
-    names = [table.text("column")] if is_list_column else _column_names(table, width)
+    names = [table.text("column")] if is_list_column else table.texts("columns")
+    if not is_list_column and len(names) != width:
+        raise table.error("columns", names, f"{width} column names")
     unit = table.choice("unit", tuple(UNITS[signal]))
     sign = table.vector("sign", width, [1.0] * width)
     if not np.all(np.abs(sign) == 1.0):
@@ -256,11 +249,3 @@ def _column(signal: str, table: Table) -> Column:
     return Column(
         tuple(names), factor, has_other_axes, gravity, inverse, unit != PER_MASS, mixer, source
     )
-
-
-def _column_names(table: Table, width: int) -> list[str]:
-    """Return the `width` names under `columns`; reject another number of names."""
-    value = table.texts("columns")
-    if len(value) != width:
-        raise table.error("columns", value, f"{width} column names")
-    return value

@@ -13,22 +13,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from eval.importers.checks.late import OF_POSE
-from eval.importers.formats.table import read_table
-from eval.importers.frames import conjugate, multiply, rotation_vector
+from eval.importers.cleaning import OF_POSE
+from eval.importers.formats import table
+from eval.importers.frames import conjugate, multiply, rates_between, rotation_vector
 from eval.importers.options import ImportOptions
 from eval.importers.rows import averaged, continuous, row_times, rows_at
 from eval.importers.signals import Recording, Signal, median_step, with_readings
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.pose import GOOD, TIMES_BETTER, fit_pose_readings
-from eval.logs.faults.reading import TIMES, read_as
+from eval.logs.faults.reading import ANGLES, TIMES, read_as
 from tracks.geometry.rotation import rot_to_quat
 
 FIRST_REACH_S = 15.0
 """The fit first uses only the samples within this time of the middle of the flight [s]."""
-COARSE_HZ = 100.0
-"""Largest row rate for the checks of the path."""
 GRID_S = 0.005
 """Step of the cross-correlation [s]."""
 SPAN_S = 0.025
@@ -43,9 +41,6 @@ SURE = 0.9
 """Correlation above which no other convention of the quaternion is tried."""
 READINGS = {"xyzw": "xyzw", "inverse": "world to body", "xyzw+inverse": "xyzw and world to body"}
 """Possible other conventions of a file's quaternions: steps of `read_as` -> description."""
-SIGNS = ("-roll", "-pitch", "-yaw")
-"""Conventions with one wrong sign. They and a mirrored gyro serve to align the clocks only; later
-checks decide which signal is wrong (`eval/logs/faults/pose.py`, `vectors.py`)."""
 OTHER_WORLD = ("vel", "cmd_quat")
 """Signals in the log's world frame, which is not that of the pose."""
 USUAL_STEP_S = 1.0 / 150.0
@@ -81,7 +76,7 @@ class Alignment:
     @property
     def rotation_deg(self) -> float:
         """Angle of `rotation` [deg]."""
-        return float(np.rad2deg(np.linalg.norm(_rotation_vector(self.rotation))))
+        return float(np.rad2deg(np.linalg.norm(rotation_vector(rot_to_quat(self.rotation)))))
 
 
 def with_pose(
@@ -94,7 +89,7 @@ def with_pose(
         ValueError: for a mapping file that cannot be used.
     """
     assert options.pose is not None
-    pose = read_table(options.pose, options.pose_map, options)
+    pose = table.read(options.pose, replace(options, map=options.pose_map))
     pose = with_readings(pose, tuple(r for r in options.read if r[0] in OF_POSE))
     for name, text in (("pos", "position"), ("quat", "attitude")):
         if name not in pose.signals:
@@ -128,7 +123,7 @@ def with_pose(
         findings.append(Finding("corrected", "pose clock", text, *about))
     joined = _join(recording, pose, quat, alignment)
     if rotation_deg > ROTATION_DEG and not _has_wrong_sign(joined):
-        axis_b = _rotation_vector(alignment.rotation) / np.deg2rad(rotation_deg)
+        axis_b = rotation_vector(rot_to_quat(alignment.rotation)) / np.deg2rad(rotation_deg)
         axis = ", ".join(f"{v:+.2f}" for v in axis_b)
         text = f"its body is rotated by {rotation_deg:.1f} deg about ({axis}) against the gyro"
         if options.fix:
@@ -155,12 +150,12 @@ def _join(recording: Recording, pose: Recording, quat: Signal, alignment: Alignm
 
 def _has_wrong_sign(recording: Recording) -> bool:
     """Return whether the path shows that one angle of the attitude has the wrong sign."""
-    times = row_times(recording, COARSE_HZ, 0.0, None)
-    fits = fit_pose_readings({k: v for k, v in rows_at(recording, times).items() if k != "rate"})
+    rows = rows_at(recording, row_times(recording))
+    fits = fit_pose_readings({k: v for k, v in rows.items() if k != "rate"})
     if fits is None or fits.given.force is None or fits.best.force is None:
         return False
     better = fits.best.force < GOOD and fits.given.force > TIMES_BETTER * fits.best.force
-    return better and fits.best.quat in SIGNS
+    return better and fits.best.quat in ANGLES
 
 
 def _in_seconds(pose: Recording) -> tuple[Recording, list[Finding]]:
@@ -172,9 +167,9 @@ def _in_seconds(pose: Recording) -> tuple[Recording, list[Finding]]:
     unit = min(units, key=lambda name: abs(np.log(step * TIMES[name] / USUAL_STEP_S)))
     if unit == "s":
         return pose, []
-    scaled = {n: Signal(s.time_s * TIMES[unit], s.value) for n, s in pose.signals.items()}
     text = f"rows are {step:.4g} apart, so time is in {unit}"
-    return replace(pose, signals=scaled), [Finding("corrected", "pose time", text, "time_unit")]
+    finding = Finding("corrected", "pose time", text, "time_unit")
+    return with_readings(pose, (("time", unit),)), [finding]
 
 
 def _align_pose(
@@ -189,7 +184,7 @@ def _align_pose(
     enough = max(SURE, 0.5 + 0.5 * unchanged.correlation)
     converted = {
         steps: Signal(quat.time_s, read_as("quat", quat.value, steps))
-        for steps in (*READINGS, *SIGNS)
+        for steps in (*READINGS, *ANGLES)
     }
     aligned = {steps: align(signal, rate, pose.name) for steps, signal in converted.items()}
     # Among conventions with equal correlation, prefer a body frame close to the gyro's.
@@ -200,8 +195,10 @@ def _align_pose(
         about = (fault, None, aligned[best].correlation)
         finding = Finding("corrected", "pose attitude", text, *about)
         return converted[best], aligned[best], [finding]
+    # One wrong sign and a mirrored gyro serve to align the clocks only: later checks decide which
+    # signal is wrong (`eval/logs/faults/pose.py`, `vectors.py`).
     mirrored = align(quat, rate, pose.name, mirrored=True)
-    wrong_sign = max((mirrored, *(aligned[s] for s in SIGNS)), key=lambda fit: fit.correlation)
+    wrong_sign = max((mirrored, *(aligned[s] for s in ANGLES)), key=lambda fit: fit.correlation)
     if wrong_sign.correlation > enough:
         return quat, replace(wrong_sign, rotation=np.eye(3)), []
     if unchanged.correlation < CORRELATION_MIN or abs(unchanged.drift) > DRIFT_MAX:
@@ -301,10 +298,8 @@ def _pose_rates(quat: Signal) -> tuple[np.ndarray, np.ndarray]:
     value = continuous(quat.value / np.linalg.norm(quat.value, axis=1, keepdims=True))
     step = median_step(quat.time_s)
     count = max(1, round(SPAN_S / step))
-    duration = quat.time_s[count:] - quat.time_s[:-count]
+    duration, rates = rates_between(quat.time_s, value, count)
     no_gap = duration < 1.5 * count * step
-    relative = multiply(conjugate(value[:-count]), value[count:])
-    rates = rotation_vector(relative) / duration[:, None]
     return (0.5 * (quat.time_s[count:] + quat.time_s[:-count]))[no_gap], rates[no_gap]
 
 
@@ -362,7 +357,3 @@ def _correlation(first: np.ndarray, second: np.ndarray) -> float:
     first, second = first - first.mean(0), second - second.mean(0)
     norm = np.sqrt(np.sum(first**2) * np.sum(second**2))
     return float(np.sum(first * second) / norm) if norm > 0 else 0.0
-
-
-def _rotation_vector(rotation: np.ndarray) -> np.ndarray:
-    return rotation_vector(rot_to_quat(rotation))

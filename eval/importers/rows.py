@@ -13,13 +13,15 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from eval.importers.frames import rotate
+from eval.importers.frames import conjugate, rotate
 from eval.importers.signals import NEEDED, Recording, Signal, median_step
 from eval.logs.columns import FlightLogError
 from eval.logs.files import MOST_ROWS
 
 LEAST_HZ = 20.0
 """Least row rate; for slower signals rows are added between the samples."""
+COARSE_HZ = 100.0
+"""Largest row rate for the checks of the pose [Hz]."""
 SMOOTH = ("pos", "quat", "vel")
 """Signals that are interpolated by a cubic spline; the others linearly."""
 SPARSE = ("pos", "quat", "vel", "rate", "acc")
@@ -79,9 +81,9 @@ def slowest(recording: Recording) -> str:
 
 def row_times(
     recording: Recording,
-    rate_hz: float,
-    start_s: float,
-    end_s: float | None,
+    rate_hz: float = COARSE_HZ,
+    start_s: float = 0.0,
+    end_s: float | None = None,
     within: tuple[float, float] = (-np.inf, np.inf),
     origin_s: float | None = None,
 ) -> np.ndarray:
@@ -206,7 +208,9 @@ def measured(samples: Signal, time_s: np.ndarray, smooth: bool) -> np.ndarray:
         if not len(rows):
             continue
         if smooth and len(t) >= 4:
-            out[rows] = _spline(t, v, time_s[rows])
+            from scipy.interpolate import CubicSpline
+
+            out[rows] = CubicSpline(t, v)(time_s[rows])
         elif not smooth and step < FASTER * row_step and len(t) > 1:
             out[rows] = smoothed(t, v, time_s[rows], row_step)
         else:
@@ -251,12 +255,20 @@ def unchanged(samples: Signal, time_s: np.ndarray) -> np.ndarray:
     return np.where(is_near[:, None], samples.value[index], np.nan)
 
 
-def in_world(vel_b: Signal, quat: Signal) -> Signal:
-    """Rotate a velocity from body to world axes; samples without an attitude are left out."""
-    attitude = measured(quat, vel_b.time_s, smooth=True)
-    known = np.isfinite(attitude).all(axis=1)
-    unit = attitude[known] / np.linalg.norm(attitude[known], axis=1, keepdims=True)
-    return Signal(vel_b.time_s[known], rotate(unit, vel_b.value[known]))
+def turn_axes(signals: dict[str, Signal], name: str, to_world: bool) -> None:
+    """Rotate a signal from body to world axes by the attitude, in place, or the other way round.
+
+    Samples without an attitude are left out, and the signal where none has one.
+    """
+    time_s, value = signals.pop(name)
+    if "quat" not in signals:
+        return
+    quat = measured(signals["quat"], time_s, smooth=True)
+    known = np.isfinite(quat).all(axis=1)
+    unit = quat[known] / np.linalg.norm(quat[known], axis=1, keepdims=True)
+    if known.any():
+        turned = rotate(unit if to_world else conjugate(unit), value[known])
+        signals[name] = Signal(time_s[known], turned)
 
 
 def continuous(quat_wxyz: np.ndarray) -> np.ndarray:
@@ -265,12 +277,6 @@ def continuous(quat_wxyz: np.ndarray) -> np.ndarray:
     flips = np.sum(quat_wxyz[1:] * quat_wxyz[:-1], axis=1) < 0
     sign = np.concatenate([[1.0], np.where(np.cumsum(flips) % 2, -1.0, 1.0)])
     return quat_wxyz * sign[:, None]
-
-
-def _spline(t: np.ndarray, v: np.ndarray, query_s: np.ndarray) -> np.ndarray:
-    from scipy.interpolate import CubicSpline
-
-    return CubicSpline(t, v)(query_s)
 
 
 def _linear(t: np.ndarray, v: np.ndarray, query_s: np.ndarray) -> np.ndarray:

@@ -160,11 +160,6 @@ def _next_attitude(quat: Signal | None, time_s: np.ndarray) -> np.ndarray:
     return quat.value[index] / np.linalg.norm(quat.value[index], axis=1, keepdims=True)
 
 
-def without_empty(signals: Mapping[str, Signal]) -> dict[str, Signal]:
-    """Return the signals that have samples; a rotation leaves none without an attitude in time."""
-    return {name: samples for name, samples in signals.items() if len(samples.time_s)}
-
-
 def median_step(time_s: np.ndarray) -> float:
     """Return the median time between samples [s]; infinite for fewer than two."""
     return float(np.median(np.diff(time_s))) if len(time_s) > 1 else np.inf

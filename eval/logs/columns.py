@@ -1,23 +1,8 @@
 """The columns of a flight log, and the rules that decide whether a log is accepted.
 
-| columns | unit | needed |
-|---|---|---|
-| `time` | s, increasing | yes |
-| `pos_x pos_y pos_z` | m, world | yes |
-| `quat_w quat_x quat_y quat_z` | body to world | yes |
-| `vel_x vel_y vel_z` | m/s, world | no (derived where absent) |
-| `rate_x rate_y rate_z` | rad/s, body | yes |
-| `cmd_thrust` with `cmd_rate_x cmd_rate_y cmd_rate_z` | m/s^2, rad/s body | these |
-| or with `cmd_torque_x cmd_torque_y cmd_torque_z` | N m, body | or these |
-| `motor_1` to `motor_4` | rad/s, measured | or these |
-| `pwm_1` to `pwm_4` | motor commands from 0 to 1 | or these |
-| `motor_cmd_1` to `motor_cmd_4` | rad/s, commanded | no |
-| `acc_x acc_y acc_z` | m/s^2, specific force, body | no |
-| `voltage` | V | no |
-| `est_pos_x` ..., `est_quat_w` ..., `est_vel_x` ... | the on-board estimate | no |
-
-Missing values are null or NaN. Rows are counted from 1, without a CSV's header. A partial log
-(marked in its metadata) needs only the time and one more group.
+docs/flight_logs.md lists the columns with their units. Missing values are null or NaN. Rows are
+counted from 1, without a CSV's header. A partial log (marked in its metadata) needs only the time
+and one more group.
 """
 
 from __future__ import annotations

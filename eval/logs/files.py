@@ -100,8 +100,10 @@ def _read_parquet(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[s
         # `ParquetFile` instead of `read_table`, which takes a folder's name for a column.
         with pyarrow.parquet.ParquetFile(path) as file:
             wanted, warnings = _wanted(path, file)
-            texts = [n for n in wanted if _is_text(file.schema_arrow.field(n).type)]
-            metadata = file.schema_arrow.metadata or {}
+            t, schema = pa.types, file.schema_arrow
+            kinds = (t.is_string, t.is_large_string, t.is_binary, t.is_large_binary)
+            texts = [n for n in wanted if any(is_kind(schema.field(n).type) for is_kind in kinds)]
+            metadata = schema.metadata or {}
         # Texts stay dictionary-encoded: a long text in every row would not fit in memory.
         with pyarrow.parquet.ParquetFile(path, read_dictionary=texts) as file:
             table = file.read(wanted)
@@ -134,12 +136,6 @@ def _wanted(path: Path, file: Any) -> tuple[list[str], list[str]]:
     left = len(names) - len(wanted)
     text = f"{path}: {left} of {len(names)} columns are left out: they hold lists, or are too many"
     return wanted, [text] if left else []
-
-
-def _is_text(kind: pa.DataType) -> bool:
-    t = pa.types
-    is_string = t.is_string(kind) or t.is_large_string(kind)
-    return is_string or t.is_binary(kind) or t.is_large_binary(kind)
 
 
 def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]:
@@ -251,7 +247,8 @@ def _lines_before(lines: list[list[str]]) -> int:
     for k in range(1, len(lines) - 2):
         width = len(lines[k])
         alike = width == len(lines[k + 1]) == len(lines[k + 2]) and width > len(lines[0])
-        if alike and not any(map(_is_number, lines[k])) and _numbers(lines[k + 1]) > 0.5:
+        numeric = sum(not cell.strip() or _is_number(cell) for cell in lines[k + 1])
+        if alike and not any(map(_is_number, lines[k])) and numeric > 0.5 * width:
             return k
     return 0
 
@@ -262,11 +259,6 @@ def _is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _numbers(row: list[str]) -> float:
-    """Return the share of numeric or empty cells of a row."""
-    return sum(not cell.strip() or _is_number(cell) for cell in row) / max(len(row), 1)
 
 
 def _arrays(table: pa.Table, path: Path) -> dict[str, np.ndarray]:

@@ -1,18 +1,8 @@
 """Read ArduPilot's `.bin` logs with pymavlink (extra `mavlink`).
 
 The vehicle's world is north-east-down and its body forward-right-down. Messages and units follow
-ArduPilot's documentation of its log messages (Copter 4.x); the first one in the log is used.
-
-| signal | messages |
-|---|---|
-| rate, acc | IMU (rad/s, m/s^2), of the lowest instance |
-| quat | ATT (roll, pitch, yaw in deg) |
-| pos, vel | XKF1, NKF1 (PN PE PD in m, VN VE VD in m/s), of the lowest core |
-| cmd_rate | RATE (RDes PDes YDes in deg/s) |
-| throttle | CTUN (ThO, 0 to 1) |
-| pwm | RCOU (pulses in us), the outputs that SERVOn_FUNCTION makes motors 1 to 4 |
-| motor | ESC (RPM by instance, in the order of these outputs), where all four report |
-| voltage | BAT (Volt) |
+ArduPilot's documentation of its log messages (Copter 4.x); of an instance or core, the lowest is
+read.
 """
 
 from __future__ import annotations
@@ -29,6 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from eval.importers.formats.betaflight import MOTOR_SIDE as BETAFLIGHT_X
+from eval.importers.formats.px4 import QUAD_X
 from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, from_euler
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
@@ -45,16 +37,12 @@ MESSAGES = ("IMU", "ATT", "XKF1", "NKF1", "RATE", "CTUN", "RCOU", "ESC", "BAT", 
 """Kinds of message that are read."""
 OPEN_HANDLES = ("data_map", "filehandle")
 """Attributes of a pymavlink reader that must be closed."""
-QUAD_X = ((1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0))
-"""Positions of motors 1 to 4 of a quadrotor X (x forward, y left): front right, rear left, front
-left, rear right."""
 QUAD_PLUS = ((0.0, -1.0), (0.0, 1.0), (1.0, 0.0), (-1.0, 0.0))
 """Positions of motors 1 to 4 of a quadrotor plus (x forward, y left): right, left, front, rear."""
-_BETAFLIGHT_X = ((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
 MOTOR_SIDES = {
     **dict.fromkeys((0, 6, 16), QUAD_PLUS),
     **dict.fromkeys((1, 2, 3, 17), QUAD_X),
-    **dict.fromkeys((12, 18), _BETAFLIGHT_X),
+    **dict.fromkeys((12, 18), BETAFLIGHT_X),
     13: ((1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0)),
     14: ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)),
 }

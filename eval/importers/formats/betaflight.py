@@ -1,11 +1,12 @@
 """Read Blackbox logs of Betaflight: raw (`.bbl`, `.bfl`), or CSV files of `blackbox_decode`.
 
-Betaflight's body frame is forward-left-up already: roll right, nose down and yaw left are positive
-in the gyro, the set points and the motor mixer. Rates are in deg/s, also where the header names no
-unit. CSV files under `blackbox_high_resolution` are in 0.1 deg/s, which a comparison with the
-attitude detects (`eval/logs/faults/vectors.py`). Units that `blackbox_decode` was set to are in
-brackets after a column's name. Position and attitude are not logged: --pose adds them, or --partial
-imports the log without.
+betaflight-chirp-core (Apache-2.0) decodes raw logs. Betaflight's body frame is forward-left-up
+already: roll right, nose down and yaw left are positive in the gyro, the set points and the motor
+mixer. Rates are in deg/s, also where the header names no unit. CSV files under
+`blackbox_high_resolution` are in 0.1 deg/s, which a comparison with the attitude detects
+(`eval/logs/faults/vectors.py`). Units that `blackbox_decode` was set to are in brackets after a
+column's name. Position and attitude are not logged: --pose adds them, or --partial imports the log
+without.
 """
 
 from __future__ import annotations
@@ -18,11 +19,10 @@ from typing import Any
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.formats.blackbox import ACC_1G, MARKER, decode
 from eval.importers.formats.table import numbers
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
-from eval.logs.columns import FlightLogError
+from eval.logs.columns import FlightLogError, quoted
 from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import Finding
 from eval.logs.files import first_line, read_columns, read_head
@@ -30,6 +30,15 @@ from eval.logs.files import first_line, read_columns, read_head
 SUMMARY = "Blackbox log (.bbl, .bfl), or CSV of blackbox_decode; --pose or --partial"
 TAKES_MAP = TAKES_SOURCE = False
 """The format has fixed names and no pose, see `Format`."""
+MARKER = b"H Product:Blackbox"
+"""Text that begins the header of each raw log in a file."""
+ACC_1G = 2048.0
+"""Raw counts of accSmooth per g, on all boards of Betaflight 4."""
+MISSING = (
+    "a raw Blackbox log; pip install 'diffracing-suite[blackbox]' reads it, or decode it with "
+    "blackbox_decode and import the CSV"
+)
+"""Reason of the error if the decoder is not installed."""
 MOTOR_SIDE = ((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
 """Positions of motors 1 to 4 (x forward, y left): rear right, front right, rear left, front
 left."""
@@ -78,11 +87,11 @@ class Blackbox:
         else:
             self.columns, _, warnings = read_columns(path)
             self.findings += [Finding("note", "file", text) for text in warnings]
-        self._units: dict[str, tuple[str, str]] = {}  # name without unit -> full name, unit
+        self.units: dict[str, tuple[str, str]] = {}  # name without unit -> full name, unit
         for column in self.columns:
             match = _UNIT.match(column)
             if match:
-                self._units[match["name"]] = (column, match["unit"] or "")
+                self.units[match["name"]] = (column, match["unit"] or "")
 
     def settings(self, name: str, default: tuple[float, ...]) -> tuple[float, ...]:
         """Return the numbers of a header setting, or `default` if it has not as many numbers."""
@@ -93,11 +102,7 @@ class Blackbox:
 
     def has(self, *names: str) -> bool:
         """Return whether the file has all these columns."""
-        return all(name in self._units for name in names)
-
-    def unit(self, name: str) -> str:
-        """Return the unit in a column's name, "" where there is none."""
-        return self._units[name][1]
+        return all(name in self.units for name in names)
 
     def values(self, names: list[str], factor: Mapping[str, float]) -> np.ndarray:
         """Return columns (N, C) in the suite's unit.
@@ -110,10 +115,10 @@ class Blackbox:
         """
         out = []
         for name in names:
-            if name not in self._units:
+            if name not in self.units:
                 reason = "missing; was the file made by blackbox_decode?"
                 raise FlightLogError(self.name, name, None, reason)
-            column, unit = self._units[name]
+            column, unit = self.units[name]
             if unit not in factor:
                 known = ", ".join(repr(u) for u in factor if u)
                 reason = f"has the unit {unit!r}; known are {known}"
@@ -149,7 +154,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
         text = "no setpoint columns: stick positions are not rates, so there is no rate command"
         findings.append(Finding("doubt", "command", text))
     if box.has("vbatLatest"):
-        unit = box.unit("vbatLatest")
+        _, unit = box.units["vbatLatest"]
         parts["voltage"] = _volts(box.values(["vbatLatest"], _VOLT), unit, options.fix, findings)
     poles = options.motor_poles
     if poles is None:
@@ -215,3 +220,57 @@ def _motors(box: Blackbox, poles: int, findings: list[Finding]) -> dict[str, np.
     text = f"rotor speeds from eRPM of motors with {poles} poles (--motor-poles)"
     findings.append(Finding("note", "motors", text))
     return {"motor": 2.0 * np.pi * turns_per_s}
+
+
+def decode(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], list[Finding]]:
+    """Return the columns of the longest log of the raw file at `path`, its settings, and notes.
+
+    The columns have the names of `blackbox_decode`; an unusual unit in brackets ends a name.
+
+    Raises:
+        FlightLogError: where the decoder is not installed, or nothing can be decoded.
+    """
+    try:
+        from betaflight_chirp_core import decoder
+    except ImportError:
+        raise FlightLogError(str(path), None, None, MISSING) from None
+    raw = path.read_bytes()
+    findings = []
+    try:
+        sessions = decoder.split_sessions(raw)
+        number, (start, end) = max(enumerate(sessions, start=1), key=lambda s: s[1][1] - s[1][0])
+        parser = decoder.FlightLogParser(raw, start, end)
+        parser.parse_header()
+        parser.parse_data()
+        if not parser.main_frames:
+            raise ValueError("it has no frame; log again")
+        if len(sessions) > 1:
+            text = f"holds {len(sessions)} logs; the longest, number {number}, is read"
+            findings.append(Finding("note", "file", text))
+        if damaged := int(parser.stats["total_corrupt_frames"]):
+            text = f"{damaged} frames are damaged (a slow memory card?) and left out"
+            findings.append(Finding("note", "file", text))
+        table = np.array(parser.main_frames, dtype=np.float64).T
+        columns = dict(zip(parser.main_field_names, table, strict=True))
+        return _in_units(columns, parser.sys_config), parser.sys_config, findings
+    except Exception as error:  # a damaged file can cause any exception in the decoder
+        reason = f"a Blackbox log that cannot be decoded ({quoted(error)})"
+        raise FlightLogError(str(path), None, None, reason) from None
+
+
+def _in_units(columns: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Return the columns with rates in deg/s and accelerations in g."""
+    counts_per_deg_s = 10.0 if header.get("blackbox_high_resolution") == 1 else 1.0
+    counts_per_g = header.get("acc_1G")
+    if not isinstance(counts_per_g, (int, float)) or counts_per_g <= 0:
+        counts_per_g = ACC_1G
+    out = {}
+    for name, value in columns.items():
+        stem = name.partition("[")[0]
+        if stem in ("gyroADC", "gyroUnfilt") or (stem == "setpoint" and name != "setpoint[3]"):
+            out[name] = value / counts_per_deg_s
+        elif stem == "accSmooth":
+            out[f"{name} (g)"] = value / counts_per_g
+        else:
+            out[name] = value
+    return out

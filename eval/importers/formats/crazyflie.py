@@ -34,14 +34,8 @@ from tracks.common.names import closest
 SUMMARY = "log of the Crazyflie's micro SD card deck"
 USD = b"\xbc"
 """First byte of a log."""
-CODES = {"b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4"} | {
-    "e": "<f2",
-    "f": "<f4",
-    "d": "<f8",
-    "q": "<i8",
-    "Q": "<u8",
-}
-"""Type code of a variable -> numpy type."""
+CODES = {code: f"<{code}" for code in "bBhHiIefdqQ"}
+"""Type code of a variable, the same in Python's `struct` -> numpy type."""
 DEFAULT_MAP = Path("crazyflie")
 """The shipped mapping of the firmware's log variables."""
 PACKED = "stateEstimateZ.quat"

@@ -4,15 +4,6 @@ ROS's worlds are z-up and its bodies forward-left-up; quaternions are xyzw. The 
 Odometry is in its child frame, the body. A mapping file's [topics] selects a topic where several
 hold the same kind of message; a pose without an odometry there replaces every odometry. Its
 `[frames] motors` gives the positions of the motors.
-
-| kind | messages |
-|---|---|
-| odometry | nav_msgs/Odometry |
-| pose | geometry_msgs/PoseStamped, PoseWithCovarianceStamped |
-| imu | sensor_msgs/Imu |
-| command | mavros_msgs/AttitudeTarget (body_rate, thrust from 0 to 1) |
-| motors | actuator_msgs/Actuators (velocity), mav_msgs/Actuators (angular_velocities) [rad/s] |
-| battery | sensor_msgs/BatteryState |
 """
 
 from __future__ import annotations
@@ -25,8 +16,8 @@ import numpy as np
 
 from eval.importers.mapping_file import map_file, motor_side_of
 from eval.importers.options import ImportOptions
-from eval.importers.rows import in_world
-from eval.importers.signals import Recording, Signal, collect, without_empty
+from eval.importers.rows import turn_axes
+from eval.importers.signals import Recording, Signal, collect
 from eval.logs.columns import FlightLogError, quoted
 from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import Finding
@@ -212,9 +203,8 @@ def _signals(
     take("voltage", "battery", lambda m: [m.voltage])
     signals, findings = collect(parts, name)
     if "vel" in signals:
-        vel_b = signals.pop("vel")
-        signals |= {"vel": in_world(vel_b, signals["quat"])} if "quat" in signals else {}
-    return without_empty(signals), findings
+        turn_axes(signals, "vel", to_world=True)
+    return signals, findings
 
 
 def _xyz(vector: Any) -> list[float]:

@@ -3,16 +3,6 @@
 PX4's world is north-east-down and its body forward-right-down; quaternions are wxyz, body to
 world. The log is converted to north-west-up and forward-left-up (`eval/importers/frames.py`).
 Source of the topics and their units: the message definitions of PX4 v1.11 to v1.16.
-
-| signal | topics, the first one in the log is used |
-|---|---|
-| quat | vehicle_attitude, vehicle_odometry |
-| pos, vel | vehicle_local_position, vehicle_odometry |
-| rate | vehicle_angular_velocity, sensor_combined |
-| acc | sensor_combined, vehicle_acceleration |
-| cmd_rate, throttle | vehicle_rates_setpoint |
-| motor | esc_status |
-| voltage | battery_status |
 """
 
 from __future__ import annotations
@@ -40,19 +30,6 @@ TAKES_MAP = TAKES_SOURCE = False
 """The format has fixed names and a single pose, see `Format`."""
 ULOG = b"ULog\x01\x12\x35"
 """First bytes of a log."""
-TOPICS = (
-    "vehicle_attitude",
-    "vehicle_odometry",
-    "vehicle_local_position",
-    "vehicle_angular_velocity",
-    "vehicle_acceleration",
-    "sensor_combined",
-    "vehicle_rates_setpoint",
-    "esc_status",
-    "battery_status",
-    "actuator_motors",
-)
-"""Topics that are read."""
 QUAD_X = ((1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0))
 """PX4's motors 1 to 4 (x forward, y left): front right, rear left, front left, rear right."""
 QUADROTOR = 2
@@ -67,6 +44,8 @@ Topic = Mapping[str, np.ndarray]
 """The columns of one topic, by field name."""
 Part = tuple[np.ndarray, np.ndarray]
 """Times (N,) [s] and values (N, C) of a signal."""
+Change = Callable[[Topic, np.ndarray], np.ndarray | None]
+"""Function of a topic and its fields (N, C) that returns them changed, or None for no samples."""
 
 
 def detect(head: bytes, options: ImportOptions) -> bool:
@@ -94,18 +73,14 @@ def read(path: Path, options: ImportOptions) -> Recording:
             text = f"the topic {data.name} has no timestamp (damaged?): left out"
             findings.append(Finding("doubt", "file", text))
     parts: dict[str, Part] = {}
-    for name, readers in _READERS.items():
-        for topic, reader in readers:
-            part = reader(topics[topic]) if topic in topics else None
-            if part is not None:
-                parts[name] = part
-                break
+    for name, sources in _SOURCES.items():
+        found = (_part(topics[topic], *how) for topic, *how in sources if topic in topics)
+        if (part := next((p for p in found if p is not None), None)) is not None:
+            parts[name] = part
     findings += _motor_count(log.initial_parameters, topics)
     batteries = [d.data for d in log.data_list if d.name == "battery_status" and d.multi_id > 0]
     findings += _other_battery(parts, batteries)
-    findings += _no_position(topics)
-    if "vehicle_local_position" in topics:
-        findings += _resets(topics["vehicle_local_position"])
+    findings += _check_position(topics.get("vehicle_local_position", {}))
     signals, more_findings = collect(parts, str(path))
     info = log.msg_info_dict
     about = {key: str(info[key]) for key in ("sys_name", "ver_hw", "ver_sw") if key in info}
@@ -150,7 +125,9 @@ def _load(path: Path) -> Any:
             _TruncationSafeReader(io.FileIO(path)) as file,
             contextlib.redirect_stdout(io.StringIO()),
         ):
-            log: Any = ULog(file, list(TOPICS))
+            log: Any = ULog(
+                file, [*{t for s in _SOURCES.values() for t, *_ in s}, "actuator_motors"]
+            )
             log.is_cut = file.is_cut
             return log
     except Exception as error:
@@ -158,47 +135,38 @@ def _load(path: Path) -> Any:
         raise FlightLogError(str(path), None, None, reason) from None
 
 
-def _columns(topic: Topic, names: Sequence[str]) -> np.ndarray | None:
-    """Return fields of a topic as (N, C); None where one is missing."""
-    if any(name not in topic for name in names):
+def _columns(topic: Topic, names: str) -> np.ndarray | None:
+    """Return the fields `names` of a topic as (N, C); None where one is missing."""
+    if any(name not in topic for name in names.split()):
         return None
-    return np.stack([np.asarray(topic[name], dtype=np.float64) for name in names], axis=1)
+    return np.stack([np.asarray(topic[n], dtype=np.float64) for n in names.split()], axis=1)
 
 
-def _time(topic: Topic) -> np.ndarray:
-    """Return the times of measurement (N,) [s]: `timestamp_sample` where the topic has it."""
+def _part(topic: Topic, names: str, factor: Any, change: Change | None = None) -> Part | None:
+    """Return the times of measurement [s] and the fields `names`, changed and times `factor`."""
+    value = _columns(topic, names)
+    value = change(topic, value) if change is not None and value is not None else value
+    if value is None:
+        return None
     stamp = topic.get("timestamp_sample", topic["timestamp"])
     stamp = np.where(np.asarray(stamp) > 0, stamp, topic["timestamp"])
-    return stamp.astype(np.float64) * 1e-6
+    return stamp.astype(np.float64) * 1e-6, value * factor
 
 
-def _vector(names: Sequence[str]) -> Callable[[Topic], Part | None]:
-    """Return a reader of a vector whose frame, world or body, has z down."""
+def _valid(*flags: str) -> Change:
+    """Return a change to NaN where a flag is false; to None where no sample is valid."""
 
-    def read_vector(topic: Topic) -> Part | None:
-        value = _columns(topic, names)
-        return None if value is None else (_time(topic), value * HALF_TURN)
-
-    return read_vector
-
-
-def _local(names: Sequence[str], valid: Sequence[str]) -> Callable[[Topic], Part | None]:
-    """Return a reader of a vector in the local world, NaN where a flag of `valid` is false."""
-
-    def read_local(topic: Topic) -> Part | None:
-        part = _vector(names)(topic)
-        if part is None:
-            return None
-        good = np.ones(len(part[0]), dtype=bool)
-        for flag in valid:
+    def change(topic: Topic, value: np.ndarray) -> np.ndarray | None:
+        good = np.ones(len(value), dtype=bool)
+        for flag in flags:
             good &= np.asarray(topic.get(flag, good)).astype(bool)
-        return (part[0], np.where(good[:, None], part[1], np.nan)) if good.any() else None
+        return np.where(good[:, None], value, np.nan) if good.any() else None
 
-    return read_local
+    return change
 
 
-def _odometry_velocity(topic: Topic) -> Part | None:
-    """Return the velocity if it is in the position's world frame or in body axes, else None.
+def _in_odometry_world(topic: Topic, value: np.ndarray) -> np.ndarray | None:
+    """Return a velocity that is in the position's world frame or in body axes, else None.
 
     From PX4 v1.14 on, frames are 1 (north-east-down), 2 (z down with another heading) and 3 (body).
     Before, they are 0, 1 and 3.
@@ -206,84 +174,62 @@ def _odometry_velocity(topic: Topic) -> Part | None:
     frame = topic.get("velocity_frame")
     since_v1_14 = "pose_frame" in topic
     world = topic.get("pose_frame" if since_v1_14 else "local_frame")
-    value = _columns(topic, [f"velocity[{k}]" for k in range(3)])
-    value = _columns(topic, ["vx", "vy", "vz"]) if value is None else value
-    if frame is None or value is None:
+    if frame is None:
         return None
     frame = np.asarray(frame)
     if np.all(frame == BODY_FRAME):
-        quat = _columns(topic, [f"q[{k}]" for k in range(4)])
-        return None if quat is None else (_time(topic), rotate(quat, value) * HALF_TURN)
+        quat = _columns(topic, QUAT)
+        return None if quat is None else rotate(quat, value)
     is_world = np.isin(frame, (1, 2) if since_v1_14 else (0, 1))
-    if world is None or not np.all(is_world & (frame == world)):
+    return value if world is not None and np.all(is_world & (frame == world)) else None
+
+
+def _in_motor_order(topic: Topic, speed: np.ndarray) -> np.ndarray | None:
+    """Return the speeds (N, 4) of Motor1 to Motor4, on whichever outputs they are."""
+    if not np.any(speed):
         return None
-    return _time(topic), value * HALF_TURN
-
-
-def _odometry_position(topic: Topic) -> Part | None:
-    value = _columns(topic, [f"position[{k}]" for k in range(3)])
-    value = _columns(topic, ["x", "y", "z"]) if value is None else value
-    return None if value is None else (_time(topic), value * HALF_TURN)
-
-
-def _attitude(topic: Topic) -> Part | None:
-    value = _columns(topic, [f"q[{k}]" for k in range(4)])
-    return None if value is None else (_time(topic), value * QUAT_HALF_TURN)
-
-
-def _throttle(topic: Topic) -> Part | None:
-    """Return the normalised collective thrust, positive along body z, of a rates set point."""
-    value = _columns(topic, ["thrust_body[2]"])
-    if value is None:
-        value = _columns(topic, ["thrust"])  # before v1.10, positive upwards
-        return None if value is None else (_time(topic), value)
-    return _time(topic), -value
-
-
-def _motors(topic: Topic) -> Part | None:
-    """Return rotor speeds (N, 4) [rad/s] of Motor1 to Motor4, on whichever outputs they are."""
-    speed = _columns(topic, [f"esc[{k}].esc_rpm" for k in range(4)])
-    if speed is None or not np.any(speed):
-        return None
-    wired = _columns(topic, [f"esc[{k}].actuator_function" for k in range(4)])
+    wired = _columns(topic, " ".join(f"esc[{k}].actuator_function" for k in range(4)))
     if wired is not None:
         order = np.argsort(wired[-1])
         if np.array_equal(wired[-1][order], FIRST_MOTOR + np.arange(4)):
             speed = speed[:, order]
-    return _time(topic), np.abs(speed) * RPM
+    return np.abs(speed)
 
 
-def _voltage(topic: Topic) -> Part | None:
-    value = _columns(topic, ["voltage_v"])
-    if value is None:
-        return None
-    return _time(topic), np.where(value > 0, value, np.nan)
-
-
-_READERS: dict[str, list[tuple[str, Callable[[Topic], Part | None]]]] = {
-    "quat": [("vehicle_attitude", _attitude), ("vehicle_odometry", _attitude)],
+QUAT = "q[0] q[1] q[2] q[3]"
+VOLTAGE = ("voltage_v", 1.0, lambda _, value: np.where(value > 0, value, np.nan))
+_SOURCES: dict[str, list[tuple[Any, ...]]] = {
+    "quat": [(t, QUAT, QUAT_HALF_TURN) for t in ("vehicle_attitude", "vehicle_odometry")],
     "pos": [
-        ("vehicle_local_position", _local(("x", "y", "z"), ("xy_valid", "z_valid"))),
-        ("vehicle_odometry", _odometry_position),
+        ("vehicle_local_position", "x y z", HALF_TURN, _valid("xy_valid", "z_valid")),
+        ("vehicle_odometry", "position[0] position[1] position[2]", HALF_TURN),
+        ("vehicle_odometry", "x y z", HALF_TURN),
     ],
     "vel": [
-        ("vehicle_local_position", _local(("vx", "vy", "vz"), ("v_xy_valid", "v_z_valid"))),
-        ("vehicle_odometry", _odometry_velocity),
+        ("vehicle_local_position", "vx vy vz", HALF_TURN, _valid("v_xy_valid", "v_z_valid")),
+        ("vehicle_odometry", "velocity[0] velocity[1] velocity[2]", HALF_TURN, _in_odometry_world),
+        ("vehicle_odometry", "vx vy vz", HALF_TURN, _in_odometry_world),
     ],
     "rate": [
-        ("vehicle_angular_velocity", _vector([f"xyz[{k}]" for k in range(3)])),
-        ("sensor_combined", _vector([f"gyro_rad[{k}]" for k in range(3)])),
+        ("vehicle_angular_velocity", "xyz[0] xyz[1] xyz[2]", HALF_TURN),
+        ("sensor_combined", "gyro_rad[0] gyro_rad[1] gyro_rad[2]", HALF_TURN),
     ],
     "acc": [
-        ("sensor_combined", _vector([f"accelerometer_m_s2[{k}]" for k in range(3)])),
-        ("vehicle_acceleration", _vector([f"xyz[{k}]" for k in range(3)])),
+        ("sensor_combined", " ".join(f"accelerometer_m_s2[{k}]" for k in range(3)), HALF_TURN),
+        ("vehicle_acceleration", "xyz[0] xyz[1] xyz[2]", HALF_TURN),
     ],
-    "cmd_rate": [("vehicle_rates_setpoint", _vector(("roll", "pitch", "yaw")))],
-    "throttle": [("vehicle_rates_setpoint", _throttle)],
-    "motor": [("esc_status", _motors)],
-    "voltage": [("battery_status", _voltage)],
+    "cmd_rate": [("vehicle_rates_setpoint", "roll pitch yaw", HALF_TURN)],
+    "throttle": [
+        ("vehicle_rates_setpoint", "thrust_body[2]", -1.0),
+        ("vehicle_rates_setpoint", "thrust", 1.0),  # before v1.10, positive upwards
+    ],
+    "motor": [
+        ("esc_status", " ".join(f"esc[{k}].esc_rpm" for k in range(4)), RPM, _in_motor_order)
+    ],
+    "voltage": [("battery_status", *VOLTAGE)],
 }
-"""Signal -> the topics that may hold it, each with its reader, in the order of preference."""
+"""Signal -> the topics that may hold it, in the order of preference, each with its fields, their
+factor, and a change before the factor."""
 
 
 def _motor_count(parameters: Mapping[str, Any], topics: Mapping[str, Topic]) -> list[Finding]:
@@ -313,7 +259,7 @@ def _other_battery(parts: dict[str, Part], others: Sequence[Topic]) -> list[Find
     if "voltage" not in parts or not check_voltage_fails(parts["voltage"][1]):
         return []
     for number, topic in enumerate(others, start=1):
-        part = _voltage(topic) if "timestamp" in topic else None
+        part = _part(topic, *VOLTAGE) if "timestamp" in topic else None
         if part is not None and not check_voltage_fails(part[1]):
             median_v = float(np.nanmedian(parts["voltage"][1]))
             parts["voltage"] = part
@@ -322,12 +268,17 @@ def _other_battery(parts: dict[str, Part], others: Sequence[Topic]) -> list[Find
     return []
 
 
-def _no_position(topics: Mapping[str, Topic]) -> list[Finding]:
-    """Return a note where the estimator's flags mark the local position as never valid."""
-    topic = topics.get("vehicle_local_position", {})
-    invalid = [f for f in ("xy_valid", "z_valid") if f in topic and not np.any(topic[f])]
-    text = f"{' and '.join(invalid)} of vehicle_local_position are false throughout"
-    return [Finding("note", "position", text)] if invalid else []
+def _check_position(topic: Topic) -> list[Finding]:
+    """Return findings where the local position is never valid, or was reset by the estimator."""
+    findings = []
+    if invalid := [f for f in ("xy_valid", "z_valid") if f in topic and not np.any(topic[f])]:
+        text = f"{' and '.join(invalid)} of vehicle_local_position are false throughout"
+        findings.append(Finding("note", "position", text))
+    counters = [topic[f] for f in ("xy_reset_counter", "z_reset_counter") if f in topic]
+    if jumps := sum(int(np.count_nonzero(np.diff(np.asarray(counter)))) for counter in counters):
+        text = f"the estimator moved the position {jumps} times in the log; it jumps there"
+        findings.append(Finding("doubt", "position", text))
+    return findings
 
 
 def _parameter(parameters: Mapping[str, Any], name: str) -> float:
@@ -366,13 +317,3 @@ def _check_file(log: Any) -> list[Finding]:
         )
         findings.append(Finding("note", "thrust", text))
     return findings
-
-
-def _resets(topic: Topic) -> list[Finding]:
-    """Return a doubt where the estimator has reset the position."""
-    jumps = 0
-    for name in ("xy_reset_counter", "z_reset_counter"):
-        if name in topic:
-            jumps += int(np.count_nonzero(np.diff(np.asarray(topic[name]))))
-    text = f"the estimator moved the position {jumps} times in the log; it jumps there"
-    return [Finding("doubt", "position", text)] if jumps else []

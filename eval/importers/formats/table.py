@@ -20,22 +20,20 @@ from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording
 from eval.logs.columns import FlightLogError, as_numbers
 from eval.logs.faults.finding import Finding
-from eval.logs.files import first_line, read_columns
+from eval.logs.files import PARQUET_MAGIC, first_line, read_columns
 from eval.logs.flight_log import flight_metadata
 from tracks.common.names import closest
 
 SUMMARY = "CSV or Parquet, described by a mapping file (--map)"
 ASKED_LAST = True
 """Other formats are tried before this one, which accepts any table."""
-PARQUET = b"PAR1"
-"""First bytes of a Parquet file."""
 _LIST_ENTRY = re.compile(r"^(.*)\[(\d)\]$")
 """Name of one number of a list column, such as `pos[0]`."""
 
 
 def detect(head: bytes, options: ImportOptions) -> bool:
     """Return whether a file with these first bytes is Parquet, or text that may be a table."""
-    if head.startswith(PARQUET):
+    if head.startswith(PARQUET_MAGIC):
         return True
     return b"\0" not in head and (options.map is not None or b"," in first_line(head))
 
@@ -47,16 +45,11 @@ def read(path: Path, options: ImportOptions) -> Recording:
         FlightLogError: for a file that is no table, or lacks a column of the mapping.
         ValueError: for a mapping file that cannot be used.
     """
-    return read_table(path, options.map, options)
-
-
-def read_table(path: Path, map_path: Path | None, options: ImportOptions) -> Recording:
-    """Return the signals of the table at `path`, by the mapping at `map_path`; see `read`."""
-    file_map = None if map_path is None else read_map(map_path)
+    file_map = None if options.map is None else read_map(options.map)
     columns, text, warnings = read_columns(path)
     mapping = file_map or own_map(columns)
     name, about = str(path), {}
-    if map_path is None:  # a flight log has metadata
+    if file_map is None:  # a flight log has metadata
         about, more_warnings = flight_metadata(text, name)
         warnings += more_warnings
     flag = "--pose-map" if path == options.pose else "--map"

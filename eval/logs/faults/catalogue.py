@@ -73,8 +73,3 @@ FAULTS: dict[str, tuple[str, str]] = {
     "file": ("the file is damaged, or of another kind", "log again"),
 }
 """Name of a fault -> its description, and the manoeuvre that makes it identifiable."""
-
-
-def manoeuvre(fault: str) -> str:
-    """Return the manoeuvre that makes `fault` identifiable."""
-    return FAULTS[fault][1]

@@ -10,7 +10,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.logs.columns import GROUPS
-from eval.logs.faults.catalogue import FAULTS, manoeuvre
+from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.clock import check_clock, check_time
 from eval.logs.faults.drive.commands import (
     check_controller_rate,
@@ -23,9 +23,8 @@ from eval.logs.faults.drive.commands import (
 from eval.logs.faults.drive.motor_map import check_motor_map
 from eval.logs.faults.drive.motors import check_lift, check_motors
 from eval.logs.faults.finding import Finding, findings_of, line
-from eval.logs.faults.height import check_height_sign
-from eval.logs.faults.jumps import check_jumps
-from eval.logs.faults.pose import Rows, check_pose, fit_pose_readings
+from eval.logs.faults.pose import Rows, check_pose
+from eval.logs.faults.position import check_height_sign, check_jumps
 from eval.logs.faults.reading import Readings, read_rows, readings_in
 from eval.logs.faults.sensors import check_accelerometer_bias, check_barometer, check_voltage
 from eval.logs.faults.vectors import check_accelerometer, check_gyro, check_velocity
@@ -64,7 +63,7 @@ Check = Callable[[Rows, CheckContext], list[Finding]]
 CLOCK: tuple[Check, ...] = (lambda rows, _: check_time(rows),)
 """The unit of the time, which all other checks need."""
 POSE: tuple[Check, ...] = (
-    lambda rows, _: check_pose(rows, fit_pose_readings(rows)),
+    lambda rows, _: check_pose(rows),
     lambda rows, against: [] if "attitude" in against.found else check_height_sign(rows),
     lambda rows, _: check_gyro(rows),
     lambda rows, _: check_velocity(rows),
@@ -175,7 +174,7 @@ def check_log(
     findings, readings, _ = run_checks(rows_of(log), checks, against, fix)
     action = {} if log.action_b is None else {"action": log.action_b}
     measured = {"time": log.time_s, **action, **_signals(columns_from_log(log))}
-    findings += check_controller_rate(measured, against.policy_hz, "the policy")
+    findings += check_controller_rate(measured, against.policy_hz)
     findings += [] if log.pos_w is None else check_jumps(log.time_s, log.pos_w)
     findings += check_vehicle_name(log.about, against.vehicle)
     again = {finding.fault for finding in findings if finding.fault}
@@ -290,7 +289,7 @@ def not_identifiable(findings: Sequence[Finding]) -> list[dict[str, str]]:
     """Return the faults that are not identifiable from the flights, each with a manoeuvre."""
     faults = {f.fault: f.evidence for f in findings if f.status == "not identifiable"}
     return [
-        {"fault": fault, "why": why, "manoeuvre": manoeuvre(fault)} for fault, why in faults.items()
+        {"fault": fault, "why": why, "manoeuvre": FAULTS[fault][1]} for fault, why in faults.items()
     ]
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eval.importers.frames import conjugate, multiply, rotation_vector
+from eval.importers.frames import rates_between
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import SPAN_S, Rows
 from eval.logs.faults.reading import TIMES, option
@@ -97,12 +97,11 @@ def check_clock(rows: Rows) -> list[Finding]:
     """Return findings on the pose's delay against the gyro, and on the drift of this delay."""
     if not {"quat", "rate"} <= rows.keys():
         return []
-    known = [np.isfinite(rows[name]).all(axis=1) for name in ("quat", "rate")]
-    (quat_time, quat), (rate_time, rate) = (
-        (rows["time"][good], rows[name][good])
-        for name, good in zip(("quat", "rate"), known, strict=True)
-    )
-    late = delay_of(quat_time, quat, rate_time, rate)
+    known_signals = []
+    for name in ("quat", "rate"):
+        known = np.isfinite(rows[name]).all(axis=1)
+        known_signals += [rows["time"][known], rows[name][known]]
+    late = delay_of(*known_signals)
     if late is None:
         text = "the flight turns too little to hold its clocks against each other"
         return unseen("pose clock", text, "clock_offset", "clock_drift")
@@ -136,7 +135,7 @@ def delay_of(
     # Body rates from the attitude: rotations from `first` to `last`, where no rows are missing.
     unit = quat / np.linalg.norm(quat, axis=1, keepdims=True)
     first, last = quat_time[:-count], quat_time[count:]
-    span = last - first
+    span, turns = rates_between(quat_time, unit, count)
     inside = (
         (span < 1.5 * count * step)
         & (first > rate_time[0] + REACH_S)
@@ -144,7 +143,6 @@ def delay_of(
     )
     if inside.sum() < 100:
         return None
-    turns = rotation_vector(multiply(conjugate(unit[:-count]), unit[count:])) / span[:, None]
     first, last, turns = first[inside], last[inside], turns[inside]
     # Integral of the gyro, from which its mean over any time follows by interpolation.
     area = 0.5 * np.diff(rate_time)[:, None] * (rate[1:] + rate[:-1])

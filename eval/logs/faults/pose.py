@@ -9,14 +9,15 @@ Second, the attitude rotates at the gyro's rates, in any axes and unit of the gy
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.frames import conjugate, multiply, rotate, rotation_vector
+from eval.importers.frames import rates_between, rotate
 from eval.logs.faults.finding import Finding, unseen
-from eval.logs.faults.reading import ORDERS, axes_matrix, option, read_as
+from eval.logs.faults.reading import ANGLES, ORDERS, axes_matrix, option, read_as
 from eval.logs.faults.relation import Match, match, rms, rms_of_squares, smooth
 from eval.logs.velocity import velocity_from_position
 
@@ -37,10 +38,9 @@ EACH = 0.06
 """Penalty on the misfit for each step of a reading, so that the simplest good one is chosen."""
 DRAG, BIAS = 1.2, 1.0
 """Largest drag [1/s] and constant side force [m/s^2] that are removed from a measured force."""
-# Steps of a reading of the attitude (see `reading`), "" for none: direction, frames, signs.
+# Steps of a reading of the attitude (see `reading`), "" for none: direction, frames.
 _SENSES = ("", "inverse")
 _FRAMES = ("", "ned", "frd", "ned+frd")
-_ANGLES = ("-roll", "-pitch", "-yaw")
 SHOWN = (
     *("attitude", "attitude_sign", "quaternion_order", "quaternion_direction", "world_frame"),
     *("body_frame", "position_axes", "position_unit"),
@@ -105,10 +105,9 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
     seen_as: dict[tuple[str, bool], Match] = {}
     gyro = smooth(time_s, rows["rate"], WIDTH_S)[::every] if "rate" in rows else None
     path = _path(time_s, rows["pos"], every) if "pos" in rows else None
+    rate = 0.0 if gyro is None else rms(gyro)
     found, level = [], 0.0
     for steps in _attitudes():
-        if len(found) == 1 and _is_right(found[0]):
-            break
         base = "+".join(step for step in steps.split("+") if step not in ("ned", "frd"))
         frames = {"ned", "frd"} & set(steps.split("+"))
         read, frd = read_as("quat", quat, steps) if steps else quat, "frd" in frames
@@ -119,45 +118,40 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
                 turned[base] * [1.0, -1.0, -1.0] if frd else turned[base], gyro
             )
         seen = seen_as.get((base, frd))
-        turns = None if seen is None else _misfit_of(seen)
+        turns = None if seen is None else seen.misfit(seen.alike)
         forces: dict[tuple[str, float], tuple[float, float]] = {}
         if path is not None:
             forces = _force_misfits(_axes_of(time_s, read, every), path)
         # A wrong frame is one mistake, of the attitude alone or of attitude and gyro.
         count = sum(step not in ("", "ned", "frd") for step in steps.split("+")) + bool(frames)
-        apart = 0 if seen is None else int(seen.axes != "x,y,z")
-        apart = 0 if "frd" in frames and seen is not None and seen.axes == "x,-y,-z" else apart
-        for pos in POSITIONS if path is not None else POSITIONS[:1]:
-            for length in LENGTHS if path is not None else (1.0,):
-                if len(found) == 1 and _is_right(found[0]):
-                    break
-                if (steps and pos in SWAPS) or (length > 1.0 and (steps or pos)):
-                    continue
-                force, size = forces.get((pos, length), (None, 0.0))
-                level = max(level, size) if not steps and not pos and length == 1.0 else level
-                taken = count + apart + (pos != "") + (length != 1.0)
-                if frames == {"ned", "frd"} and pos == "x,-y,-z":
-                    taken -= 1  # one mistake: the whole log is north-east-down
-                parts = [part for part in (force, turns) if part is not None]
-                misfit = float(np.sqrt(np.mean(np.square(parts)))) if parts else 0.0
-                found.append(Reading(steps, pos, length, taken, misfit, force, turns, seen))
+        axes = "x,y,z" if seen is None else seen.axes
+        taken = count + (axes != "x,y,z" and not ("frd" in frames and axes == "x,-y,-z"))
+        for pos, length in product(POSITIONS, LENGTHS) if path is not None else [("", 1.0)]:
+            if (steps and pos in SWAPS) or (length > 1.0 and (steps or pos)):
+                continue
+            force, size = forces.get((pos, length), (None, 0.0))
+            # The whole log is north-east-down: one mistake.
+            whole = frames == {"ned", "frd"} and pos == "x,-y,-z"
+            changes = taken + (pos != "") + (length != 1.0) - whole
+            parts = [part for part in (force, turns) if part is not None]
+            misfit = float(np.sqrt(np.mean(np.square(parts)))) if parts else 0.0
+            one = Reading(steps, pos, length, changes, misfit, force, turns, seen)
+            if not found:
+                level, is_turned = size, seen is not None and seen.is_turned
+                if force is not None and misfit < RIGHT and not is_turned:  # no other need be tried
+                    return PoseFits(one, one, np.inf, (), level, rate)
+            found.append(one)
     best = min(found, key=lambda one: one.misfit + EACH * one.steps)
     others = [one for one in found if one is not best and one.steps <= best.steps + 1]
     second = min((o.misfit + EACH * (o.steps - best.steps) for o in others), default=np.inf)
     alike = (one for one in others if one.misfit < best.misfit + 0.5 * EACH)
     rivals = tuple(one for one in alike if one is not found[0])
-    rate = 0.0 if gyro is None else rms(gyro)
     return PoseFits(found[0], best, second, rivals, level, rate)
 
 
-def _is_right(one: Reading) -> bool:
-    """Return whether the given reading fits, so that no other need be tried."""
-    turned = one.gyro is not None and one.gyro.is_turned
-    return one.force is not None and one.misfit < RIGHT and not turned
-
-
-def check_pose(rows: Rows, fits: PoseFits | None) -> list[Finding]:
+def check_pose(rows: Rows) -> list[Finding]:
     """Return the findings on attitude and position."""
+    fits = fit_pose_readings(rows)
     if fits is None:
         return unseen("attitude", "the log has no attitude", *SHOWN) if "pos" in rows else []
     given, best = fits.given, fits.best
@@ -175,65 +169,49 @@ def check_pose(rows: Rows, fits: PoseFits | None) -> list[Finding]:
         if given.misfit < BAD or (given.gyro is not None and given.gyro.is_turned):
             noisy = given.misfit > GOOD
             found = Finding("note" if noisy else "ok", "attitude", figures)
-            return [found, *_same_fit([r for r in fits.rivals if r.quat in _ANGLES])]
+            return [found, *_same_fit([r for r in fits.rivals if r.quat in ANGLES])]
         text = f"{figures}: no other order, direction, sign or frame of it fits"
         sure = 0.9 if given.misfit > 1.0 else 0.6
         return [Finding("doubt", "attitude", text, "attitude", given.misfit, sure, "see --pose")]
     better = given.misfit / max(best.misfit, 1e-3)
     clear = fits.second - best.misfit
     sure = best.misfit < GOOD and better > TIMES_BETTER and clear > 0.5 * EACH
-    readings = _readings(best, rows)
     text = f"{figures}; {_figures(best)} if {_words(best)}"
     if given.misfit < BAD and not sure:
         return [Finding("ok", "attitude", figures)]
     confidence = 0.99 if sure and clear > 2.0 * EACH else 0.95 if better > TIMES_BETTER else 0.7
-    names = list(_names(best))
+    status, changes = "corrected" if sure else "doubt", list(_changes(best))
     found = [
-        Finding("corrected" if sure else "doubt", signal, text, name, None, confidence,
-                option(*(r for r in readings if r[0] in of)))
-        for name, signal, of in names
-        if any(r[0] in of for r in readings)
+        Finding(status, signal, text, fault, None, confidence,
+                option(*(r for r in readings if r[0] in rows)))
+        for fault, signal, readings in changes
     ]  # fmt: skip
     more = _same_fit([one for one in fits.rivals if one.steps <= best.steps])
-    return found + [one for one in more if one.fault not in {name for name, *_ in names}]
+    return found + [one for one in more if one.fault not in {fault for fault, *_ in changes}]
 
 
 def _same_fit(rivals: Sequence[Reading]) -> list[Finding]:
     """Return "not identifiable" findings for the faults of readings that fit as well."""
-    words = {name: _words(one) for one in rivals for name, *_ in _names(one)}
+    words = {fault: _words(one) for one in rivals for fault, *_ in _changes(one)}
     text = "it fits as well if {}"
-    return [one for name, w in words.items() for one in unseen("attitude", text.format(w), name)]
+    return [one for fault, w in words.items() for one in unseen("attitude", text.format(w), fault)]
 
 
-def _names(best: Reading) -> Iterator[tuple[str, str, tuple[str, ...]]]:
-    """Yield (fault, subject, signals to correct) for each change of a reading."""
-    steps = set(best.quat.split("+")) - {""}
-    pose, world = ("quat", "cmd_quat"), ("pos", "vel")
-    if steps:
-        name = "attitude_sign"
+def _changes(best: Reading) -> Iterator[tuple[str, str, list[tuple[str, str]]]]:
+    """Yield (fault, subject, readings that correct it) for each change of a reading."""
+    if best.quat:
+        steps, fault = set(best.quat.split("+")), "attitude_sign"
         if {"ned", "frd"} & steps:
-            name = "body_frame" if "frd" in steps and "ned" not in steps else "world_frame"
-        name = "quaternion_direction" if "inverse" in steps else name
-        name = "quaternion_order" if steps & set(ORDERS) else name
-        yield name, "attitude", pose
+            fault = "body_frame" if "ned" not in steps else "world_frame"
+        fault = "quaternion_direction" if "inverse" in steps else fault
+        fault = "quaternion_order" if steps & set(ORDERS) else fault
+        yield fault, "attitude", [(name, best.quat) for name in ("quat", "cmd_quat")]
+    axes = [best.pos] if best.pos else []
     if best.length != 1.0:
-        yield "position_unit", "position", world
+        yield "position_unit", "position", [("pos", "+".join([*axes, f"{best.length:g}"]))]
     elif best.pos:
-        yield (
-            "world_frame" if best.pos in ("x,-y,-z", "y,x,-z") else "position_axes",
-            "position",
-            world,
-        )
-
-
-def _readings(best: Reading, rows: Rows) -> list[tuple[str, str]]:
-    """Return (signal, steps) of a reading, for options of `suite import`."""
-    found = [(name, best.quat) for name in ("quat", "cmd_quat") if best.quat and name in rows]
-    steps = [best.pos] if best.pos else []
-    steps += [f"{best.length:g}"] if best.length != 1.0 else []
-    if steps:
-        found.append(("pos", "+".join(steps)))
-    return found
+        fault = "world_frame" if best.pos in ("x,-y,-z", "y,x,-z") else "position_axes"
+        yield fault, "position", [("pos", best.pos)]
 
 
 def _words(best: Reading) -> str:
@@ -271,7 +249,7 @@ def _attitudes() -> Iterator[str]:
     for base in ("+".join(s for s in (o, i) if s) for o in ("", *ORDERS) for i in _SENSES):
         for frames in _FRAMES:
             yield "+".join(s for s in (base, frames) if s)
-    yield from _ANGLES
+    yield from ANGLES
 
 
 def _unit(quat: np.ndarray) -> np.ndarray:
@@ -284,18 +262,10 @@ def turns_of(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
     count = max(1, round(0.5 * SPAN_S / float(np.median(np.diff(time_s)))))
     rates = np.full((len(time_s), 3), np.nan)
     if len(time_s) > 2 * count:
-        step = (time_s[2 * count :] - time_s[: -2 * count])[:, None]
-        relative = multiply(conjugate(quat[: -2 * count]), quat[2 * count :])
-        no_row_missing = step < 1.5 * (2 * count) * float(np.median(np.diff(time_s)))
-        rates[count:-count] = np.where(no_row_missing, rotation_vector(relative) / step, np.nan)
+        span_s, turns = rates_between(time_s, quat, 2 * count)
+        no_row_missing = span_s < 1.5 * (2 * count) * float(np.median(np.diff(time_s)))
+        rates[count:-count] = np.where(no_row_missing[:, None], turns, np.nan)
     return rates
-
-
-def _misfit_of(seen: Match) -> float:
-    """Return the share of the attitude's body rates that the gyro's best axes do not explain."""
-    weight = seen.level**2
-    unexplained = weight * (1.0 - np.clip(seen.alike, 0.0, 1.0) ** 2)
-    return float(np.sqrt(unexplained.sum() / max(weight.sum(), 1e-12)))
 
 
 def _axes_of(time_s: np.ndarray, quat: np.ndarray, every: int) -> np.ndarray:

@@ -1,23 +1,6 @@
 """Readings: ways to interpret a signal, as in `--read rate=x,-y,-z+0.0610352`.
 
-| step | what it does | signals |
-|---|---|---|
-| `0.01` | multiply by this | all |
-| `x,-y,-z` | take these columns with these signs | pos vel rate acc cmd_rate cmd_torque |
-| `2,1,4,3` | these motors of the vehicle's order, in this order | motor motor_cmd pwm |
-| `xyzw` | the file's columns have this order, and were read as wxyz | quat cmd_quat |
-| `wxyz` | the file's columns have this order, and were read as xyzw | quat cmd_quat |
-| `ned-xyzw`, `ned-wxyz` | the same in a file with NED world and FRD body | quat cmd_quat |
-| `inverse` | the file's quaternion maps world to body | quat cmd_quat |
-| `ned`, `frd` | the file's world points down; its body is forward-right-down | quat cmd_quat |
-| `-roll`, `-pitch`, `-yaw` | change the angle's sign | quat cmd_quat |
-| `from-body`, `from-world` | rotate by the attitude into the log's axes | vel rate acc |
-| `plus-gravity` | add gravity, which the file has removed | acc |
-| `1000-2000` | map pulse widths in us to 0 to 1 | throttle pwm |
-| `ms`, `us`, `ns` | unit of all times | time |
-| `drop` | leave the signal out | all but time |
-
-Steps are joined by `+` and applied from left to right.
+docs/check.md lists the steps; they are joined by `+` and applied from left to right.
 """
 
 from __future__ import annotations
@@ -43,12 +26,13 @@ forward-left-up axes."""
 # How the texts of steps look: axes such as `x,-y,-z`, and an order of motors such as `2,1,4,3`.
 _AXES = re.compile(r"^-?[xyz],-?[xyz],-?[xyz]$")
 _ORDER = re.compile(r"^[1-4](,[1-4]){3}$")
-_ANGLES = ("-roll", "-pitch", "-yaw")
+ANGLES = ("-roll", "-pitch", "-yaw")
+"""Steps that change the sign of an angle."""
 ORDERS = ("xyzw", "wxyz", "ned-xyzw", "ned-wxyz")
 """Steps that change the order of a quaternion's columns."""
 BY_ATTITUDE = ("from-body", "from-world", "plus-gravity")
 """Steps that need an attitude."""
-_QUAT_STEPS = (*ORDERS, "inverse", "ned", "frd", *_ANGLES)
+_QUAT_STEPS = (*ORDERS, "inverse", "ned", "frd", *ANGLES)
 Readings = tuple[tuple[str, str], ...]
 """(signal, steps) in the order of application."""
 
@@ -93,8 +77,7 @@ def read_as(
 ) -> np.ndarray:
     """Return samples (N, C) of a signal after the steps of a reading.
 
-    The table in this module's docstring has the steps. `quat` returns the attitude (N, 4) wxyz at
-    the same times, for `from-body`, `from-world` and `plus-gravity`.
+    `quat` returns the attitude (N, 4) wxyz at the same times, for the steps of `BY_ATTITUDE`.
     """
     for step in _split(steps):
         if step in BY_ATTITUDE:
@@ -185,5 +168,5 @@ def _quat_as(value: np.ndarray, step: str) -> np.ndarray:
     known = np.isfinite(value).all(axis=1) & (np.linalg.norm(value, axis=1) > 0.0)
     angles = np.zeros((len(value), 3))
     angles[known] = Rotation.from_quat(value[known], scalar_first=True).as_euler("ZYX")[:, ::-1]
-    angles[:, _ANGLES.index(step)] *= -1.0
+    angles[:, ANGLES.index(step)] *= -1.0
     return np.where(known[:, None], from_euler(angles), np.nan)

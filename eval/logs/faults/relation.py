@@ -6,6 +6,7 @@ the signal to check (`given`), such as the gyro, whose axes may be swapped or in
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import permutations
 from typing import NamedTuple
 
@@ -65,10 +66,23 @@ class Match(NamedTuple):
         worse = self.seen & (self.alike - self.as_given > UNLIKE) & (self.alike > ALIKE)
         return bool(worse.any() and "".join(self.axes.split(",")).replace("-", "") == "xyz")
 
+    def misfit(self, correlations: np.ndarray) -> float:
+        """Return the relative residual at these correlations (3,), after the scale is fitted."""
+        weight = self.level**2
+        unexplained = weight * (1.0 - np.clip(correlations, 0.0, 1.0) ** 2)
+        return float(np.sqrt(unexplained.sum() / max(weight.sum(), 1e-12)))
+
 
 def match(wanted: np.ndarray, given: np.ndarray) -> Match:
-    """Return the relation of `given` (N, 3) to `wanted` (N, 3); rows with a NaN are not used."""
-    wanted, given = _clear(wanted, given)
+    """Return the relation of `given` (N, 3) to `wanted` (N, 3).
+
+    Rows with a NaN or an outlier are not used.
+    """
+    good = np.isfinite(wanted).all(axis=1) & np.isfinite(given).all(axis=1)
+    for size in (np.linalg.norm(value, axis=1) for value in (wanted, given)):
+        if good.any():
+            good = good & (size <= 8.0 * np.quantile(size[good], 0.9) + 1e-12)
+    wanted, given = wanted[good], given[good]
     if len(wanted) < LEAST:
         wanted = given = np.zeros((LEAST, 3))
     # Correlation of every axis with every other, and the order of axes with the largest ones.
@@ -93,11 +107,7 @@ def match(wanted: np.ndarray, given: np.ndarray) -> Match:
         and score[p] > score[order] - CLEAR
         and all(abs(corr[k, p[k]]) > ALIKE for k in range(3) if p[k] != order[k])
     ]
-    rival = (
-        ",".join("xyz"[k] for k in max(alternatives, key=lambda p: score[p]))
-        if alternatives
-        else ""
-    )
+    rival = ",".join("xyz"[k] for k in max(alternatives, key=lambda p: score[p], default=()))
     ratio = other[list(order)] / np.maximum(level, 1e-12)
     r = np.clip(np.abs(best), 1e-3, 1.0)
     alike = best * sign
@@ -118,6 +128,11 @@ def pooled_scale(found: Match) -> tuple[float, float, float]:
         for value in (found.scale, found.low, found.high)
     ]
     return mean[0], mean[1], mean[2]
+
+
+def within(table: Mapping[str, float], limit: float, factor: float) -> list[str]:
+    """Return the names in `table` whose value is within the ratio `limit` of `factor`."""
+    return [n for n, wrong in table.items() if abs(np.log(factor / wrong)) < np.log(limit)]
 
 
 def smooth(time_s: np.ndarray, value: np.ndarray, width_s: float) -> np.ndarray:
@@ -172,14 +187,3 @@ def jackknife_error(left_out: np.ndarray) -> float:
     """Return the jackknife's standard error from estimates (B,), each without one of B blocks."""
     count = len(left_out)
     return float(np.sqrt((count - 1) / count * np.sum((left_out - left_out.mean()) ** 2)))
-
-
-def _clear(wanted: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return both measurements in the rows in which both are finite and neither is an outlier."""
-    good = np.isfinite(wanted).all(axis=1) & np.isfinite(given).all(axis=1)
-    for value in (wanted, given):
-        size = np.linalg.norm(value, axis=1)
-        known = size[good]
-        if len(known):
-            good = good & (size <= 8.0 * np.quantile(known, 0.9) + 1e-12)
-    return wanted[good], given[good]

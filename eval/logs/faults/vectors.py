@@ -15,7 +15,7 @@ from eval.importers.frames import conjugate, rotate
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows, turns_of
 from eval.logs.faults.reading import option, read_as
-from eval.logs.faults.relation import LEAST, SEEN, Match, match, pooled_scale, rms, smooth
+from eval.logs.faults.relation import LEAST, SEEN, Match, match, pooled_scale, rms, smooth, within
 from eval.logs.velocity import velocity_from_position
 
 DEG = float(np.pi / 180.0)
@@ -76,24 +76,21 @@ def check_gyro(rows: Rows) -> list[Finding]:
     if "rate" not in rows:
         return []
     if "quat" not in rows:
-        unknown = unseen("gyro", "the log has no attitude", "gyro_axes", "gyro_frame")
-        return [*unknown, *_gyro_scale_alone(rows, "the log has no attitude")]
+        return _gyro_alone(rows, "the log has no attitude", "gyro_axes", "gyro_frame")
     time_s = rows["time"]
     turns = smooth(time_s, turns_of(time_s, rows["quat"]), WIDTH_S)
     gyro = smooth(time_s, rows["rate"], WIDTH_S)
     size = rms(turns)
     if size < CALM_RATE:
         text = f"turns of {size:.2g} rad/s are too small to check it by"
-        unknown = unseen("gyro", text, "gyro_axes", "gyro_frame", "body_frame")
-        return [*unknown, *_gyro_scale_alone(rows, text)]
+        return _gyro_alone(rows, text, "gyro_axes", "gyro_frame", "body_frame")
     found = match(turns, gyro)
     world = match(rotate(rows["quat"], turns), gyro)
-    in_world = not found.is_turned and _left(world) < GOOD and _left(found) > max(
-        BAD, TIMES_BETTER * _left(world))  # fmt: skip
-    if in_world:
+    in_body, in_world = found.misfit(found.as_given), world.misfit(world.as_given)
+    if not found.is_turned and in_world < GOOD and in_body > max(BAD, TIMES_BETTER * in_world):
         text = (
-            f"its turns are off the attitude's by {100 * _left(found):.0f} % in body axes and by "
-            f"{100 * _left(world):.0f} % in world axes"
+            f"its turns are off the attitude's by {100 * in_body:.0f} % in body axes and by "
+            f"{100 * in_world:.0f} % in world axes"
         )
         fix = option(("rate", "from-world"))
         return [Finding("corrected", "gyro", text, "gyro_frame", None, 0.98, fix)]
@@ -106,33 +103,33 @@ def check_gyro(rows: Rows) -> list[Finding]:
         findings.append(_turned(found, "rate", "gyro"))
     elif not found.seen.any():
         text = "its noise hides how the attitude turns"
-        unknown = unseen("gyro", text, "gyro_axes", "gyro_frame", "body_frame")
-        return [*unknown, *_gyro_scale_alone(rows, text)]
+        return _gyro_alone(rows, text, "gyro_axes", "gyro_frame", "body_frame")
     findings += _unseen_axes(found, "gyro", "gyro_axes", "body_frame")
     findings += _unit(found, RATES, "rate", "gyro", "gyro_scale", "the attitude's turns")
     return findings
 
 
-def _gyro_scale_alone(rows: Rows, why: str) -> list[Finding]:
-    """Return the finding on the gyro's scale without an attitude to compare it with.
+def _gyro_alone(rows: Rows, why: str, *faults: str) -> list[Finding]:
+    """Return the findings on the gyro without an attitude to compare it with, for the reason `why`.
 
-    Rates that no vehicle reaches are a fault; others are not identifiable for the reason `why`.
+    `faults` are not identifiable then. Rates that no vehicle reaches are a fault of its scale.
     """
     size = np.linalg.norm(rows["rate"], axis=1)
     known = size[np.isfinite(size)]
     top = float(np.quantile(known, 0.99)) if len(known) else 0.0
     if top < GYRO_TOP:
-        return unseen("gyro", why, "gyro_scale")
+        return unseen("gyro", why, *faults, "gyro_scale")
+    unknown = unseen("gyro", why, *faults)
     text = f"it reads up to {top:.4g} rad/s, and no gyro of a drone measures that; {why}"
     command = rms(rows["cmd_rate"]) if "cmd_rate" in rows else 0.0
     ratio = rms(rows["rate"]) / command if command > CALM_RATE else 0.0
-    for words, factor in RATES.items():
-        if ratio > 0.0 and abs(np.log(ratio / factor)) < np.log(1.5):
-            text = f"{text}. It is {ratio:.3g} times the commanded rates: {words}"
-            about = ("gyro_scale", factor, 0.95, option(("rate", f"{1.0 / factor:.10g}")))
-            return [Finding("corrected", "gyro", text, *about)]
+    for words in within(RATES, 1.5, ratio) if ratio > 0.0 else ():
+        text = f"{text}. It is {ratio:.3g} times the commanded rates: {words}"
+        fix = option(("rate", f"{1.0 / RATES[words]:.10g}"))
+        found = Finding("corrected", "gyro", text, "gyro_scale", RATES[words], 0.95, fix)
+        return [*unknown, found]
     fix = f"{option(('rate', f'{DEG:.6g}'))} for deg/s, or {DEG / COUNTS:.6g} for raw counts"
-    return [Finding("doubt", "gyro", text, "gyro_scale", None, 0.95, fix)]
+    return [*unknown, Finding("doubt", "gyro", text, "gyro_scale", None, 0.95, fix)]
 
 
 def _turned(found: Match, signal: str, subject: str) -> Finding:
@@ -206,7 +203,7 @@ def check_velocity(rows: Rows) -> list[Finding]:
     for way in ways:
         value = read_as("vel", rows["vel"], way, lambda: rows["quat"]) if way else rows["vel"]
         matches[way] = match(path, smooth(time_s, value, WIDTH_S))
-    residual = {way: _left(matched) for way, matched in matches.items()}
+    residual = {way: matched.misfit(matched.as_given) for way, matched in matches.items()}
     best = min(residual, key=lambda way: residual[way])
     here = matches[""]
     figures = f"it is off the path's derivative by {100 * residual['']:.0f} %, its scale left out"
@@ -270,14 +267,8 @@ def check_accelerometer(rows: Rows, body_is_frd: bool = False) -> list[Finding]:
     }
     size = rms(force)
     if not np.isfinite(force).all(axis=1).sum() > LEAST or size < 1.0:
-        text = "there is no path to check it by"
-        return unseen(
-            "accelerometer",
-            text,
-            "accelerometer_unit",
-            "accelerometer_axes",
-            "accelerometer_gravity",
-        )
+        faults = ("accelerometer_unit", "accelerometer_axes", "accelerometer_gravity")
+        return unseen("accelerometer", "there is no path to check it by", *faults)
     residual = {name: rms(value - force) / size for name, value in readings.items()}
     given = residual["", 1.0]
     first = "x,-y,-z" if body_is_frd else ""
@@ -378,13 +369,6 @@ def upwards(acc: np.ndarray) -> tuple[np.ndarray, float]:
     known = acc[np.isfinite(acc).all(axis=1)]
     mean = np.median(known, axis=0) if len(known) else np.array([0.0, 0.0, 1.0])
     return mean, float(mean[2]) / max(float(np.linalg.norm(mean)), 1e-9)
-
-
-def _left(found: Match) -> float:
-    """Return the relative residual of a signal in the axes as given, after its scale is fitted."""
-    weight = found.level**2
-    unexplained = weight * (1.0 - np.clip(found.as_given, 0.0, 1.0) ** 2)
-    return float(np.sqrt(unexplained.sum() / max(weight.sum(), 1e-12)))
 
 
 def _middle(value: np.ndarray) -> float:

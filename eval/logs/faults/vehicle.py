@@ -57,35 +57,25 @@ def check_vehicle_numbers(vehicle: Vehicle) -> list[Finding]:
         )
         fix = "inertia in kg m^2, of this vehicle, or rotors.position in m"
         found.append(Finding("doubt", "vehicle", text, "vehicle_inertia", gyration, 0.93, fix))
-    found += [*_rotor_torque(vehicle), *_rate_gain(vehicle)]
-    return found or [Finding("ok", "vehicle", f"full thrust is {lift:.3g} times the weight")]
-
-
-def _rotor_torque(vehicle: Vehicle) -> list[Finding]:
-    """Return a finding if the ratio of a rotor's torque to its thrust is implausible."""
     torque = vehicle.rotors.torque_coefficient
     ratio_m = torque / vehicle.rotors.thrust_coefficient
-    if TORQUE_M[0] <= ratio_m <= TORQUE_M[1]:
-        return []
-    text = f"torque_coefficient / thrust_coefficient is {ratio_m:.3g} m; usual are 0.005 to 0.05 m"
-    fix = "rotors.torque_coefficient in N m/(rad/s)^2"
-    if TORQUE_M[0] <= torque <= TORQUE_M[1]:
-        fix = "PX4's KM is this ratio: torque_coefficient = KM * thrust_coefficient"
-    return [Finding("doubt", "vehicle", text, "vehicle_torque", ratio_m, 0.95, fix)]
-
-
-def _rate_gain(vehicle: Vehicle) -> list[Finding]:
-    """Return a finding if the gain of the nominal rate loop is implausibly small."""
+    if not TORQUE_M[0] <= ratio_m <= TORQUE_M[1]:
+        text = f"torque_coefficient / thrust_coefficient is {ratio_m:.3g} m; usual are "
+        fix = "rotors.torque_coefficient in N m/(rad/s)^2"
+        if TORQUE_M[0] <= torque <= TORQUE_M[1]:
+            fix = "PX4's KM is this ratio: torque_coefficient = KM * thrust_coefficient"
+        about = ("vehicle_torque", ratio_m, 0.95, fix)
+        found.append(Finding("doubt", "vehicle", text + "0.005 to 0.05 m", *about))
     gain = min(vehicle.controller.rate_gain)
-    if vehicle.controller.kind != "p" or gain >= GAIN:
-        return []
-    text = f"the smallest controller.rate_gain is {gain:.3g} 1/s; usual are 5 to 40 1/s"
-    fix = (
-        "gains are 1/s: angular acceleration for each rad/s of rate error; a firmware's PID gains "
-        "have other units (docs/measure.md)"
-    )
-    # Only rollouts by rate commands use the gains, so they do not stop a diagnosis.
-    return [Finding("note", "vehicle", text, "vehicle_gain", gain, 0.95, fix)]
+    if vehicle.controller.kind == "p" and not gain >= GAIN:
+        text = f"the smallest controller.rate_gain is {gain:.3g} 1/s; usual are 5 to 40 1/s"
+        fix = (
+            "gains are 1/s: angular acceleration for each rad/s of rate error; a firmware's PID "
+            "gains have other units (docs/measure.md)"
+        )
+        # Only rollouts by rate commands use the gains, so they do not stop a diagnosis.
+        found.append(Finding("note", "vehicle", text, "vehicle_gain", gain, 0.95, fix))
+    return found or [Finding("ok", "vehicle", f"full thrust is {lift:.3g} times the weight")]
 
 
 def _gyration(vehicle: Vehicle, arm: float) -> float:

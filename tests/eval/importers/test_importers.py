@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from eval.importers import import_log
 from eval.importers.assemble import assemble, usable_for
-from eval.importers.checks.angles import check_angles
 from eval.importers.formats import FORMATS, detect
+from eval.importers.mapping import check_angles
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, Signal
 from eval.logs.columns import FlightLogError

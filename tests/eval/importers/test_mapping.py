@@ -11,13 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from eval.importers import import_log, mapping
 from eval.importers.formats import table
-from eval.importers.mapping_file import MIXERS, Column, LogMap, map_file, read_map, shipped_maps
+from eval.importers.mapping_file import MIXERS, SHIPPED, Column, LogMap, map_file, read_map
 from eval.importers.options import ImportOptions
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.reading import parse_readings
 from tests.support import known_flight
 from tests.support.imported import TRUE, flight, near, same_flight, text, write
 from tests.support.vehicles import PLAIN
+from tracks.common.toml_table import shipped_names
 
 POSE = 'pos = {column = "p"}\nquat = {column = "q", order = "xyzw"}\n'
 GRAVITY = np.array([0.0, 0.0, 9.81])
@@ -182,8 +183,9 @@ def test_unsigned_times_may_go_back_before_the_first_one():
 
 
 def test_every_shipped_mapping_is_read_by_its_name():
-    assert {"nanobench", "crazypad", "crazyswarm2", "crazyflie"} <= set(shipped_maps())
-    for name in shipped_maps():
+    names = shipped_names(SHIPPED)
+    assert {"nanobench", "crazypad", "crazyswarm2", "crazyflie"} <= set(names)
+    for name in names:
         assert read_map(Path(name)).motor_side is not None
 
 

@@ -5,8 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from eval.importers import import_log
-from eval.importers.checks.airborne import airborne
-from eval.importers.checks.glitches import clean
+from eval.importers.cleaning import airborne, clean
 from eval.importers.options import ImportOptions
 from eval.importers.pose import _in_seconds, align, with_pose
 from eval.importers.rows import averaged, row_times, smoothed

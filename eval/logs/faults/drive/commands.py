@@ -10,12 +10,12 @@ from __future__ import annotations
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.logs.faults.drive.motors import over_force, torque_correlations, turn_scale, within
+from eval.logs.faults.drive.motors import fit_force, torque_correlations, turn_scale
 from eval.logs.faults.drive.rate_following import bend, delayed, loop_gain
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows
 from eval.logs.faults.reading import option
-from eval.logs.faults.relation import match, pooled_scale, rms, smooth
+from eval.logs.faults.relation import match, pooled_scale, rms, smooth, within
 from eval.logs.faults.vectors import DEG, RATES, UPWARDS, check_gyro, upwards
 from eval.vehicles.vehicle import Vehicle
 
@@ -99,7 +99,7 @@ def check_thrust_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Fin
     thrust = value[:, 0]
     known = thrust[np.isfinite(thrust)]
     sign = -1.0 if len(known) and np.median(known) < 0.0 else 1.0
-    ratio = over_force(rows, sign * thrust)
+    ratio = fit_force(rows, sign * thrust)[1]
     if ratio <= 0.0:
         return []
     figures = f"it is {sign * ratio:.3g} times the force per mass that the path needs"
@@ -181,12 +181,10 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
             text = f"{figures}, by {gain:.3g} of it: it is {words}"
             fix = option(("cmd_rate", f"{1.0 / factor:.10g}"))
             return [Finding("corrected", subject, text, "rate_command_unit", factor, 0.98, fix)]
-    units = {words: factor for words, factor in RATES.items() if factor > 1.0}
-    name = next((w for w, f in units.items() if abs(np.log(gain / f)) < np.log(1.4)), None)
-    if name is not None:
+    for name in within({w: f for w, f in RATES.items() if f > 1.0}, 1.4, gain):
         text = f"{figures}, by {gain:.3g} of it: the gyro is in {name}"
-        fix = option(("rate", f"{1.0 / units[name]:.10g}"))
-        return [Finding("doubt", "gyro", text, "gyro_scale", units[name], 0.95, fix)]
+        fix = option(("rate", f"{1.0 / RATES[name]:.10g}"))
+        return [Finding("doubt", "gyro", text, "gyro_scale", RATES[name], 0.95, fix)]
     findings = []
     bent = bend(time_s, command, rate)
     if np.isfinite(gain) and (high < GAIN[0] or low > GAIN[1] or bent > BENT):
@@ -260,7 +258,7 @@ def check_gyro_scale(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding
         return []
     gain, between_axes = gains
     text = f"it is {gain:.3g} times a steady rate command"
-    unit = next((w for w, f in RATES.items() if abs(np.log(gain / f)) < np.log(SAME_UNIT)), None)
+    unit = next(iter(within(RATES, SAME_UNIT, gain)), None)
     is_command = unit == "deg/s" and _gyro_is_right(rows)
     if unit is not None and rms(rows["cmd_rate"]) < FASTEST_RMS and not is_command:
         fix = option(("rate", f"{1.0 / RATES[unit]:.10g}"))
@@ -294,11 +292,8 @@ def _response(vehicle: Vehicle) -> float:
     return late + vehicle.rotors.time_constant + (1.0 / loop if loop else 0.05)
 
 
-def check_controller_rate(rows: Rows, wanted_hz: float | None, whose: str) -> list[Finding]:
-    """Return a finding on whether commands change `wanted_hz` times a second.
-
-    `whose` names in words what requires this rate: the policy or the vehicle file.
-    """
+def check_controller_rate(rows: Rows, wanted_hz: float | None) -> list[Finding]:
+    """Return a finding on whether commands change `wanted_hz` times a second, as the policy's."""
     name = next((n for n in ("action", "cmd_rate", "cmd_thrust", "motor_cmd", "pwm")
                  if n in rows), None)  # fmt: skip
     if wanted_hz is None or name is None:
@@ -310,19 +305,16 @@ def check_controller_rate(rows: Rows, wanted_hz: float | None, whose: str) -> li
     change = np.flatnonzero(np.any(np.diff(value, axis=0) != 0.0, axis=1)) + 1
     row_hz = 1.0 / float(np.median(np.diff(time_s)))
     if len(change) < 20:
-        text = "its commands hardly change"
-        return unseen("controller", text, "controller_rate")
-    span = time_s[change[-1]] - time_s[change[0]]
-    steps = np.diff(time_s[change])
-    hz = (len(change) - 1) / float(span)
-    holds = float(np.median(steps))
+        return unseen("controller", "its commands hardly change", "controller_rate")
+    hz = (len(change) - 1) / float(time_s[change[-1]] - time_s[change[0]])
+    holds = float(np.median(np.diff(time_s[change])))
     figures = f"commands change {hz:.3g} times a second (each {1e3 * holds:.0f} ms)"
     if hz > 0.9 * row_hz:
         text = f"{figures}, with every row: log faster than the controller runs"
         return unseen("controller", text, "controller_rate")
     if abs(hz / wanted_hz - 1.0) < RATE_OFF:
         return [Finding("ok", "controller", figures)]
-    text = f"{figures}, and {whose} says {wanted_hz:g} Hz"
+    text = f"{figures}, and the policy says {wanted_hz:g} Hz"
     fix = (
         f"the link or the computer that keeps it from {wanted_hz:g} Hz, or a policy of {hz:.0f} Hz"
     )

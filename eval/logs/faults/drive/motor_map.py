@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eval.logs.faults.drive.motors import FITS, force_without_drag
+from eval.logs.faults.drive.motors import FITS, fit_force
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import WIDTH_S, Rows
 from eval.logs.faults.relation import jackknife_error, shift_rows, smooth
@@ -60,16 +60,33 @@ class Drive(NamedTuple):
     """`[motors]` of the vehicle file; None: thrust is proportional to the command."""
     command: np.ndarray
     """(T, C) commands from 0 to 1; C = 4 motors, or 1 for a throttle, which all motors share."""
-    full: float
-    """Thrust of all motors at full command, used where `motors` is None [N]; 1 without a vehicle
-    file."""
+    vehicle: Vehicle | None
+    """The vehicle file."""
+    time_s: np.ndarray
+    """(T,) time of the rows [s]."""
+    volts: np.ndarray | None
+    """(T,) voltage of the battery [V]."""
 
     def thrust(self, motors: MotorMap | None, volts: np.ndarray | None) -> np.ndarray:
         """Return the thrust (T, C) that the map gives: per motor, or for C = 1 of all four [N]."""
         if motors is None:
-            return self.full * self.command
+            vehicle = self.vehicle
+            return (1.0 if vehicle is None else vehicle.full_thrust * vehicle.mass) * self.command
         share = 4.0 if self.command.shape[1] == 1 else 1.0
         return share * np.asarray(motor_thrust(motors, self.command, volts))
+
+    def command_quantile(self, share: float) -> float:
+        """Return a quantile of the commands."""
+        return float(np.quantile(self.command[np.isfinite(self.command)], share))
+
+    @property
+    def exponent(self) -> float:
+        """D log(thrust) / d log(command) by the file, at the median command."""
+        if self.motors is None:
+            return 1.0
+        command = self.command_quantile(0.5)
+        linear, square = self.motors.thrust[0] * command, self.motors.thrust[1] * command**2
+        return (linear + 2.0 * square) / (linear + square)
 
 
 class Ratio(NamedTuple):
@@ -85,12 +102,6 @@ class Ratio(NamedTuple):
     """Coefficient `battery`; 0 where the voltage is unknown or constant."""
     battery_error: float
     """Standard error of `battery`; infinite where the voltage is unknown or constant."""
-    exponent: float
-    """Exponent of the file's thrust over the command, at the median command."""
-    low: float
-    """5 % quantile of the commands."""
-    high: float
-    """95 % quantile of the commands."""
     span: float
     """Difference of the 95 % and the 5 % quantile of log F."""
     late: int
@@ -103,58 +114,58 @@ def check_motor_map(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
     Without a vehicle file, only a throttle's curve is checked. For the `rows` see
     `check.run_checks`.
     """
-    return [one for drive in _drives(rows, vehicle) for one in _check(rows, drive, vehicle)]
+    return [one for drive in _drives(rows, vehicle) for one in _check(rows, drive)]
 
 
-def _check(rows: Rows, drive: Drive, vehicle: Vehicle | None) -> list[Finding]:
+def _check(rows: Rows, drive: Drive) -> list[Finding]:
     """Return the findings on one kind of command."""
-    measured = _measured(rows, drive, vehicle)
+    measured = _measured(rows, drive)
     if measured is None:
         text = "neither rotor speeds, nor an accelerometer, nor a pose show the thrust"
         return unseen(drive.subject, text, drive.fault, "battery_scaling")
-    volts = rows["voltage"][:, 0] if "voltage" in rows else None
-    ratio = _ratio(rows["time"], drive, measured, volts)
+    ratio = _ratio(drive, measured)
     if ratio is None:
         text = "too few commands between the limits, or the thrust does not follow them"
         return unseen(drive.subject, text, drive.fault, "battery_scaling")
-    findings = _findings(ratio, drive, vehicle)
+    findings = _findings(ratio, drive)
     if not any(finding.status == "doubt" for finding in findings):
         return findings
     # One fix repairs size, curve and battery together. It is only computed where it is needed.
-    fix = _fix(rows["time"], drive, measured, volts, ratio, vehicle)
+    fix = _fix(drive, measured, ratio)
     return [f._replace(fix=fix) if f.status == "doubt" else f for f in findings]
 
 
 def _drives(rows: Rows, vehicle: Vehicle | None) -> Iterator[Drive]:
     """Yield each kind of command in the log whose thrust can be computed."""
-    full = 1.0 if vehicle is None else vehicle.full_thrust * vehicle.mass
     motors = None if vehicle is None else vehicle.motors
+    about = vehicle, rows["time"], rows["voltage"][:, 0] if "voltage" in rows else None
     if "pwm" in rows and motors is not None:
-        yield Drive("pwm", "motor map", "motor_map", motors, rows["pwm"], full)
+        yield Drive("pwm", "motor map", "motor_map", motors, rows["pwm"], *about)
     if "throttle" in rows:
-        yield Drive("throttle", "throttle", "throttle_curve", motors, rows["throttle"], full)
+        yield Drive("throttle", "throttle", "throttle_curve", motors, rows["throttle"], *about)
     elif "cmd_thrust" in rows and vehicle is not None:
         share = rows["cmd_thrust"] / vehicle.full_thrust
-        yield Drive("cmd_thrust", "thrust command", "throttle_curve", None, share, full)
+        yield Drive("cmd_thrust", "thrust command", "throttle_curve", None, share, *about)
 
 
-def _measured(rows: Rows, drive: Drive, vehicle: Vehicle | None) -> np.ndarray | None:
+def _measured(rows: Rows, drive: Drive) -> np.ndarray | None:
     """Return the measured thrust: (T, 4) of each motor, or (T, 1) of all [N]; None: unknown.
 
     Without a vehicle file the mass is unknown, so the result is thrust per mass [m/s^2].
     """
+    vehicle = drive.vehicle
     if drive.name == "pwm" and "motor" in rows and vehicle is not None:
         return vehicle.rotors.thrust_coefficient * rows["motor"] ** 2
-    total = np.sum(drive.thrust(drive.motors, None), axis=1)
-    force = force_without_drag(rows, total)
-    return None if force is None else force[:, None] * (1.0 if vehicle is None else vehicle.mass)
+    if not ({"quat", "pos"} <= rows.keys() or "acc" in rows):
+        return None
+    force, ratio = fit_force(rows, np.sum(drive.thrust(drive.motors, None), axis=1))
+    return force[:, None] * (1.0 if vehicle is None else vehicle.mass) if ratio > 0.0 else None
 
 
-def _ratio(
-    time_s: np.ndarray, drive: Drive, measured: np.ndarray, volts: np.ndarray | None
-) -> Ratio | None:
+def _ratio(drive: Drive, measured: np.ndarray) -> Ratio | None:
     """Return how the measured thrust differs from the file's; None where it is not identifiable."""
-    wanted = _averaged(time_s, drive, drive.thrust(drive.motors, volts), measured)
+    time_s, volts = drive.time_s, drive.volts
+    wanted = _averaged(drive, drive.motors, measured)
     thrust = smooth_columns(time_s, measured)
     thrust = np.where(thrust > 0.1 * np.nanmedian(thrust), thrust, np.nan)
     # Logarithms of the file's thrust (moved by the delay), the measured thrust and the voltage.
@@ -192,20 +203,19 @@ def _ratio(
     without_block = np.array([fitted(usual & (block != k)) for k in range(BLOCKS)])
     errors = [jackknife_error(without_block[:, k]) for k in range(3)]
     errors[2] = errors[2] if len(columns) == 3 else np.inf
-    command = np.asarray(drive.command[np.isfinite(drive.command)])
     span = float(np.ptp(np.quantile(x, (0.05, 0.95))))
-    low, middle, high = (float(q) for q in np.quantile(command, (0.05, 0.5, 0.95)))
-    return Ratio(float(estimate[0]), float(estimate[1]), errors[1], float(estimate[2]), errors[2],
-                 _exponent(drive.motors, middle), low, high, span, late)  # fmt: skip
+    size, curve, battery_size = estimate.tolist()
+    return Ratio(size, curve, errors[1], battery_size, errors[2], span, late)
 
 
-def _findings(ratio: Ratio, drive: Drive, vehicle: Vehicle | None) -> list[Finding]:
+def _findings(ratio: Ratio, drive: Drive) -> list[Finding]:
     """Return the findings on size, curve and battery, without their fix."""
-    findings = []
-    true, error = ratio.exponent * (1.0 + ratio.curve), ratio.exponent * ratio.curve_error
+    findings, exponent = [], drive.exponent
+    low, high = drive.command_quantile(0.05), drive.command_quantile(0.95)
+    true, error = exponent * (1.0 + ratio.curve), exponent * ratio.curve_error
     figures = (
         f"thrust grows with the command to the power {true:.2f} (± {error:.2f}) from "
-        f"{ratio.low:.2f} to {ratio.high:.2f}, to {ratio.exponent:.2f} by the file"
+        f"{low:.2f} to {high:.2f}, to {exponent:.2f} by the file"
     )
     if SURE * ratio.curve_error > CURVE or ratio.span < SPAN:
         why = "too uncertain" if ratio.span >= SPAN else "the commands hardly change"
@@ -215,10 +225,10 @@ def _findings(ratio: Ratio, drive: Drive, vehicle: Vehicle | None) -> list[Findi
         text = f"{figures}: the curve or its linearisation is another"
         findings.append(Finding("doubt", drive.subject, text, *about))
     had = 0.0 if drive.motors is None else drive.motors.voltage_exponent
-    per_volt = had * ratio.exponent + ratio.battery
+    per_volt = had * exponent + ratio.battery
     figures_of_battery = (
         f"thrust at one command grows with the voltage to the power {per_volt:.2f} "
-        f"(± {ratio.battery_error:.2f}), to {had * ratio.exponent:.2f} by the file"
+        f"(± {ratio.battery_error:.2f}), to {had * exponent:.2f} by the file"
     )
     if not SURE * ratio.battery_error < BATTERY:
         known = np.isfinite(ratio.battery_error)
@@ -228,7 +238,7 @@ def _findings(ratio: Ratio, drive: Drive, vehicle: Vehicle | None) -> list[Findi
         about = ("battery_scaling", per_volt, 0.95)
         text = f"{figures_of_battery}: the battery is taken into account twice, or not at all"
         findings.append(Finding("doubt", drive.subject, text, *about))
-    if vehicle is None:
+    if drive.vehicle is None:
         return findings
     # Size: `check_thrust_command` reports it for a command in m/s^2, so there is no limit here.
     times, reach = float(np.exp(-ratio.size)), np.inf if drive.name == "cmd_thrust" else FITS
@@ -243,45 +253,30 @@ def _findings(ratio: Ratio, drive: Drive, vehicle: Vehicle | None) -> list[Findi
     return [*findings, Finding("ok", drive.subject, figures)]
 
 
-def _fix(
-    time_s: np.ndarray,
-    drive: Drive,
-    measured: np.ndarray,
-    volts: np.ndarray | None,
-    ratio: Ratio,
-    vehicle: Vehicle | None,
-) -> str:
+def _fix(drive: Drive, measured: np.ndarray, ratio: Ratio) -> str:
     """Return the fix in words: `[motors]` of the vehicle file, with values that fit the flight."""
-    if vehicle is None:
+    if drive.vehicle is None:
         return "[motors] of a vehicle file, with --vehicle"
     from scipy.optimize import nnls
 
     nominal = drive.motors or MotorMap((0.0, 1.0), 1.0, 0.0)
     exponent, voltage = nominal.voltage_exponent, nominal.voltage
-    if SURE * ratio.battery_error < BATTERY and volts is not None:
-        voltage = voltage if exponent else float(np.nanmedian(volts))
-        true_exponent = exponent + ratio.battery / max(ratio.exponent * (1.0 + ratio.curve), 0.5)
+    if SURE * ratio.battery_error < BATTERY and drive.volts is not None:
+        voltage = voltage if exponent else float(np.nanmedian(drive.volts))
+        true_exponent = exponent + ratio.battery / max(drive.exponent * (1.0 + ratio.curve), 0.5)
         exponent = round(float(np.clip(true_exponent, 0.0, 4.0)), 2)
     thrust_of_terms = [
-        shift_rows(_averaged(time_s, drive, drive.thrust(motors, volts), measured), ratio.late)
+        shift_rows(_averaged(drive, motors, measured), ratio.late)
         for motors in (MotorMap(t, voltage, exponent) for t in ((1.0, 0.0), (0.0, 1.0)))
     ]
     columns = np.stack([term.ravel() for term in thrust_of_terms], axis=1)
-    thrust = smooth_columns(time_s, measured).ravel()
+    thrust = smooth_columns(drive.time_s, measured).ravel()
     good = np.isfinite(columns).all(axis=1) & np.isfinite(thrust)
     (linear, square), _ = nnls(columns[good], thrust[good])
     return (
         f"motors.thrust = [{linear:.4g}, {square:.4g}], motors.voltage = {voltage:.4g} and "
         f"motors.voltage_exponent = {exponent:g} in the vehicle file"
     )
-
-
-def _exponent(motors: MotorMap | None, command: float) -> float:
-    """Return d log(thrust) / d log(command) of a map at a command."""
-    if motors is None:
-        return 1.0
-    linear, square = motors.thrust[0] * command, motors.thrust[1] * command**2
-    return (linear + 2.0 * square) / (linear + square)
 
 
 def _delay_rows(time_s: np.ndarray, wanted: np.ndarray, thrust: np.ndarray) -> int:
@@ -304,14 +299,13 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.corrcoef(a, b)[0, 1])
 
 
-def _averaged(
-    time_s: np.ndarray, drive: Drive, thrust: np.ndarray, measured: np.ndarray
-) -> np.ndarray:
-    """Return the file's thrust, summed and averaged in the same way as the measured thrust.
+def _averaged(drive: Drive, motors: MotorMap | None, measured: np.ndarray) -> np.ndarray:
+    """Return the thrust by `motors`, summed and averaged in the same way as the measured thrust.
 
     It is NaN where a command is at a limit. A measured total force is already averaged once by
-    `force_without_drag`, so the file's total is averaged twice as well.
+    `fit_force`, so the file's total is averaged twice as well.
     """
+    time_s, thrust = drive.time_s, drive.thrust(motors, drive.volts)
     at_limit = (drive.command < USED[0]) | (drive.command > USED[1])
     if measured.shape[1] > 1:
         return smooth_columns(time_s, np.where(at_limit, np.nan, thrust))

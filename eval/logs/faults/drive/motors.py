@@ -6,7 +6,6 @@ needs; 1 is correct. *Mixer*: matrix from the thrusts of the motors to torques a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import permutations
 
 import numpy as np
@@ -16,7 +15,7 @@ from eval.importers.frames import conjugate, rotate
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import WIDTH_S, Rows
 from eval.logs.faults.reading import option
-from eval.logs.faults.relation import forward_mean, rms, smooth
+from eval.logs.faults.relation import forward_mean, rms, smooth, within
 from eval.logs.velocity import velocity_from_position
 from eval.vehicles.vehicle import Vehicle, motor_thrust
 
@@ -63,8 +62,8 @@ POLES = {
     if 0.5 <= mine / true <= 2.0 and mine != true
 }
 """Wrong number of poles -> factor by which speeds from electrical rpm (eRPM) are then too large."""
-X_SHAPE = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
-"""Positions (x, y) without a vehicle file, in the order of the shipped vehicles: front right, rear
+SHIPPED_ORDER = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
+"""Motor positions (x forward, y left) in the order of the shipped vehicles: front right, rear
 right, rear left, front left."""
 X_SPIN = (1, -1, 1, -1)
 """Directions of rotation in the same order."""
@@ -146,7 +145,7 @@ def _torques(
     The torque by the gyro is the change of the angular momentum. Without a vehicle file the inertia
     is set to 1. If the flight is too short or too calm, the result is the reason in words.
     """
-    hubs = np.array(X_SHAPE if vehicle is None else [h[:2] for h in vehicle.rotors.position])
+    hubs = np.array(SHIPPED_ORDER if vehicle is None else [h[:2] for h in vehicle.rotors.position])
     spin = np.array(X_SPIN if vehicle is None else vehicle.rotors.spin, dtype=float)
     mixer = np.stack([hubs[:, 1], -hubs[:, 0], -spin * np.abs(hubs).max()], axis=0)
     time_s, rate = rows["time"], rows["rate"]
@@ -255,7 +254,7 @@ def check_lift(rows: Rows, vehicle: Vehicle | None, doubtful: bool = False) -> l
         why = ": the vehicle file is in doubt" if doubtful else "; --vehicle makes it possible"
         return [Finding("note", "rotor speeds", f"not checked against the weight{why}")]
     thrust = vehicle.rotors.thrust_coefficient * np.sum(rows["motor"] ** 2, axis=1)
-    lift = over_force(rows, thrust) / vehicle.mass
+    lift = fit_force(rows, thrust)[1] / vehicle.mass
     if not lift > 0.0:
         return []
     figures = f"by {vehicle.name!r} they lift {lift:.3g} times the weight"
@@ -302,32 +301,13 @@ def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Fin
     return Finding("doubt", "rotor speeds", text, "motor_unit", factor, 0.9, fix)
 
 
-def over_force(rows: Rows, thrust: np.ndarray) -> float:
-    """Return `thrust` (T,) over the specific force along body z, without drag; 0 where unknown.
+def fit_force(rows: Rows, thrust: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the specific force (T,) along body z without drag [m/s^2], and `thrust` (T,) over it.
 
-    A thrust in newtons gives a mass [kg], a thrust in m/s^2 a dimensionless ratio.
-    """
-    _, share = _force_and_share(rows, thrust)
-    return 1.0 / share if share > 0.0 else 0.0
-
-
-def force_without_drag(rows: Rows, thrust: np.ndarray) -> np.ndarray | None:
-    """Return the specific force (T,) along body z, averaged over `WIDTH_S`, without drag [m/s^2].
-
-    None where it is unknown. `thrust` (T,) is in any unit: its factor is fitted together with the
-    drag. For the `rows` see `check.run_checks`.
-    """
-    if not ({"quat", "pos"} <= rows.keys() or "acc" in rows):
-        return None
-    force, share = _force_and_share(rows, thrust)
-    return force if share > 0.0 else None
-
-
-def _force_and_share(rows: Rows, thrust: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the specific force (T,) along body z without drag, and its fitted ratio to `thrust`.
-
-    The force comes from the path where the log has a pose, and from the accelerometer otherwise
-    (then without a correction for drag). A ratio of 0 means that nothing could be fitted.
+    A thrust in newtons gives a mass [kg], a thrust in m/s^2 a dimensionless ratio; 0 means that
+    nothing could be fitted. The force is averaged over `WIDTH_S`. It comes from the path where the
+    log has a pose, from the accelerometer otherwise (then without a correction for drag), and is
+    gravity where the log has neither.
     """
     time_s = rows["time"]
     drag = np.zeros((len(time_s), 0))
@@ -345,9 +325,5 @@ def _force_and_share(rows: Rows, thrust: np.ndarray) -> tuple[np.ndarray, float]
     if not good.any() or not np.any(thrust[good]):
         return force, 0.0
     coefficients = np.linalg.lstsq(columns[good], force[good], rcond=None)[0]
-    return force - drag @ coefficients[1:], float(coefficients[0])
-
-
-def within(table: Mapping[str, float], limit: float, factor: float) -> list[str]:
-    """Return the names in `table` whose value is within the ratio `limit` of `factor`."""
-    return [n for n, wrong in table.items() if abs(np.log(factor / wrong)) < np.log(limit)]
+    share = float(coefficients[0])
+    return force - drag @ coefficients[1:], 1.0 / share if share > 0.0 else 0.0

@@ -8,7 +8,7 @@ import pytest
 from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.check import CheckContext, check_before_diagnosis, check_log, kept_lines
 from eval.logs.faults.finding import Finding
-from eval.logs.faults.jumps import check_jumps
+from eval.logs.faults.position import check_jumps
 from eval.logs.faults.reading import parse_readings, read_rows
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN

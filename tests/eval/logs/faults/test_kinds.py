@@ -23,7 +23,7 @@ from eval.logs.faults.clock import check_clock
 from eval.logs.faults.drive import commands
 from eval.logs.faults.drive.commands import check_controller_rate
 from eval.logs.faults.drive.rate_following import delayed
-from eval.logs.faults.height import check_height_sign
+from eval.logs.faults.position import check_height_sign
 from eval.logs.faults.reading import parse_readings, read_rows
 from eval.logs.flight_log import read_flight
 from suite.diagnose.example.flights import FOLDER
@@ -81,7 +81,7 @@ def checked(parts, vehicle=VEHICLE, fov=1.0):
     checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
     findings, readings, _ = run_checks(parts, checks, against, fix=True)
     commands = {name: value for name, value in parts.items() if name != "throttle"}
-    findings += check_controller_rate(commands, POLICY_HZ, "the policy")
+    findings += check_controller_rate(commands, POLICY_HZ)
     return findings + check_files(against), readings
 
 

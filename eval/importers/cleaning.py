@@ -1,4 +1,4 @@
-"""Remove impossible samples from a log: jumps, and samples that were not measured.
+"""Clean a recording: impossible samples, the delay of its pose, and its time on the ground.
 
 Jumps of position and velocity would pass for collisions. Repeated and interpolated samples are not
 measurements, and with them the noise seems smaller than it is.
@@ -6,15 +6,17 @@ measurements, and with them the noise seems smaller than it is.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
 
-from eval.importers.frames import conjugate, multiply, rotation_vector
+from eval.importers.frames import rates_between
 from eval.importers.rows import continuous
 from eval.importers.signals import MAD_TO_SD, Recording, Signal, median_step
+from eval.logs.faults.clock import LATE_S, LEAST_S, SURE, delay_of
 from eval.logs.faults.finding import Finding
-from eval.logs.faults.jumps import ACC_MAX
+from eval.logs.faults.position import ACC_MAX
 from eval.logs.faults.relation import rms
 from eval.logs.velocity import velocity_from_position
 
@@ -40,6 +42,19 @@ TURNING = 0.05
 """Least body rate at which an interpolated attitude can be detected [rad/s]."""
 EXACT = 1e-3
 """Largest relative change of the body rate at an attitude that counts as interpolated."""
+OF_POSE = ("pos", "quat", "vel")
+"""Signals of the device that measures the pose; they share its delay."""
+RUNNING = 0.5
+"""The motors carry the vehicle if their effort exceeds this share of its median in flight."""
+HOLD_S = 0.3
+"""Least duration of a flight: time above `RUNNING` without a break [s]."""
+RISE_M = 0.05
+"""Height above the ground from which the vehicle counts as flying [m]."""
+POWER = {
+    **{"throttle": 1, "cmd_thrust": 1, "kept:cmd_force": 1},
+    **{"pwm": 1, "motor": 2, "motor_cmd": 2},
+}
+"""Signals that measure the motors' effort -> exponent with which each gives the thrust."""
 
 
 def clean(recording: Recording) -> tuple[Recording, list[Finding]]:
@@ -62,6 +77,15 @@ def _select(samples: Signal, good: np.ndarray) -> Signal:
     return Signal(samples.time_s[good], samples.value[good])
 
 
+def _keep(
+    signals: dict[str, Signal], names: Collection[str], like: Signal, good: np.ndarray
+) -> None:
+    """Keep the `good` samples of the signals logged at the times of `like`, in place."""
+    for name in names:
+        if name in signals and np.array_equal(signals[name].time_s, like.time_s):
+            signals[name] = _select(signals[name], good)
+
+
 def _drop_repeats(signals: dict[str, Signal]) -> list[Finding]:
     """Remove repeated poses in place, with the signals logged at the same times."""
     for name in ("quat", "pos"):
@@ -73,12 +97,7 @@ def _drop_repeats(signals: dict[str, Signal]) -> list[Finding]:
         share = float(np.mean(~is_new))
         if share < REPEATED or _is_coarse(samples) or not _moves(samples):
             continue
-        for other in ("pos", "quat", "vel"):
-            samples_of_other = signals.get(other)
-            if samples_of_other is not None and np.array_equal(
-                samples_of_other.time_s, samples.time_s
-            ):
-                signals[other] = _select(samples_of_other, is_new)
+        _keep(signals, OF_POSE, samples, is_new)
         text = f"{100 * share:.0f} % of the poses repeat the one before: left out"
         return [Finding("corrected", TEXTS[name], text)]
     return []
@@ -106,9 +125,7 @@ def without_lost(recording: Recording) -> tuple[Recording, list[Finding]]:
                 inside = (rate.time_s >= time_s[first]) & (rate.time_s <= time_s[stop - 1])
                 is_lost[first + 1 : stop] = inside.any() and rms(rate.value[inside]) > LOST_RATE
         if is_lost.any():
-            for other in (name, "vel"):
-                if other in signals and np.array_equal(signals[other].time_s, time_s):
-                    signals[other] = _select(signals[other], ~is_lost)
+            _keep(signals, (name, "vel"), samples, ~is_lost)
             text = f"{is_lost.sum()} samples stand still while the gyro turns (lost): left out"
             findings.append(Finding("corrected", TEXTS[name], text))
     return replace(recording, signals=signals), findings
@@ -136,8 +153,7 @@ def _moves(samples: Signal) -> bool:
 def _without_interpolated(quat: Signal) -> tuple[Signal, list[Finding]]:
     """Remove attitudes at which the body rate does not change: these were interpolated."""
     value = continuous(quat.value / np.linalg.norm(quat.value, axis=1, keepdims=True))
-    step = np.diff(quat.time_s)[:, None]
-    rate = rotation_vector(multiply(conjugate(value[:-1]), value[1:])) / step
+    _, rate = rates_between(quat.time_s, value, 1)
     change = np.linalg.norm(rate[1:] - rate[:-1], axis=1)
     rate_size = np.linalg.norm(rate[1:], axis=1)
     is_interpolated = np.zeros(len(value), dtype=bool)
@@ -151,11 +167,12 @@ def _without_interpolated(quat: Signal) -> tuple[Signal, list[Finding]]:
 
 def _without_jumps(pos: Signal) -> tuple[Signal, list[Finding]]:
     """Remove positions further from the running median than the largest acceleration allows."""
+    from scipy.ndimage import median_filter
+
     half = MEDIAN_SAMPLES // 2
-    padded = np.concatenate([pos.value[:1]] * half + [pos.value] + [pos.value[-1:]] * half)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, MEDIAN_SAMPLES, axis=0)
     reach_s = half * median_step(pos.time_s)
-    jump_m = np.abs(pos.value - np.median(windows, axis=-1)).max(axis=1)
+    usual = median_filter(pos.value, (MEDIAN_SAMPLES, 1), mode="nearest")
+    jump_m = np.abs(pos.value - usual).max(axis=1)
     bad = jump_m > POS_LEAST + 0.5 * ACC_MAX * reach_s**2
     bad[:half] = bad[len(bad) - half :] = False  # the padded median is no reference at the ends
     if not bad.any():
@@ -186,3 +203,117 @@ def _without_glitches(vel: Signal, pos: Signal) -> tuple[Signal, list[Finding]]:
     worst = float(np.linalg.norm(error[bad], axis=1).max())
     text = f"{int(bad.sum())} samples are up to {worst:.2g} m/s off the path's slope: left out"
     return _select(vel, ~bad), [Finding("corrected", "velocity", text)]
+
+
+def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Finding]]:
+    """Return the recording with the pose shifted to the gyro's clock, and the findings.
+
+    The recording has times in s, rates in rad/s and a flight log's frames; it must have quat and
+    rate. Without `fix` the delay is only reported.
+    """
+    quat, rate = recording.signals["quat"], recording.signals["rate"]
+    fit = delay_of(quat.time_s, quat.value, rate.time_s, rate.value)
+    if fit is None:
+        return recording, []
+    delay, error = fit.delay_s, fit.error_s
+    figures = f"it is {1e3 * delay:+.1f} ms (± {1e3 * error:.1f} ms) late against the gyro"
+    is_late, findings = abs(delay) > max(LEAST_S, SURE * error), []
+    option = "leave --no-fix out: the import shifts the pose"
+    status = "corrected" if fix else "doubt"
+    if fit.drifts:
+        about = ("clock_drift", fit.drift, 0.95, option)
+        findings.append(Finding(status, "pose clock", fit.drift_figures(), *about))
+    if is_late:
+        confidence = 0.95 if abs(delay) > LATE_S else 0.8
+        text = f"{figures}: pose and velocity are shifted" if fix else f"{figures}; not corrected"
+        about = ("clock_offset", delay, confidence, option)
+        findings.append(Finding(status, "pose delay", text, *about))
+    else:
+        findings.append(Finding("ok", "pose delay", figures))
+    if not fix or not (is_late or fit.drifts):
+        return recording, findings
+    drift = fit.drift if fit.drifts else 0.0
+    signals = dict(recording.signals)
+    for name in OF_POSE:
+        if name in signals:
+            time_s, value = signals[name]
+            signals[name] = Signal(time_s - (delay + drift * (time_s - fit.middle_s)), value)
+    return replace(recording, signals=signals), findings
+
+
+def airborne(recording: Recording) -> tuple[tuple[float, float], list[Finding]]:
+    """Return the first and the last time in flight [s], and a finding.
+
+    A time is infinite where the log starts or ends in flight, or has no signal of the motors.
+    """
+    no_limits = (-np.inf, np.inf)
+    effort = _motor_effort(recording)
+    if effort is None:
+        text = "no signal shows when the motors run: nothing is cut; see --start and --end"
+        return no_limits, [Finding("note", "ground", text)]
+    time_s = effort.time_s
+    in_flight = _long_runs(time_s, effort.value[:, 0] > RUNNING)
+    if not in_flight.any():
+        text = f"the motors never run for {HOLD_S:g} s: nothing is cut"
+        return no_limits, [Finding("doubt", "ground", text)]
+    first, last = np.flatnonzero(in_flight)[[0, -1]]
+    start = float(time_s[first]) if time_s[first] > time_s[0] else -np.inf
+    stop = float(time_s[last]) if time_s[last] < time_s[-1] else np.inf
+    if "pos" in recording.signals:
+        start, stop = _off_ground(recording.signals["pos"], start, stop)
+    if not np.isfinite(start) and not np.isfinite(stop):
+        return no_limits, [Finding("ok", "ground", "it flies from the first row to the last")]
+    cuts = []
+    if np.isfinite(start):
+        cuts.append(f"the {start - time_s[0]:.1f} s before take-off")
+    if np.isfinite(stop):
+        cuts.append(f"the {time_s[-1] - stop:.1f} s after landing")
+    text = f"{' and '.join(cuts)} are left out"
+    return (float(start), float(stop)), [Finding("note", "ground", text)]
+
+
+def _motor_effort(recording: Recording) -> Signal | None:
+    """Return the motors' thrust relative to its median in flight; None without such a signal."""
+    for name, power in POWER.items():
+        samples = recording.signals.get(name)
+        if samples is None or len(samples.time_s) < 10:
+            continue
+        thrust_level = np.mean(samples.value**power, axis=1)  # speeds may have the spin's sign
+        high_level = float(np.quantile(thrust_level, 0.95))
+        if high_level <= 0.0:
+            continue
+        median_in_flight = float(np.median(thrust_level[thrust_level > RUNNING * high_level]))
+        return Signal(samples.time_s, (thrust_level / median_in_flight)[:, None])
+    return None
+
+
+def _long_runs(time_s: np.ndarray, running: np.ndarray) -> np.ndarray:
+    """Return which samples belong to a run of at least `HOLD_S`."""
+    edges = np.flatnonzero(np.diff(running.astype(int))) + 1
+    in_long_run = np.zeros(len(running), dtype=bool)
+    for run in np.split(np.arange(len(running)), edges):
+        if running[run[0]] and time_s[run[-1]] - time_s[run[0]] >= HOLD_S:
+            in_long_run[run] = True
+    return in_long_run
+
+
+def _off_ground(pos: Signal, start: float, stop: float) -> tuple[float, float]:
+    """Return the first and last time [s] within `start` and `stop` above the ground.
+
+    The ground is the median height over the second before the start and after the stop.
+    """
+    time_s, height = pos.time_s, pos.value[:, 2]
+    is_inside = (time_s >= start) & (time_s <= stop)
+    if not is_inside.any():
+        return start, stop
+    before, after = (
+        (time_s < start) & (time_s > start - 1.0),
+        (time_s > stop) & (time_s < stop + 1.0),
+    )
+    ends = [start, stop]
+    for k, near in ((0, before), (-1, after)):
+        ground = float(np.median(height[near])) if near.any() else float(height[is_inside][k])
+        above_ground = time_s[is_inside & (height > ground + RISE_M)]
+        if np.isfinite(ends[k]) and len(above_ground):
+            ends[k] = float(above_ground[k])
+    return ends[0], ends[1]

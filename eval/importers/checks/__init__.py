@@ -1,1 +1,0 @@
-"""Checks of an imported log against itself: time in flight, impossible samples, delays."""
