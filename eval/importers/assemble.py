@@ -169,7 +169,6 @@ def assemble(
         "source": format,
         **{key: value for key, value in recording.about.items() if key != "partial"},
         "imported_from": recording.name.replace("\\", "/").rsplit("/", 1)[-1],
-        "findings": [finding._asdict() for finding in findings],
     }
     findings += check_vehicle_name(about, options.vehicle)
     if options.vehicle is not None:
@@ -177,7 +176,7 @@ def assemble(
     if missing:
         findings.append(usable_for(rows, missing))
         about["partial"] = missing
-        about["findings"] = [finding._asdict() for finding in findings]
+    about["findings"] = [finding._asdict() for finding in findings]
     log = log_from_columns(columns, about, recording.name)
     return log, tuple(findings)
 

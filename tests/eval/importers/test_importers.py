@@ -212,7 +212,9 @@ def recording(**left_out):
 
 
 def test_a_recording_becomes_a_log_that_says_where_it_is_from():
-    log, findings = assemble(recording(), "made", ImportOptions(vehicle=PLAIN))
+    made_up = recording()
+    made_up.about["vehicle"] = "other"
+    log, findings = assemble(made_up, "made", ImportOptions(vehicle=PLAIN))
     parts = flight(end=2.0)
     np.testing.assert_allclose(log.pos_w, parts["pos"], atol=1e-12)
     assert log.thrust_cmd is not None
@@ -220,6 +222,7 @@ def test_a_recording_becomes_a_log_that_says_where_it_is_from():
     known = [log.about[key] for key in ("firmware", "source", "imported_from", "vehicle")]
     assert known == ["made up", "made", "log.bin", "plain"]
     assert log.about["findings"] == [finding._asdict() for finding in findings]
+    assert any("names the vehicle 'other'" in finding.evidence for finding in findings)
 
 
 @pytest.mark.parametrize(("scale", "known"), [(1.0, False), (1e3, False), (1.0, True)])
