@@ -16,6 +16,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
+from suite.diagnose.thresholds import Thresholds
 
 
 class Estimate(NamedTuple):
@@ -69,6 +70,11 @@ class Block:
 
 class Linearised(Protocol):
     """Evidence whose noise is known: all that a fit needs."""
+
+    @property
+    def limits(self) -> Thresholds:
+        """Number of steps of a fit, and the fall of chi-square at which it has converged."""
+        ...
 
     @property
     def space(self) -> ParameterSpace:

@@ -17,7 +17,6 @@ from scipy.stats import t as student
 
 from suite.diagnose.estimate.block import Block, Estimate, Linearised, NormalEquations
 from suite.diagnose.estimate.parameters import ParameterSpace
-from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
 def solve(
@@ -107,7 +106,6 @@ def fit(
     indices: Sequence[int],
     rounds: int | None = None,
     known: Block | None = None,
-    limits: Thresholds = THRESHOLDS,
 ) -> tuple[Estimate, Block]:
     """Fit the parameters at `indices` and the nuisance parameters of every stretch.
 
@@ -115,14 +113,13 @@ def fit(
         evidence: evidence whose noise is known.
         start: estimate with which the fit begins.
         indices: places of the fitted parameters in the vector.
-        rounds: largest number of steps; by default that of `limits`.
+        rounds: largest number of steps; by default that of the evidence's `limits`.
         known: the block at `start`, if it was computed before.
-        limits: number of steps, and the fall of chi-square at which the fit has converged.
 
     Returns:
         The best estimate, and the block at this estimate.
     """
-    places, space = np.array(indices, dtype=int), evidence.space
+    places, space, limits = np.array(indices, dtype=int), evidence.space, evidence.limits
     low, high = space.array("low")[places], space.array("high")[places]
     best, block = start, known or evidence.linearise(start, indices)
     for steps_done in range(limits.fit_rounds if rounds is None else rounds):

@@ -32,7 +32,7 @@ from suite.diagnose.data.whitening import (
 )
 from suite.diagnose.data.windows import KNOTS, LENGTH_S, SLICES, STATE, FlightWindows, cut, take
 from suite.diagnose.estimate.block import Block, Estimate
-from suite.diagnose.estimate.gauss_newton import fit, gauss_newton_step
+from suite.diagnose.estimate.gauss_newton import gauss_newton_step
 from suite.diagnose.estimate.parameters import (
     Candidate,
     ParameterLayout,
@@ -40,7 +40,7 @@ from suite.diagnose.estimate.parameters import (
     effects_at,
     make_space,
 )
-from suite.diagnose.evidence.evidence import Evidence, flights_agree
+from suite.diagnose.evidence.evidence import Evaluation, Evidence, flights_agree
 from suite.diagnose.evidence.linearise import (
     BATCH,
     VehicleArrays,
@@ -83,35 +83,35 @@ class RolloutEvidence(Evidence):
         along = range(self.model.size) if indices is None else indices
         return block_of(self.whitening, linear, along, self.windows)
 
-    def estimate_noise(self, at: Estimate) -> tuple[RolloutEvidence, Block]:
-        """Return this evidence with its noise estimated at `at`; see `Evidence`."""
+    def estimate_noise(self, at: Estimate) -> Evaluation:
+        """Evaluate this evidence with its noise estimated at `at`; see `Evidence`."""
         # The trusted windows are chosen again, as a better model stays near the flight for longer.
-        return rollout_evidence(self.model, self.windows, self._linear(at), self.limits)
+        new, block = rollout_evidence(self.model, self.windows, self._linear(at), self.limits)
+        return Evaluation(new, at, block)
 
-    def relinearise(self, at: Estimate) -> tuple[RolloutEvidence, Block]:
-        """Return this evidence with its noise unchanged; see `Evidence`."""
+    def relinearise(self, at: Estimate) -> Evaluation:
+        """Evaluate this evidence with its noise unchanged; see `Evidence`."""
         linear = self._linear(at)
         new, block = rollout_evidence(self.model, self.windows, linear, self.limits, self.noise)
-        return replace(new, misfit_is_noise=self.misfit_is_noise), block
+        return Evaluation(replace(new, misfit_is_noise=self.misfit_is_noise), at, block)
 
-    def misfit_as_noise(self, at: Estimate, block: Block) -> tuple[RolloutEvidence, Block] | None:
+    def misfit_as_noise(self, best: Evaluation) -> RolloutEvidence | None:
         """Return this evidence with its whole residual as noise; see `Evidence`."""
-        slow, expected = self.slow_errors(block)
+        slow, expected = self.slow_errors(best.block)
         if slow.sum() <= self.limits.structure_rotor_input * expected.sum():
             return None
-        linear = self._linear(at)
+        linear = self._linear(best.at)
         noise = residual_as_noise(linear.residual, linear.start_slope, self.trusted, self.limits)
         whitening = make_whitening(linear, noise, self.trusted, self.limits)
-        new = replace(self, noise=noise, whitening=whitening, misfit_is_noise=True)
-        return new, block_of(whitening, linear, range(self.model.size), self.windows)
+        return replace(self, noise=noise, whitening=whitening, misfit_is_noise=True)
 
     def explained_share(
-        self, before: Block, at: Estimate, after: Block, candidate: Candidate, gains: np.ndarray
+        self, before: Block, after: Evaluation, candidate: Candidate, gains: np.ndarray
     ) -> float | None:
         """Return the share of the error that a candidate explains; see `Evidence`."""
         if self.misfit_is_noise and not flights_agree(gains):
             return None
-        return super().explained_share(before, at, after, candidate, gains)
+        return super().explained_share(before, after, candidate, gains)
 
     def slow_errors(self, block: Block) -> tuple[np.ndarray, np.ndarray]:
         """Return the energy (W, 12) of slow errors of the state, and that by noise alone."""
@@ -243,8 +243,8 @@ def is_hopeless(
     few = np.unique(np.linspace(0, len(windows.flight) - 1, limits.hopeless_windows).astype(int))
     evidence, block = rollout_evidence(model, take(windows, few), take(linear, few), limits)
     at = Estimate(start, linear.offset[few])
-    _, block = fit(evidence, at, informed, limits.hopeless_rounds, block, limits)
-    return is_far(float((block.residual**2).sum()))
+    best = evidence.fitted(at, informed, limits.hopeless_rounds, block)
+    return is_far(float((best.block.residual**2).sum()))
 
 
 COMPILED = {"xla_cpu_use_fusion_emitters": False}

@@ -17,7 +17,7 @@ from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.composites import carried
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace, at_bound, usual_first
 from suite.diagnose.estimate.permutation import folds_of
-from suite.diagnose.evidence.evidence import Evidence, flights_agree
+from suite.diagnose.evidence.evidence import Evaluation, Evidence, flights_agree
 from suite.diagnose.evidence.moments import (
     ForceModel,
     ViewData,
@@ -120,11 +120,11 @@ class ViewEvidence(Evidence):
         """Return the block at `at`, with slopes along `indices`; see `Evidence`."""
         return self._block(self.residuals(at.theta, indices), indices)
 
-    def estimate_noise(self, at: Estimate) -> tuple[ViewEvidence, ViewBlock]:
-        """Return this evidence with its noise estimated at `at`; see `Evidence`."""
+    def estimate_noise(self, at: Estimate) -> Evaluation:
+        """Evaluate this evidence with its noise estimated at `at`; see `Evidence`."""
         data = self.residuals(at.theta, None)
         evidence = replace(self, weights=weights_of(data, self.limits))
-        return evidence, evidence._block(data)
+        return Evaluation(evidence, at, evidence._block(data))
 
     def folds(self, block: Block) -> np.ndarray:
         """Return the fold of each stretch: its flight, or parts of all flights if they are few."""
@@ -133,27 +133,28 @@ class ViewEvidence(Evidence):
         return folds_of(block.flight, np.arange(len(block.flight), dtype=float), self.limits.folds)
 
     def explained_share(
-        self, before: Block, at: Estimate, after: Block, candidate: Candidate, gains: np.ndarray
+        self, before: Block, after: Evaluation, candidate: Candidate, gains: np.ndarray
     ) -> float | None:
         """Return the share of the error that a candidate explains; see `Evidence`.
 
         None if a value is at a physical bound, if flights disagree, if fast changes contradict the
         candidate, or if the share is too small.
         """
-        assert isinstance(before, ViewBlock) and isinstance(after, ViewBlock)
-        if at_bound(self.space, at.theta, candidate) or not flights_agree(gains):
+        theta, fitted = after.at.theta, after.block
+        assert isinstance(before, ViewBlock) and isinstance(fitted, ViewBlock)
+        if at_bound(self.space, theta, candidate) or not flights_agree(gains):
             return None
         # Both errors are weighted by the noise estimated with the candidate: in an estimate without
         # it, a slow effect would count as noise.
-        noise = weights_of(after.data, self.limits)
+        noise = weights_of(fitted.data, self.limits)
         chi2_after, chi2_before = (
-            float((whitened(block.data, noise)[0] ** 2).sum()) for block in (after, before)
+            float((whitened(block.data, noise)[0] ** 2).sum()) for block in (fitted, before)
         )
         share = 1.0 - chi2_after / chi2_before
         indices = list(candidate.indices)
-        columns = [after.along.index(index) for index in indices]
-        change = (at.theta - self.space.array("start"))[indices]
-        consistent = fast_changes_agree(after.data, columns, change, self.limits)
+        columns = [fitted.along.index(index) for index in indices]
+        change = (theta - self.space.array("start"))[indices]
+        consistent = fast_changes_agree(fitted.data, columns, change, self.limits)
         return share if share >= self.limits.least_view_share and consistent else None
 
     def preference(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:

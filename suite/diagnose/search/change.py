@@ -24,10 +24,10 @@ from scipy.stats import ttest_ind
 
 from suite.diagnose.data.view import SmoothedFlight
 from suite.diagnose.estimate.block import Block, Estimate, NormalEquations, without_nuisance
-from suite.diagnose.estimate.gauss_newton import chi2_fall, fit
+from suite.diagnose.estimate.gauss_newton import chi2_fall
 from suite.diagnose.estimate.parameters import Candidate, at_bound, usual_first
 from suite.diagnose.estimate.permutation import CandidateScore, corrected_p_values
-from suite.diagnose.evidence.evidence import Evidence, flights_agree
+from suite.diagnose.evidence.evidence import Evaluation, Evidence, flights_agree
 from suite.diagnose.evidence.moments import (
     ViewData,
     Weights,
@@ -38,7 +38,7 @@ from suite.diagnose.evidence.moments import (
     whitened,
 )
 from suite.diagnose.evidence.views import ViewBlock, ViewEvidence, view_candidates
-from suite.diagnose.search.evaluation import Evaluation, NamedEffect, SearchResult
+from suite.diagnose.search.evaluation import NamedEffect, SearchResult
 
 
 def _motion_inputs(task: ViewEvidence, theta: np.ndarray) -> np.ndarray:
@@ -72,7 +72,7 @@ def fit_balance(reference: ViewEvidence) -> np.ndarray:
         weights = weights or weights_of(reference.residuals(theta), reference.limits)
         weights = weights._replace(trim=np.zeros(3))  # here the trims are fitted, and not noise
         evidence = replace(reference, weights=weights)
-        theta = fit(evidence, Estimate(theta), indices, limits=reference.limits)[0].theta
+        theta = evidence.fitted(Estimate(theta), indices).at.theta
     return theta
 
 
@@ -192,23 +192,18 @@ class ChangeEvidence(ViewEvidence):
         """Probability that a step of the search names a change although nothing has changed."""
         return self.limits.change_p_value
 
-    def estimate_noise(self, at: Estimate) -> tuple[ChangeEvidence, ViewBlock]:
-        """Return this evidence with its noise unchanged, since it is known; see `Evidence`."""
-        return self, self.linearise(at)
+    def estimate_noise(self, at: Estimate) -> Evaluation:
+        """Evaluate this evidence with its noise unchanged, since it is known; see `Evidence`."""
+        return self.relinearise(at)
 
     def scores(
-        self,
-        block: Block,
-        equations: NormalEquations,
-        theta: np.ndarray,
-        named: Sequence[int],
-        among: Sequence[Candidate],
-        seed: int,
+        self, current: Evaluation, named: Sequence[int], among: Sequence[Candidate], seed: int
     ) -> list[CandidateScore]:
         """Return the scores of all candidates close to the best, best first, see `Evidence`.
 
         The means of few flights contain little information: nearly every candidate is close.
         """
+        block, theta = current.block, current.at.theta
         assert isinstance(block, ViewBlock) and self.spread and self.exact_weights and self.weights
         weights = self.weights if named else self.exact_weights
         stretch = np.arange(len(block.data.flight))
@@ -232,12 +227,12 @@ class ChangeEvidence(ViewEvidence):
         return sorted((s for s in scores if s.gain >= least), key=lambda s: -s.gain)
 
     def explained_share(
-        self, before: Block, at: Estimate, after: Block, candidate: Candidate, gains: np.ndarray
+        self, before: Block, after: Evaluation, candidate: Candidate, gains: np.ndarray
     ) -> float | None:
         """Return the share of the error that a candidate explains; see `Evidence`."""
-        if at_bound(self.space, at.theta, candidate) or not flights_agree(gains):
+        if at_bound(self.space, after.at.theta, candidate) or not flights_agree(gains):
             return None
-        return Evidence.explained_share(self, before, at, after, candidate, gains)
+        return Evidence.explained_share(self, before, after, candidate, gains)
 
     def preference(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
         """Return a sort key: plausible candidates, then few parameters, then the catalogue."""
@@ -247,8 +242,8 @@ class ChangeEvidence(ViewEvidence):
 
 def change_evidence(
     reference: ViewEvidence, flights: Sequence[SmoothedFlight], spread: RotorSpread
-) -> tuple[ChangeEvidence, Estimate]:
-    """Return the evidence of changes in `flights` since `reference`, and the start of its search.
+) -> Evaluation:
+    """Return the evidence of changes in `flights` since `reference`, at the start of its search.
 
     `spread` is the spread of flights of the unchanged vehicle.
     """
@@ -274,7 +269,7 @@ def change_evidence(
     evidence = ChangeEvidence(
         task.view, task.model, flights, limits, task.carried, True, with_gain_error, weights, spread
     )
-    return evidence, Estimate(start)
+    return evidence.relinearise(Estimate(start))
 
 
 BOUND_SHARE = 0.1

@@ -26,7 +26,7 @@ from suite.diagnose.search.change import (
     rotor_spread,
     search_motion_change,
 )
-from suite.diagnose.search.evaluation import Evaluation, SearchResult
+from suite.diagnose.search.evaluation import SearchResult
 from suite.diagnose.sources.source import FITTED, GIVEN, DiagnosisInput, Series
 from suite.diagnose.sources.view_source import NO_AGREEMENT, QUANTITIES, Shares, ViewSource
 
@@ -110,9 +110,7 @@ class MotionSource(ViewSource):
     def search(self, say: Callable[[str], None], seed: int) -> SearchResult:
         """Search for an effect that has changed since the reference flights, see `Source`."""
         found = search_motion_change(self.reference, self.fitted, self.candidates, self.views)
-        evidence, block = self.weighed
-        unchanged = Evaluation(evidence, self.start, block)
-        return found or SearchResult((), self.start, unchanged, unchanged, [])
+        return found or SearchResult((), self.start, self.begin, self.begin, [])
 
 
 def since_reference(
@@ -130,21 +128,19 @@ def since_reference(
     thrusts vary between the flights of one vehicle. With `means_only` there is no fallback.
     `shared` are fields of both sources.
     """
-    difference, start = change_evidence(reference, evidence.flights, spread)
-    weighed = difference.relinearise(start)
-    shared = {
-        **shared, "weighed": weighed, "start": start, "names_small": True, "reference": reference
-    }  # fmt: skip
+    begin = change_evidence(reference, evidence.flights, spread)
+    theta = begin.at.theta
+    shared = {**shared, "begin": begin, "names_small": True, "reference": reference}
     in_motion = MotionSource(
         candidates=allowed, held=held, fitted=evidence, views=len(spread.along), **shared
     )
-    means = replace(less_reference_residual(reference, start.theta, held.flights), means=True)
+    means = replace(less_reference_residual(reference, theta, held.flights), means=True)
     shared |= {
         "measure": MEASURE.format(about=shared["about"], unit=shared["unit"]),
-        "floor": _spread_of_means(reference, start.theta),
+        "floor": _spread_of_means(reference, theta),
     }
     return MeansSource(
-        candidates=view_candidates(allowed, weighed[1]),
+        candidates=view_candidates(allowed, begin.block),
         held=means,
         fallback=None if means_only else in_motion,
         **shared,

@@ -16,7 +16,7 @@ import numpy as np
 
 from eval.effects import EFFECTS
 from suite.diagnose.estimate.block import Estimate
-from suite.diagnose.estimate.gauss_newton import TINY, fit, intervals95
+from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.estimate.parameters import Candidate, effects_in, indices_of
 from suite.diagnose.search.evaluation import NamedEffect, SearchResult
 from suite.diagnose.sources.source import TOO_SMALL, Finding, Source
@@ -211,8 +211,8 @@ def control(source: Source, found: SearchResult) -> tuple[str, Gap] | None:
     wrong = next((candidate for candidate in single if candidate.name not in excluded), None)
     if wrong is None:
         return None
-    theta = found.fitted_anew(found.start, list(wrong.indices)).theta
-    return wrong.label, source.gap(found, theta)
+    fitted = found.judged.evidence.fitted(found.start, list(wrong.indices))
+    return wrong.label, source.gap(found, fitted.at.theta)
 
 
 def _without_influence(found: SearchResult) -> list[Candidate]:
@@ -235,7 +235,7 @@ def _without_each(source: Source, found: SearchResult) -> dict[str, Gap]:
             theta = found.estimate.theta.copy()
             theta[list(one.indices)] = start[list(one.indices)]
             without = Estimate(theta, found.estimate.free)
-            theta = found.fitted_anew(without, indices_of(others)).theta
+            theta = found.judged.evidence.fitted(without, indices_of(others)).at.theta
         gaps[one.label] = source.gap(found, theta)
     return gaps
 
@@ -258,11 +258,10 @@ def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate,
         if not evidence.linearise(by.estimate, indices).acts().any() or candidate in by.candidates:
             continue
         fitted = sorted({*by.indices, *indices})
-        best, block = fit(evidence, by.estimate, fitted, limits=evidence.limits)
-        equations = block.equations.along_numbers(fitted)
-        half = intervals95(equations, evidence.flights_differ_p).half_width
+        best = evidence.fitted(by.estimate, fitted)
+        half = best.half_widths(fitted)
         for index in indices:
-            value, other = found.estimate.theta[index], best.theta[index]
+            value, other = found.estimate.theta[index], best.at.theta[index]
             other_half = float(half[fitted.index(index)])
             if abs(value - other) > CONTRADICTION * (widths[index] + other_half):
                 words = f"{value:.3g} here, {other:.3g} ± {other_half:.2g} there"

@@ -31,6 +31,7 @@ from suite.diagnose.data.windows import (
 from suite.diagnose.estimate.gauss_newton import TINY, Z95, gauss_newton_step
 from suite.diagnose.estimate.parameters import Candidate
 from suite.diagnose.estimate.permutation import folds_of
+from suite.diagnose.evidence.evidence import Evaluation
 from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.rollouts import (
     RolloutEvidence,
@@ -39,7 +40,7 @@ from suite.diagnose.evidence.rollouts import (
     true_starts,
 )
 from suite.diagnose.evidence.views import ViewEvidence
-from suite.diagnose.search.evaluation import Evaluation, SearchResult
+from suite.diagnose.search.evaluation import SearchResult
 from suite.diagnose.sources.source import (
     FITTED,
     GIVEN,

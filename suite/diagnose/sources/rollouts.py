@@ -22,6 +22,7 @@ from suite.diagnose.data.whitening import Linearisation, block_of, make_whitenin
 from suite.diagnose.data.windows import LENGTH_S, cut, take
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.parameters import candidates, make_space
+from suite.diagnose.evidence.evidence import Evaluation
 from suite.diagnose.evidence.rollouts import (
     RolloutModel,
     is_hopeless,
@@ -145,6 +146,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     # Effects on a signal that the logs lack, or that the model does not use, are not candidates.
     signals = {"acc_b"} if any(log.acc_b is not None for log in logs) else set()
     single = candidates(model.space, voltage, signals if rotor_input else signals | {"command"})
+    evidence, block = rollout_evidence(model, fitted, take(linear, is_fitted), limits)
     source = RolloutSource(
         name="whole",
         about="whole flights, in rollouts of a second",
@@ -152,8 +154,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
         unit="times the noise",
         measure=MEASURE,
         horizon_s=LENGTH_S,
-        weighed=rollout_evidence(model, fitted, take(linear, is_fitted), limits),
-        start=start_estimate(model, fitted),
+        begin=Evaluation(evidence, start_estimate(model, fitted), block),
         candidates=[*single, *composites(single)],
         limits=limits,
         small_explains=True,

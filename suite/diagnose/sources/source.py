@@ -20,9 +20,9 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.estimate.block import Block, Estimate
+from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
-from suite.diagnose.evidence.evidence import Evidence
+from suite.diagnose.evidence.evidence import Evaluation
 from suite.diagnose.search.evaluation import NamedEffect, SearchResult
 from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import Thresholds
@@ -103,11 +103,9 @@ class Source(ABC):
     """For people: definition of the gap."""
     horizon_s: float
     """Length of the windows over which the gap is measured [s]."""
-    weighed: tuple[Evidence, Block]
-    """The fitted flights with the weights of their residuals, and the linearisation of these
-    residuals, both at the start of the search."""
-    start: Estimate
-    """The vehicle file's parameters, from which the search starts."""
+    begin: Evaluation
+    """The fitted flights with their noise, evaluated along all parameters at the vehicle file's
+    parameters, from which the search starts."""
     candidates: Sequence[Candidate]
     """Effects that the search tries."""
     limits: Thresholds
@@ -123,7 +121,12 @@ class Source(ABC):
     @property
     def space(self) -> ParameterSpace:
         """The catalogue's parameters."""
-        return self.weighed[0].space
+        return self.begin.evidence.space
+
+    @property
+    def start(self) -> Estimate:
+        """The parameters from which the search starts."""
+        return self.begin.at
 
     @property
     def window(self) -> str:
@@ -140,7 +143,7 @@ class Source(ABC):
 
     def search(self, say: Callable[[str], None], seed: int) -> SearchResult:
         """Search for the effects that explain the fitted flights."""
-        return search(self.weighed[0], self.start, self.candidates, say, seed, self.weighed)
+        return search(self.begin, self.candidates, say, seed)
 
     def is_worse(self, before: Gap, after: Gap) -> bool:
         """Return whether held-out flights contradict effects that change the gap to `after`.

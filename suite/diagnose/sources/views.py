@@ -67,7 +67,7 @@ def by_views(given: DiagnosisInput) -> SourceSet:
               f"about {BASE_S + rows * ROW_S:.0f} s")  # fmt: skip
     # Choose the held-out flights by their information, so that the fitted flights keep enough.
     first = evidence[flights.views[0].name]
-    block = first.estimate_noise(first.start)[1]
+    block = first.estimate_noise(first.start).block
     information = (block.slope**2).sum(axis=1)
     start_s = np.zeros(len(information))
     is_fitted, _ = choose_held_out(logs, block.flight, start_s, information, limits)
@@ -96,15 +96,12 @@ def by_views(given: DiagnosisInput) -> SourceSet:
                 )
             )
             continue
-        weighed = to_fit.estimate_noise(to_fit.start)
-        tried = view_candidates([*allowed, *composites(allowed)], weighed[1])
+        begin = to_fit.estimate_noise(to_fit.start)
+        tried = view_candidates([*allowed, *composites(allowed)], begin.block)
         whole = one if one.view.in_world else None
         sources.append(
-            ViewSource(
-                weighed=weighed, start=to_fit.start, candidates=tried, held=held_out,
-                all_flights=whole, **shared,
-            )
-        )  # fmt: skip
+            ViewSource(begin=begin, candidates=tried, held=held_out, all_flights=whole, **shared)
+        )
     lag = None if references else find_rotor_lag(logs, vehicle, limits)
     return SourceSet(
         tuple(sources),

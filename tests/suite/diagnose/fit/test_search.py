@@ -15,8 +15,8 @@ from suite.diagnose.estimate.block import Block, Estimate, NormalEquations, prod
 from suite.diagnose.estimate.gauss_newton import chi2_by_group, chi2_fall, intervals95, solve
 from suite.diagnose.estimate.parameters import ParameterSpace, candidates, effects_in, make_space
 from suite.diagnose.estimate.permutation import folds_of, score_candidates
-from suite.diagnose.evidence.evidence import Evidence, flights_agree
-from suite.diagnose.search.evaluation import Evaluation, linear_change
+from suite.diagnose.evidence.evidence import Evaluation, Evidence, flights_agree
+from suite.diagnose.search.evaluation import linear_change
 from suite.diagnose.search.search import could_be_best, needs_all_parts, search
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.vehicles import PLAIN
@@ -269,8 +269,8 @@ class Response(Evidence):
             windows % 4, 1.0 * (windows // 4), none, none[..., None] + np.zeros(len(along)),
         )  # fmt: skip
 
-    def estimate_noise(self, at: Estimate) -> tuple[Evidence, Block]:
-        return self, self.linearise(at)
+    def estimate_noise(self, at: Estimate) -> Evaluation:
+        return self.relinearise(at)
 
 
 def test_a_delay_longer_than_a_jump_is_named_and_not_a_lower_gain():
@@ -282,10 +282,11 @@ def test_a_delay_longer_than_a_jump_is_named_and_not_a_lower_gain():
     flown = replace(flown, measured=flown.response(0.03) + noise)
     among = [c for c in COMMANDED if {DELAY, GAIN} & {*c.indices}]
 
-    found = search(flown, BEGIN, among)
+    found = search(flown.relinearise(BEGIN), among)
     assert [one.label for one in found.candidates] == ["command_delay"]
     assert abs(found.estimate.theta[DELAY] - 0.03) < 1e-3
     # The tangent at no delay leads into another minimum.
     entries = tuple(replace(entry, tried=()) for entry in SPACE.entries)
-    stuck = search(replace(flown, parameters=replace(SPACE, entries=entries)), BEGIN, among)
+    flown = replace(flown, parameters=replace(SPACE, entries=entries))
+    stuck = search(flown.relinearise(BEGIN), among)
     assert "command_delay" not in [one.label for one in stuck.candidates]
