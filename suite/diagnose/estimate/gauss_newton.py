@@ -1,8 +1,7 @@
 """Fits parameters by Gauss-Newton with bounds and step halving, and computes 95 % intervals.
 
-All functions work on blocks, which are the linearised residuals of stretches of flights, and on
-their normal equations (`estimate/block.py`). So every kind of evidence uses them. J is the Jacobian
-of the model and r the residual; chi-square is the squared error over the noise variance.
+All functions work on blocks and their normal equations (`estimate/block.py`). J is the Jacobian of
+the model and r the residual; chi-square is the squared error over the noise variance.
 """
 
 from __future__ import annotations
@@ -22,14 +21,10 @@ from suite.diagnose.estimate.parameters import ParameterSpace
 def solve(
     hessian: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray, scale: np.ndarray
 ) -> np.ndarray:
-    """Return the change (K,) of K parameters within bounds that lowers chi-square most.
+    """Return the change (K,) of K parameters, from `low` to `high`, that lowers chi-square most.
 
-    Args:
-        hessian: (K, K) J'J.
-        gradient: (K,) J'r.
-        low: (K,) lower bound of the change.
-        high: (K,) upper bound of the change.
-        scale: (K,) usual size of each parameter. In these units the equations are well conditioned.
+    `hessian` is J'J and `gradient` J'r. `scale` (K,) is the usual size of each parameter: in these
+    units the equations are well conditioned.
 
     Raises:
         ValueError: for values that are not finite.
@@ -61,11 +56,8 @@ def gauss_newton_step(
 ) -> tuple[np.ndarray, float]:
     """Return the best change (K,) of the parameters, and the expected fall of chi-square.
 
-    Args:
-        equations: normal equations along the K fitted parameters, computed at `theta`.
-        theta: (P,) values of all parameters.
-        space: bounds of all parameters.
-        inside: (B,) bool, whether each stretch is fitted; all are if not given.
+    `equations` are along the K fitted parameters, computed at `theta` (P,). `inside` (B,) bool says
+    which stretches are fitted; all are if not given.
     """
     hessian, gradient = equations.sums(inside)
     indices = np.array(equations.numbers, dtype=int)
@@ -107,14 +99,10 @@ def fit(
     rounds: int | None = None,
     known: Block | None = None,
 ) -> tuple[Estimate, Block]:
-    """Fit the parameters at `indices` and the nuisance parameters of every stretch.
+    """Fit the parameters at `indices` and the nuisance parameters of every stretch, from `start`.
 
-    Args:
-        evidence: evidence whose noise is known.
-        start: estimate with which the fit begins.
-        indices: places of the fitted parameters in the vector.
-        rounds: largest number of steps; by default that of the evidence's `limits`.
-        known: the block at `start`, if it was computed before.
+    It takes at most `rounds` steps, by default those of the evidence's `limits`. `known` is the
+    block at `start`, if it was computed before.
 
     Returns:
         The best estimate, and the block at this estimate.

@@ -2,9 +2,8 @@
 
 Evidence is the differences between simulation and flights, divided by their noise. Each kind of it
 is one subclass: the errors of rollouts (simulated stretches of 1 s), or those of force or torque. A
-subclass linearises its residuals along the model's parameters and estimates their noise; the other
-methods have defaults. A block is the result of a linearisation (`estimate/block.py`), and a stretch
-is a piece of a flight whose residuals may be correlated.
+subclass linearises its residuals (see `estimate/block.py`) and estimates their noise; the other
+methods have defaults.
 """
 
 from __future__ import annotations
@@ -126,10 +125,7 @@ class Evaluation(NamedTuple):
 
 
 def validation_groups(flight: np.ndarray) -> np.ndarray:
-    """Return the cross-validation group (M,) of each row: its flight, or its third of a single one.
-
-    `flight` (M,) is the number of each row's flight.
-    """
+    """Return the cross-validation group (M,) of each row: its flight, or third of a single one."""
     if len(np.unique(flight)) > 1:
         return flight
     return np.arange(len(flight)) * 3 // len(flight)

@@ -1,9 +1,8 @@
 """Rollouts (simulated stretches of 1 s) as evidence on the model's parameters.
 
-`RolloutModel` computes the errors of rollouts and their Jacobian, compiled once for all vehicles.
-`RolloutEvidence` divides both by the measurement noise, and removes what a change of the unknown
-start states could explain. A window is the data of one stretch. Start numbers are what is unknown
-at its start: 12 numbers of the state, and errors of the rotor speeds.
+`RolloutModel` computes the errors of rollouts and their Jacobian. `RolloutEvidence` divides both by
+the measurement noise, and removes what a change of the unknown start numbers could explain: 12
+numbers of the state, and errors of the rotor speeds.
 """
 
 from __future__ import annotations
@@ -129,11 +128,6 @@ def start_estimate(model: RolloutModel, windows: FlightWindows) -> Estimate:
     return Estimate(theta, true_starts(model, theta, windows))
 
 
-ACC_ROW = 9
-"""The acceleration at a window's start is computed from the velocities there and in this row,
-counted among the rows with a velocity."""
-
-
 def true_starts(model: RolloutModel, theta: np.ndarray, windows: FlightWindows) -> np.ndarray:
     """Return the true start states minus the logged ones, (W, F), given the delay of logged poses.
 
@@ -164,8 +158,6 @@ def rollouts_along(
     limits: Thresholds = THRESHOLDS,
 ) -> tuple[RolloutModel, FlightWindows, Estimate]:
     """Return the model of rollouts of `vehicle` along `logs`, the windows, and the start of a fit.
-
-    The arguments are those of `cut` and `fly_windows`.
 
     Raises:
         ValueError: if no flight has a window.
@@ -247,6 +239,9 @@ def is_hopeless(
     return is_far(float((best.block.residual**2).sum()))
 
 
+ACC_ROW = 9
+"""The acceleration at a window's start is computed from the velocities there and in this row,
+counted among the rows with a velocity."""
 COMPILED = {"xla_cpu_use_fusion_emitters": False}
 """Options of the compiler XLA: its newer code for loops is no faster, and compiles half as fast."""
 
@@ -288,8 +283,8 @@ class RolloutModel:
         self.dt = step_s(vehicle)
         """About the length of a step [s]."""
         self.integrator = integrator
-        kind = (space.layout, rotor_input, voltage, integrator)
-        _, self._linear, self._respond = compiled(*kind)
+        functions = compiled(space.layout, rotor_input, voltage, integrator)
+        _, self._linear, self._respond = functions
 
     def residual(self, theta: np.ndarray, offset: np.ndarray, windows: FlightWindows) -> np.ndarray:
         """Return measured - simulated (W, N, 19), with start numbers changed by `offset` (W, F)."""
@@ -330,8 +325,8 @@ def compiled(
 ) -> tuple[Callable[..., Any], ...]:
     """Return three functions of (vehicle, theta, offset, windows), kept as compiling is slow.
 
-    The first gives simulated - measured and the simulated states, and takes a disturbance, too. The
-    second is that of `slopes_along`, and the third gives the response to disturbances at the knots.
+    The first gives simulated - measured and the simulated states (and takes a disturbance), the
+    second that of `slopes_along`, the third the response to disturbances at the knots.
     """
 
     def fly(

@@ -1,8 +1,4 @@
-"""Force and torque as evidence on the model's parameters.
-
-A view is one part of the dynamics, force or torque. Measured mean accelerations are compared with
-those of the model. The noise of the residuals is estimated from the residuals themselves.
-"""
+"""Force and torque as evidence: measured mean accelerations compared with those of the model."""
 
 from __future__ import annotations
 
@@ -71,10 +67,7 @@ class ViewEvidence(Evidence):
         return Estimate(self.space.array("start"))
 
     def residuals(self, theta: np.ndarray, indices: Sequence[int] | None = ()) -> ViewData:
-        """Return the residuals at the parameters `theta` (P,), with slopes along `indices`.
-
-        With None as indices the slopes are along all parameters.
-        """
+        """Return the residuals at `theta` (P,), with slopes along `indices`, or all with None."""
         parts = [self._residuals(n, theta, indices) for n in range(len(self.flights))]
         # Flights may have different numbers of unknowns of the pose: pad with zeros.
         widest = max(part.pose_slope.shape[2] for part in parts)
@@ -181,8 +174,7 @@ def _attenuated(series: np.ndarray, reliability: np.ndarray) -> np.ndarray:
 def view_candidates(among: Sequence[Candidate], block: Block) -> list[Candidate]:
     """Return the candidates that change a view's accelerations, without faults of sensors.
 
-    Of a composite (several effects as one hypothesis), each effect has to change them, alone or
-    through another effect.
+    Each effect of a composite has to change them, alone or through another effect.
     """
     acts, acting_through_others = block.acts(), carried(among)
 

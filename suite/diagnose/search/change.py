@@ -1,10 +1,9 @@
 """Finds what has changed in a vehicle since reference flights, earlier flights of the same vehicle.
 
 The vehicle file need not be right: the residual of the reference flights (its mean, and its
-dependence on velocity) is subtracted from the residual of the later flights. The reference flights
-also show how much flights of an unchanged vehicle differ (`rotor_spread`). Their mean has an error,
-too, which is common to all later flights. A change is named if it is large compared with that
-spread; all candidates are tested together (`estimate/permutation.py`).
+dependence on velocity) is subtracted from that of the later flights. The reference flights also
+show how much flights of an unchanged vehicle differ (`rotor_spread`). A change is named if it is
+large compared with that spread.
 
 Some effects, such as a drag, only act in motion, and hardly change the mean of a flight. So where
 no mean has changed, each candidate is fitted to each flight alone. The fitted values of the
@@ -44,9 +43,8 @@ from suite.diagnose.search.evaluation import NamedEffect, SearchResult
 def _motion_inputs(task: ViewEvidence, theta: np.ndarray) -> np.ndarray:
     """Return the inputs (M, 9) of a regression that explains a model's error by the motion.
 
-    They are the velocity, the speed times the velocity, and the model's accelerations at the
-    parameters `theta` (P,), which stand for an error of the model's gain or delay. Each flight's
-    mean is subtracted.
+    They are the velocity, the speed times the velocity, and the model's accelerations at `theta`
+    (P,), which stand for an error of its gain or delay; all without each flight's mean.
     """
     motion = []
     for flight in task.flights:
@@ -81,8 +79,7 @@ def less_reference_residual(
 ) -> ViewEvidence:
     """Return the evidence of `flights`, from which the reference flights' residual is subtracted.
 
-    That residual is computed at the parameters `theta` (P,) of `fit_balance`, and is described by
-    its mean and a ridge regression on the motion.
+    That residual, at `theta` (P,), is described by its mean and a ridge regression on the motion.
     """
     data, inputs = reference.residuals(theta), _motion_inputs(reference, theta)
     deviation = centred(data.residual, data.flight)
@@ -112,6 +109,15 @@ class RotorSpread:
     prior: int
     """Weight of the pooled estimate in `along`, in degrees of freedom."""
 
+    def words(self, count: int) -> tuple[str, ...]:
+        """Return a text for people on how much the `count` reference flights differ."""
+        return (
+            f"The {count} reference flights differ as if each rotor's thrust varied by "
+            f"{100 * self.share:.1f} % from flight to flight ({self.freedom} degrees of freedom). "
+            "The differences along each axis count as well. A change is named if it exceeds these "
+            "differences significantly.",
+        )
+
     def variance_ratios(self, view: str, draws: int, rng: np.random.Generator) -> np.ndarray:
         """Return draws (D, 3) of the estimated variance over the true one, by axis of `view`.
 
@@ -128,10 +134,7 @@ class RotorSpread:
 def _moderated(
     pooled: np.ndarray | float, square: np.ndarray, freedom: np.ndarray, prior: int
 ) -> np.ndarray:
-    """Return a weighted mean of the pooled variance and of each axis's own (Smyth 2004).
-
-    `square` is the sum of squares of an axis with `freedom`, and `prior` the weight of `pooled`.
-    """
+    """Return a weighted mean of the pooled variance and of each axis's own (Smyth 2004)."""
     return (prior * pooled + square) / (prior + freedom)
 
 
@@ -243,10 +246,7 @@ class ChangeEvidence(ViewEvidence):
 def change_evidence(
     reference: ViewEvidence, flights: Sequence[SmoothedFlight], spread: RotorSpread
 ) -> Evaluation:
-    """Return the evidence of changes in `flights` since `reference`, at the start of its search.
-
-    `spread` is the spread of flights of the unchanged vehicle.
-    """
+    """Return the evidence of changes in `flights` since `reference`, at the start of its search."""
     start = fit_balance(reference)
     task, count = less_reference_residual(reference, start, flights), len(reference.flights)
     gain, data = rotor_gain(task), task.residuals(start)
@@ -305,8 +305,8 @@ def search_motion_change(
 ) -> SearchResult | None:
     """Return the candidate that has changed since `reference`; None where none is significant.
 
-    The parameters of the result are total values, not changes. Both sets need at least two flights.
-    Bonferroni's correction counts the number of searched `views`.
+    Its parameters are total values, not changes. Both sets need at least two flights. Bonferroni's
+    correction counts the searched `views`.
     """
     start, limits, space = fit_balance(reference), task.limits, task.space
     sets = [within_flights(one.residuals(start, None)) for one in (reference, task)]

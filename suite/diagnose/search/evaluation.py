@@ -1,8 +1,4 @@
-"""Fits candidate effects from one estimate of the parameters; defines the result of a search.
-
-A candidate is an effect, or several as one hypothesis (a composite), that may explain the residuals
-of flights. A block is what a linearisation gives: residuals and slopes (`estimate/block.py`).
-"""
+"""Fits candidate effects from one estimate of the parameters; defines the result of a search."""
 
 from __future__ import annotations
 
@@ -38,19 +34,23 @@ class NamedEffect:
     """Share of the squared error that the effect explains."""
 
 
+def fitted_by(named: Sequence[NamedEffect]) -> list[int]:
+    """Return the places of the named effects' parameters in the vector of all."""
+    return indices_of([name.candidate for name in named])
+
+
 def with_inactive(current: Evaluation, among: Sequence[Candidate]) -> Evaluation:
     """Return the evaluation `current` with further columns for inactive parameters.
 
-    A wind acts only through a drag: without a drag the wind's column of slopes is zero. Then a
-    second column is added, computed with a drag of usual size (see `estimate/composites.py`).
-    Some columns become secants (see `with_secants`).
+    Without a drag, a wind's column of slopes is zero. Then a second column is added, computed with
+    a drag of usual size (see `inactive_at`). Some columns become secants (see `with_secants`).
     """
     evidence, at, _ = current
     block = with_secants(current, among)
     inactive = inactive_at(evidence.space, at.theta, among, block.acts())
     if inactive is not None:
-        indices = inactive.indices
-        active = evidence.linearise(Estimate(inactive.theta, at.free), indices)
+        indices, raised = inactive
+        active = evidence.linearise(Estimate(raised, at.free), indices)
         columns = [active.along.index(index) for index in indices]
         block = replace(
             block,
@@ -64,10 +64,9 @@ def with_inactive(current: Evaluation, among: Sequence[Candidate]) -> Evaluation
 def with_secants(current: Evaluation, among: Sequence[Candidate]) -> Block:
     """Return the block with secants in place of tangents where these lead to a worse minimum.
 
-    A delay longer than the time between two rows is such a case: the tangent at no delay leads
-    nowhere near it. So the model is evaluated at the parameter's values `tried`. If the best of
-    them lowers chi-square more than a linear fit along the tangent, the column becomes the secant
-    to this value. A fit's first step then leads there.
+    A delay longer than the time between two rows is such a case. So the model is evaluated at the
+    parameter's values `tried`. If the best of them lowers chi-square more than a linear fit along
+    the tangent, the column becomes the secant to this value. A fit's first step then leads there.
     """
     evidence, at, block = current
     entries, start = evidence.space.entries, evidence.space.array("start")
@@ -166,7 +165,7 @@ class SearchResult:
     @property
     def indices(self) -> list[int]:
         """Places of the named effects' parameters in the vector of all."""
-        return indices_of(self.candidates)
+        return fitted_by(self.named)
 
     @property
     def moved(self) -> np.ndarray:
@@ -179,7 +178,7 @@ class SearchResult:
 
     def refitted(self, named: Sequence[NamedEffect]) -> SearchResult:
         """Return this result with only the effects `named`, fitted again."""
-        indices = indices_of([one.candidate for one in named])
+        indices = fitted_by(named)
         theta = self.start.theta.copy()
         theta[indices] = self.estimate.theta[indices]
         begin = Estimate(theta, self.estimate.free) if named else self.start

@@ -3,8 +3,7 @@
 A candidate is an effect of the catalogue, or several as one hypothesis (a composite). It is named
 if it lowers the error on left-out stretches of the flights by more than the best of all candidates
 does by chance, and if it passes further tests of the evidence. An alternative (`rivals` in the
-code) is another candidate that explains the same flights about as well; the diagnosis prints it as
-`A or B`. All kinds of evidence use this search.
+code) is another candidate that explains the same flights about as well.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import numpy as np
 
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.gauss_newton import chi2_fall
-from suite.diagnose.estimate.parameters import Candidate, indices_of
+from suite.diagnose.estimate.parameters import Candidate
 from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.evidence.evidence import Evaluation, Evidence
 from suite.diagnose.search.evaluation import (
@@ -25,6 +24,7 @@ from suite.diagnose.search.evaluation import (
     SearchResult,
     cross_validated_chi2,
     fit_with,
+    fitted_by,
     with_inactive,
 )
 from suite.diagnose.thresholds import Thresholds
@@ -86,14 +86,9 @@ def search(
         say("the model leaves more than noise: names are judged by what it leaves")
         named, at = _settle(task, misfit, last.at, named)
         judged = _final_fit(misfit, at, named)
-        block = last.evidence.linearise(judged.at, _indices(named))
+        block = last.evidence.linearise(judged.at, fitted_by(named))
         last = Evaluation(last.evidence, judged.at, block)
     return SearchResult(tuple(named), start, last, judged, first)
-
-
-def _indices(named: Sequence[NamedEffect]) -> list[int]:
-    """Return the places of the named effects' parameters in the vector of all."""
-    return indices_of([name.candidate for name in named])
 
 
 def _one_name_per_effect(name: NamedEffect) -> list[NamedEffect]:
@@ -103,7 +98,7 @@ def _one_name_per_effect(name: NamedEffect) -> list[NamedEffect]:
 
 def _final_fit(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Evaluation:
     """Fit all names with many steps, as some effects saturate; without names keep the estimate."""
-    indices = _indices(named)
+    indices = fitted_by(named)
     return evidence.fitted(at, indices, evidence.limits.last_rounds if indices else 0)
 
 
@@ -115,21 +110,15 @@ def _best_candidate(
     known: Sequence[CandidateScore] | None = None,
     tested: Candidate | None = None,
 ) -> tuple[NamedEffect, Estimate] | None:
-    """Return the candidate that explains most in addition to `named`, and the fit with it.
+    """Return the candidate of `among` that explains most in addition to `named`, and its fit.
 
-    None where no candidate passes all tests.
-
-    Args:
-        task: inputs of the search.
-        current: evaluation with the present names, without the candidate.
-        named: names that are fitted together with every candidate.
-        among: the candidates.
-        known: scores of the candidates, if they were computed before.
-        tested: candidate of a name that was taken out of `current`, to be tested against the other
-            candidates. If given, all that could replace it are fitted, significant or not.
+    None where no candidate passes all tests. `current` is the evaluation with the present names.
+    `known` are the scores of the candidates, if they were computed before. `tested` is a candidate
+    that was taken out of `current`, to be tested against the others. If given, all that could
+    replace it are fitted, significant or not.
     """
     evidence, limits, space = current.evidence, current.evidence.limits, current.evidence.space
-    others = _indices(named)
+    others = fitted_by(named)
     unnamed = [c for c in among if not set(c.indices) & set(others)]
     known = known or evidence.scores(current, others, unnamed, task.seed)
     scores = {score.candidate: score for score in known}
@@ -204,7 +193,7 @@ def _replace_or_drop(
     """Test the name at `place` of `named` as if it were added last, against the candidates `among`.
 
     The best candidate takes its place; that may be the same effect. If none passes, the name is
-    dropped. Returned are the new names and the fit with them.
+    dropped. Returned are the new names and their fit.
     """
     tested, theta = named[place].candidate, at.theta.copy()
     theta[list(tested.indices)] = evidence.space.array("start")[list(tested.indices)]
@@ -239,15 +228,12 @@ def _drop_unneeded(
 def _settle(
     task: SearchTask, evidence: Evidence, at: Estimate, named: list[NamedEffect]
 ) -> tuple[list[NamedEffect], Estimate]:
-    """Refit all names together and test each against all candidates, until no name changes.
-
-    Returned are the names and the fit with them.
-    """
+    """Refit all names and test each against all candidates, until none changes; return both."""
     for _ in range(evidence.limits.settle_rounds):
         before = [name.candidate for name in named]
         if not before:
             break
-        at = evidence.fitted(at, indices_of(before)).at
+        at = evidence.fitted(at, fitted_by(named)).at
         place = 0
         while place < len(named):
             count = len(named)
@@ -278,8 +264,7 @@ def needs_all_parts(
 ) -> bool:
     """Return whether no single part of a composite explains about as much as the composite.
 
-    `costs` holds chi-square plus the number of parameters, by fitted candidate. True for a
-    candidate that is not a composite.
+    `costs` holds chi-square plus the number of parameters, by fitted candidate.
     """
     limit = costs[candidate] + limits.rival_chi2
     return all(limit < costs.get(part, np.inf) for part in candidate.parts)

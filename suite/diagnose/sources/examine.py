@@ -1,10 +1,7 @@
 """The steps of a diagnosis for one source of evidence (rollouts, force or torque).
 
-A source compares flights with the model in one way (`source.py`). The steps are search, test on
-held-out flights, test of relevance, and analysis of the remaining error. `diagnose.py` calls
-`examine` for each source, and then `one_cause` on all findings.
-
-The argument `found` is always the result of a search: named effects and their fitted parameters.
+The steps are search, test on held-out flights, test of relevance, and analysis of the remaining
+error. The argument `found` is always the result of a search: named effects and their fit.
 """
 
 from __future__ import annotations
@@ -216,10 +213,7 @@ def control(source: Source, found: SearchResult) -> tuple[str, Gap] | None:
 
 
 def _without_influence(found: SearchResult) -> list[Candidate]:
-    """Return the named effects on which these flights have no information.
-
-    An example is a wind without a drag.
-    """
+    """Return the named effects without information in these flights, as a wind without a drag."""
     information = np.einsum("wkk->k", found.judged.equations.along_numbers(found.indices).hessian)
     informed = {i for i, value in zip(found.indices, information, strict=True) if value > 0.0}
     return [candidate for candidate in found.candidates if not informed & set(candidate.indices)]
@@ -241,13 +235,10 @@ def _without_each(source: Source, found: SearchResult) -> dict[str, Gap]:
 
 
 def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate, str]]:
-    """Return the named effects of `found` that the evidence of `by` contradicts.
+    """Return the named effects of `found` that the evidence of `by` contradicts, and both values.
 
     Each effect is fitted to that evidence, together with the effects that `by` names. It is
     contradicted if a parameter differs significantly from its value in `found`.
-
-    Returns:
-        For each such effect, its candidate and a text with both values.
     """
     refused = []
     widths = dict(zip(found.indices, found.half_widths(), strict=True))

@@ -1,8 +1,7 @@
 """The source of evidence `whole`: whole flights, simulated in stretches of 1 s (rollouts).
 
-Its residuals are the differences between measured and simulated states. `FlightWindows` holds the
-stretches, here also called windows. W is their number, N the number of rows of each, and 19 the
-number of channels (position, attitude, velocity, rates, accelerometer, rotor speeds).
+Arrays have W windows (stretches), N rows of each, and 19 channels (position, attitude, velocity,
+rates, accelerometer, rotor speeds).
 """
 
 from __future__ import annotations
@@ -348,9 +347,8 @@ def structure_where(
 ) -> str | None:
     """Return in words the quantity that a structured residual depends on; None if it is noise.
 
-    The energy of slow errors and its expectation are from `RolloutEvidence.slow_errors`. With
-    measured rotor speeds as the input, or commands of which the log lacks some, the noise is less
-    certain. The thresholds are then higher.
+    `slow_errors` are from `RolloutEvidence.slow_errors`. With measured rotor speeds as the input,
+    or commands of which the log lacks some, the noise is less certain, and the thresholds higher.
     """
     slow, expected = slow_errors
     shape = residual.shapes[0] if residual.shapes else None
@@ -374,10 +372,7 @@ def structure_where(
 
 
 def _worst_channels(slow: np.ndarray, expected: np.ndarray) -> str:
-    """Return in words the three channels whose slow errors exceed the expected ones most.
-
-    `slow` and `expected` (12,) are energies of the errors by channel.
-    """
+    """Return in words the three channels whose `slow` errors (12,) exceed the `expected` most."""
     energy = np.maximum(slow / np.maximum(expected, 1e-9) - 1.0, 0.0)
     worst = [k for k in np.argsort(-energy)[:3] if energy[k] > 0]
     # Each group of channels has three axes.
@@ -385,10 +380,7 @@ def _worst_channels(slow: np.ndarray, expected: np.ndarray) -> str:
 
 
 def pose_delays(found: SearchResult) -> dict[str, float]:
-    """Return the delay [s] of the logged pose that each named effect describes, by its name.
-
-    Only effects that describe such a delay have an entry.
-    """
+    """Return the delay [s] of the logged pose by name, of those named effects that describe one."""
     values = found.judged.evidence.space.effects(found.estimate.theta)
     named = dict.fromkeys(candidate.name for candidate in found.candidates)
     return {name: float(pose_delay({name: values[name]})) for name in named if EFFECTS[name].late}

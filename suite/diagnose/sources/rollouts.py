@@ -1,8 +1,7 @@
 """Makes the source of evidence `whole`, which compares simulated stretches of 1 s with flights.
 
-Such a stretch is a rollout: it starts from a measured state, and commands or rotor speeds drive it.
-Some stretches are fitted, the others held out. `FlightWindows` holds the stretches, here also
-called windows; W is their number.
+Such a stretch (a window; W is their number) is a rollout: it starts from a measured state, and
+commands or rotor speeds drive it. Some stretches are fitted, the others held out.
 """
 
 from __future__ import annotations
@@ -107,7 +106,13 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     all_windows, windows, linear = windows, take(windows, is_finite), take(linear, is_finite)
     if coarser is not None:
         limits = with_model_error(model, start.theta, windows, linear, coarser, limits)
-    coarser_share = 0.0 if coarser is None or not rotor_input else _coarser_share(logs, vehicle)
+    # See `RolloutSource.sizes` for these shares.
+    dense = all(
+        log.rotor_speed is None
+        or rows_show_torque(vehicle, own_spacing_s(log.time_s, log.rotor_speed))
+        for log in logs
+    )
+    coarser_share = 0.0 if coarser is None or not rotor_input else (0.5 if dense else 2.0)
     if not rotor_input and commands_are_slow(logs, limits):
         fewer = take(windows_of(fewer_commands=all_windows)[0], is_finite)
         held = with_held_commands(model, start.theta, windows, linear, fewer, limits)
@@ -175,24 +180,14 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
 def can_fly(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
     """Return whether rollouts of these flights can be simulated.
 
-    The logs must have all signals of the state. They must also have measured rotor speeds, or
-    commands to a rate loop without integrators and filters: these have an unknown state.
+    The logs need all signals of the state, and measured rotor speeds or commands to a rate loop
+    without integrators and filters (whose state is unknown).
     """
     return not any(
         log.partial
         or (log.rotor_speed is None and (log.rate_cmd_b is None or has_firmware_loop(vehicle)))
         for log in logs
     )
-
-
-def _coarser_share(logs: Sequence[FlightLog], vehicle: Vehicle) -> float:
-    """Return `coarser_share` of a source driven by rotor speeds; see `RolloutSource.sizes`."""
-    rows_are_dense = all(
-        log.rotor_speed is None
-        or rows_show_torque(vehicle, own_spacing_s(log.time_s, log.rotor_speed))
-        for log in logs
-    )
-    return 0.5 if rows_are_dense else 2.0
 
 
 def _needs_rotor_input(logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds) -> bool:

@@ -3,8 +3,7 @@
 A source belongs to one view (part of the dynamics): whole flights (rollouts), forces or torques. It
 has the flights that are fitted and those that are held out to test the result. A new source is one
 subclass of `Source` and one function that makes it from flights, with an entry in `SOURCES`
-(`suite/diagnose/diagnose.py`). Search, held-out test, relevance, verdict, JSON and report use only
-this interface.
+(`suite/diagnose/diagnose.py`).
 
 Arrays of parameters have P entries: all parameters of all effects in the catalogue.
 """
@@ -190,13 +189,9 @@ def sizes_by_effect(
     """Return the size of each named effect and the upper end of its 95 % interval, by name.
 
     The upper end is zero if the model's own error may be the whole effect (see `beyond_error`).
-
-    Args:
-        found: result of a search with K named parameters.
-        slope: (..., K) derivatives of the flights' errors with respect to these parameters.
-        size_of: function from a change of the flights' errors to its size.
-        model_error: (K,) changes of the parameters that the model's own numerical error may cause.
-            They are subtracted before the upper end is computed.
+    `slope` (..., K) are derivatives of the flights' errors by the K named parameters, and `size_of`
+    takes a change of these errors to its size. The model's own numerical error may change the
+    parameters by `model_error` (K,); this is subtracted before the upper end is computed.
     """
     entries, width, change = found.last.evidence.space.entries, found.half_widths(), found.moved
     certain = np.sign(change) * np.maximum(np.abs(change) - model_error, 0.0)

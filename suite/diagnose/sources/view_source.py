@@ -1,9 +1,8 @@
 """The sources of evidence `force` and `torque`, which compare mean accelerations with the model.
 
-Each is a view: one part of the dynamics, with all other signals as measured. Accelerations are
-averaged over short windows; M is the number of these means. A black box, a ridge regression without
-physics, is fitted to the same flights. It estimates how much of the error any model could explain,
-and whether structure remains beyond the named effects.
+Accelerations are averaged over short windows; M is the number of these means. A black box, a ridge
+regression without physics, is fitted to the same flights. It estimates how much of the error any
+model could explain, and whether structure remains beyond the named effects.
 """
 
 from __future__ import annotations
@@ -73,10 +72,7 @@ class ViewSource(Source):
         return round(self.limits.view_block_s / self.view.spacing_s)
 
     def _within(self, residual: np.ndarray, flight: np.ndarray) -> np.ndarray:
-        """Return the `residual` (M, 3) without each flight's mean (its trim).
-
-        A mean is no error within the flight. `flight` (M,) is the number of each row's flight.
-        """
+        """Return the `residual` (M, 3) without each flight's mean (its trim)."""
         return centred(residual, flight)
 
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
@@ -207,8 +203,7 @@ class ViewSource(Source):
         measured = (before.value + before.residual)[rows, axis][shown]
         lines = {GIVEN: before.value[rows, axis][shown]}
         if found.named:
-            named = measured - after.residual[rows, axis][shown]
-            lines[FITTED] = named
+            lines[FITTED] = measured - after.residual[rows, axis][shown]
         quantity = QUANTITIES.get(self.name, self.name).capitalize()
         return Series(
             middle[shown] - middle[shown][0],
@@ -239,22 +234,14 @@ class Shares(NamedTuple):
 
     def along(self, axis: int) -> dict[str, float | None]:
         """Return the entries of diagnosis.json for one axis."""
-        values = {
-            "repeatability": self.repeatability,
-            "closed": self.closed,
-            "explainable": self.explainable,
+        shares = {
+            key: getattr(self, key)[axis] for key in ("repeatability", "closed", "explainable")
         }
-        return {
-            key: float(shares[axis]) if np.isfinite(shares[axis]) else None
-            for key, shares in values.items()
-        }
+        return {key: float(share) if np.isfinite(share) else None for key, share in shares.items()}
 
 
 def share_of_energy(before: Gap, after: Gap, noise_power: float) -> float:
-    """Return the ratio of the mean squared errors after and before naming, minus the noise.
-
-    `noise_power` is the mean square of the noise, which is subtracted from both errors.
-    """
+    """Return the ratio of the mean squared errors `after` and `before`, each less `noise_power`."""
     remaining = max(float(after.energy.mean()) - noise_power, 0.0)
     return remaining / max(float(before.energy.mean()) - noise_power, remaining, TINY)
 
@@ -271,9 +258,8 @@ def inputs_of(flight: SmoothedFlight) -> np.ndarray:
 def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> np.ndarray:
     """Return the weights (K, 3) with which `inputs` (M, K) explain `error` (M, 3) best.
 
-    They are those of a ridge regression, chosen in cross-validation over flights. Each flight's
-    mean (its trim) is subtracted from inputs and error. `flight` (M,) is the number of each row's
-    flight. A single flight is split into thirds.
+    They are those of a ridge regression, chosen in cross-validation over flights, of which each
+    flight's mean (its trim) is no part. A single flight is split into thirds.
     """
     groups = validation_groups(flight)
     inputs, error = centred(inputs, flight), centred(error, flight)
@@ -301,10 +287,7 @@ def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> 
 
 
 def closed_share(before: np.ndarray, after: np.ndarray, flight: np.ndarray) -> np.ndarray:
-    """Return the share (3,) of the variance within flights that `before` has and `after` lacks.
-
-    Both are errors (M, 3); `flight` (M,) is the number of each row's flight.
-    """
+    """Return the share (3,) of the variance within flights that `before` has and `after` lacks."""
     power = (centred(before, flight) ** 2).sum(axis=0)
     return 1.0 - (centred(after, flight) ** 2).sum(axis=0) / np.maximum(power, TINY)
 

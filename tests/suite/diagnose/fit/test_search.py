@@ -164,8 +164,8 @@ def test_a_wind_gets_slopes_of_a_usual_drag_only_where_no_drag_passes_it_on():
     assert composites.inactive_at(SPACE, theta, [WIND], acts) is None
     acts[places("constant_wind")] = False
     found = composites.inactive_at(SPACE, theta, [WIND], acts)
-    assert found is not None and list(found.indices) == places("constant_wind")
-    np.testing.assert_allclose(found.theta[places("linear_drag")], 0.35)
+    assert found is not None and list(found[0]) == places("constant_wind")
+    np.testing.assert_allclose(found[1][places("linear_drag")], 0.35)
     assert composites.inactive_at(SPACE, theta, SINGLE, acts) is None
     theta[places("constant_wind")[0]] = 1.0
     assert composites.inactive_at(SPACE, theta, [WIND], acts) is None
