@@ -130,8 +130,7 @@ def residual_as_noise(
 def colour_filter(noise: Noise, name: str, windows: FlightWindows) -> np.ndarray:
     """Return matrices (W, N, N) that make the rows of the group `name` independent.
 
-    They are applied to rows that are divided by their standard deviation. Rows without a value are
-    unchanged.
+    They apply to rows over their standard deviation, and leave those without a value unchanged.
     """
     valid = np.asarray(np.all(windows.valid[..., SLICES[name]], axis=-1))
     correlation = _correlation(np.asarray(windows.row_s), *noise.coloured[name])
@@ -143,10 +142,7 @@ def colour_filter(noise: Noise, name: str, windows: FlightWindows) -> np.ndarray
 
 
 def _correlation(time_s: np.ndarray, share: float, lasts_s: float) -> np.ndarray:
-    """Return the correlation (..., N, N) of noise at the times `time_s` (..., N).
-
-    `share` of the variance is autocorrelated, with the correlation time `lasts_s` [s].
-    """
+    """Return the correlation (..., N, N) of noise at `time_s` (..., N), see `Noise.coloured`."""
     lag_s = np.abs(time_s[..., :, None] - time_s[..., None, :])
     return (1.0 - share) * np.eye(time_s.shape[-1]) + share * np.exp(-lag_s / lasts_s)
 
@@ -228,9 +224,8 @@ def _drift_covariance(time_s: np.ndarray, integrations: int) -> np.ndarray:
 def _without_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.ndarray, int, float]:
     """Return the energy (V * C,) without the polynomial, its freedom, and half a log-determinant.
 
-    The energy is the sum of squares of each column after rows are whitened by `process` and the
-    polynomial is subtracted. The freedom is its number of independent rows, and the log-determinant
-    a term of the restricted likelihood.
+    The energy is the sum of squares of each column after rows are whitened by `process`; the
+    log-determinant is a term of the restricted likelihood.
     """
     correlation = _correlation(stretches.time_s, process.share, process.lasts_s)
     lower = np.linalg.cholesky(correlation + process.drift * stretches.drift)
@@ -290,10 +285,7 @@ def _fit_by_time(
 def _with_drift(
     score: Callable[[_Process], float], begin: _Process, drift: float
 ) -> tuple[_Process, float]:
-    """Return the process with the best `score` and the same T as `begin`, and that score.
-
-    The search begins at the share of `begin` and at `drift`.
-    """
+    """Return the process with the best `score` and the T of `begin`, and that score."""
 
     def process_at(x: np.ndarray) -> _Process:
         share = float(1.0 / (1.0 + np.exp(-x[0])))

@@ -26,7 +26,6 @@ def choose_held_out(
 ) -> tuple[np.ndarray, list[str]]:
     """Return for each window (W,) whether it is fitted, and the names of the held-out flights.
 
-    `flight` (W,) is the number of each window's flight, `start_s` (W,) the window's start in it.
     `information` (W, K) is the information of each window on each of K parameters.
 
     Held out are the flights whose information the others contain, too. So a flight with the only
@@ -96,10 +95,9 @@ def _split(flights: ViewFlights, held: Sequence[int], limits: Thresholds) -> Par
     """Return what `parted` returns, however short the parts are."""
     count = len(flights.names)
     if count > 1:
-        inside = [number for number in range(count) if number not in held]
         fitted_part, held_part = (
             {name: [part[k] for k in numbers] for name, part in flights.smoothed.items()}
-            for numbers in (inside, held)
+            for numbers in ([k for k in range(count) if k not in held], held)
         )
         return Parted(fitted_part, held_part, [flights.names[k] for k in held])
     fitted_part, held_part = {}, {}

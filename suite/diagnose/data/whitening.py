@@ -1,11 +1,10 @@
 """Whitens residuals of windows (1 s stretches of flights) and projects out their start states.
 
-Whitened residuals are in units of independent noise. A window's start state is measured with the
-same noise as its other rows. So it is a nuisance parameter: what a change of its 12 numbers could
-explain is removed (projected out) from residuals and slopes. Errors of the rotor speeds are
-nuisance parameters, too. If measured speeds are the model's input, they have errors at knots
-(support points) all along a window, else only at its start. Additional rows hold a prior on the
-size of these errors. Start numbers are all nuisance parameters of a window: state and rotor speeds.
+A window's start state is measured with the same noise as its other rows. So it is a nuisance
+parameter: what a change of its 12 numbers could explain is removed (projected out) from residuals
+and slopes. Errors of the rotor speeds are nuisance parameters, too. If measured speeds are the
+model's input, they have errors at knots all along a window, else only at its start. Additional rows
+hold a prior on the size of these errors. Start numbers are all these parameters of a window.
 """
 
 from __future__ import annotations
@@ -172,10 +171,7 @@ def _filtered(scaled: np.ndarray, filters: Mapping[str, np.ndarray]) -> np.ndarr
 
 
 def slow_energy(whitening: Whitening, residual: np.ndarray) -> np.ndarray:
-    """Return the energy (W, 19) of slow errors in a block's `residual` (W, M), by channel.
-
-    The start numbers are projected out of the residual, so the slow polynomials need no projection.
-    """
+    """Return the energy (W, 19) of slow errors in a block's `residual` (W, M), by channel."""
     rows = residual[:, : whitening.weight[0].size].reshape(whitening.weight.shape)
     amplitude = (np.swapaxes(rows, 1, 2)[:, :, None] @ whitening.slow)[:, :, 0]
     return (amplitude**2).sum(axis=2)

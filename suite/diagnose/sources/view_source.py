@@ -152,7 +152,6 @@ class ViewSource(Source):
         assert isinstance(evidence, ViewEvidence)
         before = self.held.residuals(found.start.theta)
         after = self.held.residuals(found.estimate.theta)
-        spread = self._repeatability(found)
         # Fit one black box to the error of the given vehicle, and a second one to the error that
         # remains with the named effects. Both are tested on the held-out flights.
         inputs, held_inputs = (
@@ -174,13 +173,8 @@ class ViewSource(Source):
             )
         )
         variance = (centred(before.residual, before.flight) ** 2).mean(axis=0)
-        return Shares(closed, np.maximum(explainable, closed), with_both - closed, variance, spread)
-
-    def _repeatability(self, found: SearchResult) -> np.ndarray:
-        """Return the standard deviation (3,) of the flights' means; NaN with too few flights."""
-        evidence = found.last.evidence
-        assert isinstance(evidence, ViewEvidence)
-        return np.where(np.isfinite(evidence.repeatability), evidence.repeatability, np.nan)
+        beyond, spread = with_both - closed, evidence.repeatability
+        return Shares(closed, np.maximum(explainable, closed), beyond, variance, spread)
 
     def series(self, found: SearchResult) -> Series:
         """Return the stretch of a held-out flight that the named effects change most.
@@ -226,7 +220,7 @@ class Shares(NamedTuple):
     variance: np.ndarray
     """Variance of the error of the given vehicle [the view's unit squared]."""
     repeatability: np.ndarray
-    """Standard deviation of the flights' means [the view's unit]; NaN with too few flights."""
+    """Standard deviation of the flights' means [the view's unit]; infinite with too few flights."""
 
     def total(self, by_axis: np.ndarray) -> float:
         """Return the share of all axes together from the shares by axis (3,); at least 0."""

@@ -162,9 +162,10 @@ class MeansSource(ViewSource):
             for at in (found.start, found.estimate)
         )
         closed = 1.0 - after / np.maximum(before, TINY)
-        return Shares(
-            closed, np.maximum(closed, 0.0), np.zeros(3), before, self._repeatability(found)
-        )
+        evidence = found.last.evidence
+        assert isinstance(evidence, ViewEvidence)
+        spread = evidence.repeatability
+        return Shares(closed, np.maximum(closed, 0.0), np.zeros(3), before, spread)
 
     def series(self, found: SearchResult) -> Series:
         """Return the mean of every reference flight and held-out flight, see `Source`.
