@@ -119,10 +119,6 @@ class NormalEquations(NamedTuple):
             place |= {number: numbers.index(number) for number in candidate.indices}
         return [place[number] for number in candidate.indices]
 
-    def repeated(self) -> tuple[int, ...]:
-        """Return the places of the parameters that have two columns."""
-        return tuple(n for k, n in enumerate(self.numbers) if n in self.numbers[:k])
-
     def take(self, columns: Sequence[int]) -> NormalEquations:
         """Return the equations along `columns` only."""
         chosen = np.array(columns, dtype=int)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ LEAST_ERROR = 1e-9
 """Lower limit of a squared error in a denominator, in units of the noise variance."""
 
 
+@dataclass(frozen=True, kw_only=True)
 class Evidence(ABC):
     """Whitened residuals (in units of independent noise), and how the parameters change them."""
 

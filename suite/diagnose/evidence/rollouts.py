@@ -63,8 +63,6 @@ class RolloutEvidence(Evidence):
     """The same windows, each shortened to the time in which the linearisation holds."""
     noise: Noise
     whitening: Whitening
-    limits: Thresholds = THRESHOLDS  # pyrefly: ignore[bad-override]
-    misfit_is_noise: bool = False  # pyrefly: ignore[bad-override]
 
     @property
     def space(self) -> ParameterSpace:
@@ -78,19 +76,20 @@ class RolloutEvidence(Evidence):
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
         """Return the block at `at`, with slopes along `indices`; see `Evidence`."""
-        linear = self.model.linearise(at.theta, at.free, self.trusted, indices)
+        linear = self.model.linearise(at, self.trusted, indices)
         along = range(self.model.size) if indices is None else indices
         return block_of(self.whitening, linear, along, self.windows)
 
     def estimate_noise(self, at: Estimate) -> Evaluation:
         """Evaluate this evidence with its noise estimated at `at`; see `Evidence`."""
         # The trusted windows are chosen again, as a better model stays near the flight for longer.
-        new, block = rollout_evidence(self.model, self.windows, self._linear(at), self.limits)
+        linear = self.model.linearise(at, self.windows)
+        new, block = rollout_evidence(self.model, self.windows, linear, self.limits)
         return Evaluation(new, at, block)
 
     def relinearise(self, at: Estimate) -> Evaluation:
         """Evaluate this evidence with its noise unchanged; see `Evidence`."""
-        linear = self._linear(at)
+        linear = self.model.linearise(at, self.windows)
         new, block = rollout_evidence(self.model, self.windows, linear, self.limits, self.noise)
         return Evaluation(replace(new, misfit_is_noise=self.misfit_is_noise), at, block)
 
@@ -99,7 +98,7 @@ class RolloutEvidence(Evidence):
         slow, expected = self.slow_errors(best.block)
         if slow.sum() <= self.limits.structure_rotor_input * expected.sum():
             return None
-        linear = self._linear(best.at)
+        linear = self.model.linearise(best.at, self.windows)
         noise = residual_as_noise(linear.residual, linear.start_slope, self.trusted, self.limits)
         whitening = make_whitening(linear, noise, self.trusted, self.limits)
         return replace(self, noise=noise, whitening=whitening, misfit_is_noise=True)
@@ -117,23 +116,16 @@ class RolloutEvidence(Evidence):
         energy = slow_energy(self.whitening, block.residual)
         return energy[:, :STATE], self.whitening.slow_freedom[:, :STATE]
 
-    def _linear(self, at: Estimate) -> Linearisation:
-        """Return the full windows, linearised at `at` along all parameters and start numbers."""
-        return self.model.linearise(at.theta, at.free, self.windows, None)
 
+def start_estimate(
+    model: RolloutModel, windows: FlightWindows, theta: np.ndarray | None = None
+) -> Estimate:
+    """Return the parameters `theta` (P,), or the vehicle file's, with the true start states.
 
-def start_estimate(model: RolloutModel, windows: FlightWindows) -> Estimate:
-    """Return the vehicle file's parameters, and the start states that it gives (`true_starts`)."""
-    theta = model.space.array("start")
-    return Estimate(theta, true_starts(model, theta, windows))
-
-
-def true_starts(model: RolloutModel, theta: np.ndarray, windows: FlightWindows) -> np.ndarray:
-    """Return the true start states minus the logged ones, (W, F), given the delay of logged poses.
-
-    The delay is an effect (the clock offset) with its value in `theta` (P,). Over the delay,
-    position and attitude change by velocity and rates, and the velocity by the acceleration.
+    Logged poses have a delay, an effect (the clock offset) in `theta`. Over the delay, position and
+    attitude change by velocity and rates, and the velocity by the acceleration.
     """
+    theta = model.space.array("start") if theta is None else theta
     delay_s = pose_delay(model.space.effects(theta))
     offset = np.zeros((len(windows.flight), model.free))
     offset[:, :3] = delay_s * windows.vel_w
@@ -145,7 +137,7 @@ def true_starts(model: RolloutModel, theta: np.ndarray, windows: FlightWindows) 
     span_s = np.asarray(windows.row_s)[window, row][:, None]
     acc_w = (np.asarray(windows.row_vel_w)[window, row] - windows.vel_w) / np.maximum(span_s, 1e-3)
     offset[:, 6:9] = delay_s * np.where(has_vel.any(axis=1, keepdims=True), acc_w, 0.0)
-    return offset
+    return Estimate(theta, offset)
 
 
 def rollouts_along(
@@ -209,7 +201,7 @@ def rollout_evidence(
     near = trusted(windows, linear.residual, limits)
     noise = noise or measured_noise(linear.residual, linear.start_slope, near, limits)
     whitening = make_whitening(linear, noise, near, limits)
-    evidence = RolloutEvidence(model, windows, near, noise, whitening, limits)
+    evidence = RolloutEvidence(model, windows, near, noise, whitening, limits=limits)
     indices = range(model.size) if along is None else along
     return evidence, block_of(whitening, linear, indices, windows)
 
@@ -286,37 +278,31 @@ class RolloutModel:
         functions = compiled(space.layout, rotor_input, voltage, integrator)
         _, self._linear, self._respond = functions
 
-    def residual(self, theta: np.ndarray, offset: np.ndarray, windows: FlightWindows) -> np.ndarray:
-        """Return measured - simulated (W, N, 19), with start numbers changed by `offset` (W, F)."""
-        return self.linearise(theta, offset, windows, []).residual
+    def residual(self, at: Estimate, windows: FlightWindows) -> np.ndarray:
+        """Return measured - simulated (W, N, 19) at the estimate `at`."""
+        return self.linearise(at, windows, []).residual
 
-    def respond(
-        self, theta: np.ndarray, offset: np.ndarray, windows: FlightWindows
-    ) -> KnotResponse:
+    def respond(self, at: Estimate, windows: FlightWindows) -> KnotResponse:
         """Return the response of the rows of each window to forces and torques at its knots."""
         with jax.enable_x64(True):
             parts = [
                 jax.tree.map(
-                    lambda x, n=own: np.asarray(x)[:n], self._respond(self.given, theta, x, w)
+                    lambda x, n=own: np.asarray(x)[:n], self._respond(self.given, at.theta, x, w)
                 )
-                for x, w, own in batches(offset, windows)
+                for x, w, own in batches(at.free, windows)
             ]
         return jax.tree.map(lambda *p: np.concatenate(p), *parts)
 
     def linearise(
-        self,
-        theta: np.ndarray,
-        offset: np.ndarray,
-        windows: FlightWindows,
-        indices: Sequence[int] | None,
+        self, at: Estimate, windows: FlightWindows, indices: Sequence[int] | None = None
     ) -> Linearisation:
-        """Return residuals and slopes at `theta` (P,), with starts changed by `offset` (W, F).
+        """Return residuals and slopes at the estimate `at`.
 
         The slopes are along the parameters at `indices`; places in `starts` mean start numbers.
         With None they are along all parameters and then all start numbers.
         """
-        values, slope = linearised(self._linear, self.given, theta, offset, windows, indices, BATCH)
-        return Linearisation(-values, slope, offset)
+        values, slope = linearised(self._linear, self.given, *at, windows, indices, BATCH)
+        return Linearisation(-values, slope, at.free)
 
 
 @cache

@@ -25,7 +25,6 @@ from suite.diagnose.evidence.moments import (
     weights_of,
     whitened,
 )
-from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,6 @@ class ViewEvidence(Evidence):
     view: View
     model: ForceModel
     flights: Sequence[SmoothedFlight]
-    limits: Thresholds = THRESHOLDS  # pyrefly: ignore[bad-override]
     carried: np.ndarray | None = None
     """(M, 3) residual that follows from reference flights (is carried over from them); it is
     subtracted."""

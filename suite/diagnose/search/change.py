@@ -267,8 +267,9 @@ def change_evidence(
     # even one that explains much less than the best (a share of 1 switches that limit off).
     limits = replace(task.limits, rival_share=1.0)
     evidence = ChangeEvidence(
-        task.view, task.model, flights, limits, task.carried, True, with_gain_error, weights, spread
-    )
+        task.view, task.model, flights, task.carried, True, with_gain_error, weights, spread,
+        limits=limits,
+    )  # fmt: skip
     return evidence.relinearise(Estimate(start))
 
 

@@ -101,7 +101,8 @@ def fit_with(start: Evaluation, others: Sequence[int], candidate: Candidate) -> 
     """Fit `candidate` together with the parameters at `others`, from the estimate of `start`."""
     evidence, limits, estimate = start.evidence, start.evidence.limits, start.at
     indices = sorted({*others, *candidate.indices})
-    inactive = [index for index in start.equations.repeated() if index in candidate.indices]
+    numbers = start.equations.numbers  # those of inactive parameters have two columns
+    inactive = [n for k, n in enumerate(numbers) if n in numbers[:k] and n in candidate.indices]
     if not candidate.parts or not inactive:
         rounds = limits.bilinear_rounds if acts_through(candidate) else None
         return evidence.fitted(estimate, indices, rounds, start.block)

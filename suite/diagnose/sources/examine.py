@@ -158,7 +158,10 @@ def confirmed(
         while lost:
             withdrawn += [candidate.label for candidate in lost]
             found = found.refitted([one for one in found.named if one.candidate not in lost])
-            lost = _without_influence(found)
+            equations = found.judged.equations.along_numbers(found.indices)
+            information = np.einsum("wkk->k", equations.hessian)
+            informed = {i for i, v in zip(found.indices, information, strict=True) if v > 0.0}
+            lost = [one for one in found.candidates if not informed & set(one.indices)]
         after = source.gap(found, found.estimate.theta)
     return found, after, {}, withdrawn
 
@@ -210,13 +213,6 @@ def control(source: Source, found: SearchResult) -> tuple[str, Gap] | None:
         return None
     fitted = found.judged.evidence.fitted(found.start, list(wrong.indices))
     return wrong.label, source.gap(found, fitted.at.theta)
-
-
-def _without_influence(found: SearchResult) -> list[Candidate]:
-    """Return the named effects without information in these flights, as a wind without a drag."""
-    information = np.einsum("wkk->k", found.judged.equations.along_numbers(found.indices).hessian)
-    informed = {i for i, value in zip(found.indices, information, strict=True) if value > 0.0}
-    return [candidate for candidate in found.candidates if not informed & set(candidate.indices)]
 
 
 def _without_each(source: Source, found: SearchResult) -> dict[str, Gap]:

@@ -36,7 +36,7 @@ from suite.diagnose.evidence.rollouts import (
     RolloutEvidence,
     RolloutModel,
     rollout_evidence,
-    true_starts,
+    start_estimate,
 )
 from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.search.evaluation import SearchResult
@@ -175,11 +175,11 @@ class RolloutSource(Source):
         """
         model, estimate, indices = self.model, found.estimate, found.indices
         windows = of_rollouts(found.last).trusted
-        slope = model.linearise(estimate.theta, estimate.free, windows, indices).slope
+        slope = model.linearise(estimate, windows, indices).slope
         model_error = np.zeros(len(indices))
         if self.coarser is not None and len(indices):
             directions = [*indices, *model.starts]
-            linear = model.linearise(estimate.theta, estimate.free, self.coarser, directions)
+            linear = model.linearise(estimate, self.coarser, directions)
             options = (found.last.evidence.limits, of_rollouts(found.last).noise, indices)
             equations = rollout_evidence(model, self.coarser, linear, *options)[1].equations
             change, _ = gauss_newton_step(equations, estimate.theta, model.space)
@@ -259,7 +259,7 @@ class RolloutSource(Source):
             return None
         voltage = all(log.voltage is not None for log in self.logs)
         model = ForceModel(self.vehicle, self.space, voltage)
-        return residual_swing(ViewEvidence(FORCE, model, flights, self.limits), theta)
+        return residual_swing(ViewEvidence(FORCE, model, flights, limits=self.limits), theta)
 
     def explained_by_steps(self, found: SearchResult) -> bool:
         """Return whether MuJoCo's Euler steps explain a named delay between pose and rates.
@@ -297,8 +297,8 @@ class RolloutSource(Source):
         correction = start_correction(self.model, best, windows, noise, self.limits)
 
         def errors(theta: np.ndarray) -> np.ndarray:
-            start = true_starts(self.model, theta, windows) + correction
-            return self.model.residual(theta, start, windows)
+            at = start_estimate(self.model, windows, theta)
+            return self.model.residual(at._replace(free=at.free + correction), windows)
 
         named = {FITTED: errors(best)} if found.named else {}
         return windows, {GIVEN: errors(self.start.theta), **named}

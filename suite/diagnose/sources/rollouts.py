@@ -94,7 +94,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     voltage = all(log.voltage is not None for log in logs)
     model = RolloutModel(vehicle, make_space(vehicle), rotor_input, voltage, integrator)
     start = start_estimate(model, windows)
-    linear = model.linearise(start.theta, start.free, windows, None)
+    linear = model.linearise(start, windows)
     is_finite = _finite(linear, limits)
     if not is_finite.all():
         diverged = int((~is_finite).sum())
@@ -143,8 +143,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     held_flights = np.unique(not_fitted.flight).tolist()
     held, _ = windows_of(stride_s=limits.gap_stride_s, only=held_flights, since_s=since_s)
     assert held is not None
-    begin = start_estimate(model, held)
-    flies = _finite(model.linearise(begin.theta, begin.free, held, []), limits)
+    flies = _finite(model.linearise(start_estimate(model, held), held, []), limits)
     if not flies.all():
         held = take(held, flies)
         warnings.append(f"{(~flies).sum()} held-out stretches left out: the model diverges there")

@@ -106,7 +106,8 @@ class ViewSource(Source):
             swing = residual_swing(self.all_flights, found.estimate.theta)
             force = self._unexplained_force(found.estimate.theta, gaps[1], seed)
             if force and not structured:
-                structured, beyond = True, max(beyond, share_of_energy(*gaps, self._noise_power))
+                energy, left = (max(gap.energy.mean() - self._noise_power, 0.0) for gap in gaps)
+                structured, beyond = True, max(beyond, float(left / max(energy, left, TINY)))
                 where = (
                     f"a force of {force:.2g} m/s^2 beyond the noise, which no logged signal "
                     "predicts"
@@ -232,12 +233,6 @@ class Shares(NamedTuple):
             key: getattr(self, key)[axis] for key in ("repeatability", "closed", "explainable")
         }
         return {key: float(share) if np.isfinite(share) else None for key, share in shares.items()}
-
-
-def share_of_energy(before: Gap, after: Gap, noise_power: float) -> float:
-    """Return the ratio of the mean squared errors `after` and `before`, each less `noise_power`."""
-    remaining = max(float(after.energy.mean()) - noise_power, 0.0)
-    return remaining / max(float(before.energy.mean()) - noise_power, remaining, TINY)
 
 
 RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)

@@ -18,7 +18,6 @@ from eval.effects import EFFECTS
 from suite.diagnose.data.flights import ViewFlights, ready
 from suite.diagnose.data.hold_out import choose_held_out, parted
 from suite.diagnose.data.inertial import UNSEEN, is_inertial
-from suite.diagnose.data.view import View
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.estimate.parameters import Candidate, candidates, make_space
@@ -70,7 +69,7 @@ def by_views(given: DiagnosisInput) -> SourceSet:
         limits = replace(limits, least_view_share=limits.least_inertial_share)
         not_shown = [f"without a position these flights do not show {what}" for what in UNSEEN]
     evidence = {
-        view.name: ViewEvidence(view, model, flights.smoothed[view.name], limits)
+        view.name: ViewEvidence(view, model, flights.smoothed[view.name], limits=limits)
         for view in flights.views
     }
     # `earlier` is the evidence of the reference flights by view; empty if there are none.
@@ -98,8 +97,15 @@ def by_views(given: DiagnosisInput) -> SourceSet:
     for name in parts.fitted:
         one = evidence[name]
         to_fit, held_out = (replace(one, flights=p[name]) for p in (parts.fitted, parts.held))
+        view, unit = one.view, "m/s^2" if one.view.in_world else "rad/s^2"
         shared: dict[str, Any] = {
-            **_descriptions(one.view),
+            "name": name,
+            "about": view.about,
+            "subject": f"error of the {name}",
+            "unit": unit,
+            "measure": MEASURE.format(about=view.about, unit=unit, width=view.width_s),
+            "horizon_s": view.width_s,
+            "view": view,
             "limits": limits,
             "floor": flights.floor[name],
         }
@@ -125,16 +131,6 @@ def by_views(given: DiagnosisInput) -> SourceSet:
         (lag,) if lag else (),
         spread.words(len(references)) if spread else (),
     )
-
-
-def _descriptions(view: View) -> dict[str, Any]:
-    """Return the fields of a source that depend only on its view, by name."""
-    about = {"about": view.about, "unit": "m/s^2" if view.in_world else "rad/s^2"}
-    measure = MEASURE.format(**about, width=view.width_s)
-    return {
-        **about, "name": view.name, "view": view, "horizon_s": view.width_s, "measure": measure,
-        "subject": f"error of the {view.name}",
-    }  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

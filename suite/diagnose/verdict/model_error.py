@@ -30,6 +30,7 @@ from suite.diagnose.data.whitening import (
     slow_energy,
 )
 from suite.diagnose.data.windows import SLICES, FlightWindows
+from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.thresholds import Thresholds
 
@@ -122,7 +123,7 @@ def _difference(
     model: RolloutModel, theta: np.ndarray, linear: Linearisation, other: FlightWindows
 ) -> np.ndarray:
     """Return by how much the residuals (W, N, 19) of `other` differ; NaN where one diverges."""
-    difference = model.residual(theta, linear.offset, other) - linear.residual
+    difference = model.residual(Estimate(theta, linear.offset), other) - linear.residual
     finite = np.isfinite(difference).all(axis=(1, 2), keepdims=True)
     return np.where(finite, difference, np.nan)
 

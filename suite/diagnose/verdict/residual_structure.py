@@ -73,7 +73,7 @@ def disturbance_equations(
     limits: Thresholds = THRESHOLDS,
 ) -> DisturbanceEquations:
     """Return the normal equations of a disturbance that may explain the residual at `estimate`."""
-    response = model.respond(estimate.theta, estimate.free, windows)
+    response = model.respond(estimate, windows)
     columns = range(response.slope.shape[-1])
     disturbed = Linearisation(response.residual, response.slope, estimate.free)
     equations = block_of(whitening, disturbed, columns, windows).equations

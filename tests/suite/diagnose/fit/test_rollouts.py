@@ -73,7 +73,7 @@ def linearised(flown):
     """Return the model of the shared diagnosis, its windows, and their slopes along everything."""
     model, windows = flown.model, flown.cut(1.0)
     begin = rollouts.start_estimate(model, windows)
-    return model, windows, model.linearise(begin.theta, begin.free, windows, None)
+    return model, windows, model.linearise(begin, windows)
 
 
 def test_slopes_are_those_of_small_changes_and_a_disturbance_pushes_the_windows(linearised):
@@ -81,12 +81,13 @@ def test_slopes_are_those_of_small_changes_and_a_disturbance_pushes_the_windows(
     begin = rollouts.start_estimate(model, windows)
     index = model.space.layout.index(("linear_drag", "coefficient", 0))
     step = 1e-4 * (np.arange(model.size) == index)
-    ends = [model.residual(begin.theta + s * step, begin.free, windows) for s in (-1, 1)]
+    moved = (begin._replace(theta=begin.theta + sign * step) for sign in (-1, 1))
+    ends = [model.residual(at, windows) for at in moved]
     slope = (ends[0] - ends[1]) / 2e-4
     np.testing.assert_allclose(linear.slope[..., index], slope, atol=1e-4)
-    few = model.linearise(begin.theta, begin.free, windows, [index])
+    few = model.linearise(begin, windows, [index])
     np.testing.assert_allclose(few.slope[..., 0], linear.slope[..., index], atol=1e-9)
-    response = model.respond(begin.theta, begin.free, windows)
+    response = model.respond(begin, windows)
     assert response.slope.shape[-1] == KNOTS * 6
     assert response.knot.rotor_speed.shape == (len(windows.flight), KNOTS, 4)
     up = response.slope[..., 2::6].sum(axis=-1)[:, :, 2]
@@ -243,7 +244,7 @@ def test_a_fault_from_a_package_is_a_candidate_and_in_the_simulated_log(
     true[list(one.indices)] = *TURN, 1.04, 0.01
     fly_model = jax.jit(rollouts.compiled(space.layout, False, False, "euler")[0])
     with jax.enable_x64(True):
-        starts = [(theta, rollouts.true_starts(model, theta, windows)) for theta in (start, true)]
+        starts = [rollouts.start_estimate(model, windows, theta) for theta in (start, true)]
         off = [np.asarray(fly_model(model.given, *both, windows)[0]) for both in starts]
     for channel in ("position", "attitude", "velocity", "rates"):
         before, after = (np.sqrt((o[..., SLICES[channel]] ** 2).mean()) for o in off)
