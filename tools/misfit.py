@@ -81,7 +81,7 @@ def rollout_error(
     """
     model, windows, start = rollouts_along(logs, vehicle, rotor_input=False)
     linear = model.linearise(start, windows, model.starts)
-    noise = noise or measured_noise(linear.residual, linear.start_slope, windows)
+    noise = noise or measured_noise(linear, windows)
     return gap_of(linear, windows, noise).rms, noise
 
 

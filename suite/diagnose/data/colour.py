@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import get_lapack_funcs, solve_triangular
 from scipy.optimize import minimize, minimize_scalar
 
-from suite.diagnose.data.noise import at_least, noise_of, typical_variance
+from suite.diagnose.data.noise import Linearisation, at_least, noise_of, typical_variance
 from suite.diagnose.data.windows import SLICES, FlightWindows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
@@ -72,21 +72,11 @@ class _Process(NamedTuple):
 
 
 def measured_noise(
-    residual: np.ndarray,
-    start_slope: np.ndarray,
-    windows: FlightWindows,
-    limits: Thresholds = THRESHOLDS,
+    linear: Linearisation, windows: FlightWindows, limits: Thresholds = THRESHOLDS
 ) -> Noise:
-    """Estimate the measurement noise from residuals.
-
-    Args:
-        residual: (W, N, 19) measured - simulated.
-        start_slope: (W, N, 19, F) derivative of the simulated values by each window's start state.
-        windows: W stretches of 1 s.
-        limits: the gain in likelihood that autocorrelated noise needs, among others.
-    """
-    sigma = noise_of(residual, windows, limits=limits)
-    residual = _without_start(residual, start_slope, np.where(windows.valid, 1.0 / sigma, 0.0))
+    """Estimate the measurement noise from the residuals of `windows`."""
+    sigma = noise_of(linear.residual, windows, limits=limits)
+    residual = _without_start(linear, np.where(windows.valid, 1.0 / sigma, 0.0))
     sigma = noise_of(residual, windows, limits=limits)
     groups = _all_stretches(residual, sigma, windows, ESTIMATED, limits)
     fits = {name: _fit_by_time(stretches, limits) for name, stretches in groups.items()}
@@ -102,18 +92,15 @@ def measured_noise(
 
 
 def residual_as_noise(
-    residual: np.ndarray,
-    start_slope: np.ndarray,
-    windows: FlightWindows,
-    limits: Thresholds = THRESHOLDS,
+    linear: Linearisation, windows: FlightWindows, limits: Thresholds = THRESHOLDS
 ) -> Noise:
     """Return the noise if the whole residual counts as noise, including the model's error.
 
     It is used where even the best model does not fit: intervals then allow for the bias that the
-    wrong model causes. The arguments are those of `measured_noise`.
+    wrong model causes.
     """
-    sigma = noise_of(residual, windows, limits=limits)
-    residual = _without_start(residual, start_slope, np.where(windows.valid, 1.0 / sigma, 0.0))
+    sigma = noise_of(linear.residual, windows, limits=limits)
+    residual = _without_start(linear, np.where(windows.valid, 1.0 / sigma, 0.0))
     coloured = {}
     for name, stretches in _all_stretches(residual, sigma, windows, SLICES, limits).items():
         rows = len(stretches.time_s)
@@ -147,11 +134,12 @@ def _correlation(time_s: np.ndarray, share: float, lasts_s: float) -> np.ndarray
     return (1.0 - share) * np.eye(time_s.shape[-1]) + share * np.exp(-lag_s / lasts_s)
 
 
-def _without_start(residual: np.ndarray, slope: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return `residual` (W, N, 19) without what an error of each window's start state explains.
+def _without_start(linear: Linearisation, weight: np.ndarray) -> np.ndarray:
+    """Return the residuals (W, N, 19) without what an error of each window's start state explains.
 
-    `slope` (W, N, 19, F) is the derivative by the start state, and `weight` (W, N, 19) 1 / noise.
+    `weight` (W, N, 19) is 1 / noise.
     """
+    residual, slope = linear.residual, linear.start_slope
     rows = (slope * np.nan_to_num(weight)[..., None]).reshape(len(slope), -1, slope.shape[-1])
     white = (residual * np.nan_to_num(weight)).reshape(len(slope), -1, 1)
     transposed = np.swapaxes(rows, 1, 2)

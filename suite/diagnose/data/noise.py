@@ -6,10 +6,30 @@ at a time, and the remainder is noise.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from suite.diagnose.data.windows import CHANNELS, SLICES, FlightWindows
+from suite.diagnose.data.windows import CHANNELS, SLICES, STATE, FlightWindows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+
+
+class Linearisation(NamedTuple):
+    """Residuals of W windows, and derivatives (slopes) of the simulated values by K numbers."""
+
+    residual: np.ndarray
+    """(W, N, 19) measured - simulated; zero where nothing was measured."""
+    slope: np.ndarray
+    """(W, N, 19, K) derivative of the simulated values; often the last F are by the start
+    numbers."""
+    offset: np.ndarray
+    """(W, F) correction of each window's start numbers with which the residuals were computed."""
+
+    @property
+    def start_slope(self) -> np.ndarray:
+        """(W, N, 19, 12) slopes along each window's start state; the last F must be as above."""
+        size = self.offset.shape[1]
+        return self.slope[..., self.slope.shape[-1] - size :][..., :STATE]
 
 
 def rotor_noise(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> float:

@@ -223,19 +223,18 @@ def _pose_whitened(
     return shrunk(residual), shrunk(slope)
 
 
-def stretch_numbers(data: ViewData, limits: Thresholds = THRESHOLDS) -> np.ndarray:
-    """Return the number (M,) of each moment's stretch; these are so long as to be independent."""
-    time_block = (data.middle_s / limits.view_block_s).astype(int)
-    _, stretch = np.unique(np.stack([data.flight, time_block]), axis=1, return_inverse=True)
-    return stretch.ravel()
-
-
-def block_of(data: ViewData, weights: Weights, stretch: np.ndarray, along: Sequence[int]) -> Block:
-    """Return the block of `data`, with slopes `along` parameters; `stretch` (M,): see `stacked`."""
+def block_of(
+    data: ViewData, weights: Weights, along: Sequence[int], limits: Thresholds = THRESHOLDS
+) -> Block:
+    """Return the block of `data`, with slopes `along` parameters."""
     residual, slope = whitened(data, weights)
-    first = np.unique(stretch, return_index=True)[1]
+    # Stretches are so long that they are independent.
+    time_block = (data.middle_s / limits.view_block_s).astype(int)
+    _, first, stretch = np.unique(
+        np.stack([data.flight, time_block]), axis=1, return_index=True, return_inverse=True
+    )
     return without_nuisance(
-        residual, slope, along, stretch, data.flight[first], data.middle_s[first]
+        residual, slope, along, stretch.ravel(), data.flight[first], data.middle_s[first]
     )
 
 
@@ -265,8 +264,7 @@ def fast_share(
     """
     fast = successive_changes(data)
     fast = fast._replace(slope=(fast.slope[..., list(columns)] @ change)[..., None])
-    stretch = stretch_numbers(fast, limits)
-    equations = block_of(fast, weights_of(fast, limits), stretch, [0]).equations
+    equations = block_of(fast, weights_of(fast, limits), [0], limits).equations
     hessian, gradient = equations.sums()
     share = 1.0 + float(gradient[0]) / max(float(hessian[0, 0]), 1e-300)
     return share, float(intervals95(equations).half_width[0])

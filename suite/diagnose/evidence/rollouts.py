@@ -21,14 +21,9 @@ from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import assemble
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.colour import Noise, measured_noise, residual_as_noise
+from suite.diagnose.data.noise import Linearisation
 from suite.diagnose.data.steps import LONGEST_S, step_s
-from suite.diagnose.data.whitening import (
-    Linearisation,
-    Whitening,
-    block_of,
-    make_whitening,
-    slow_energy,
-)
+from suite.diagnose.data.whitening import Whitening, block_of, make_whitening, slow_energy
 from suite.diagnose.data.windows import KNOTS, LENGTH_S, SLICES, STATE, FlightWindows, cut, take
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.gauss_newton import gauss_newton_step
@@ -99,7 +94,7 @@ class RolloutEvidence(Evidence):
         if slow.sum() <= self.limits.structure_rotor_input * expected.sum():
             return None
         linear = self.model.linearise(best.at, self.windows)
-        noise = residual_as_noise(linear.residual, linear.start_slope, self.trusted, self.limits)
+        noise = residual_as_noise(linear, self.trusted, self.limits)
         whitening = make_whitening(linear, noise, self.trusted, self.limits)
         return replace(self, noise=noise, whitening=whitening, misfit_is_noise=True)
 
@@ -199,7 +194,7 @@ def rollout_evidence(
     numbers. If no `noise` is given, it is estimated from `linear`.
     """
     near = trusted(windows, linear.residual, limits)
-    noise = noise or measured_noise(linear.residual, linear.start_slope, near, limits)
+    noise = noise or measured_noise(linear, near, limits)
     whitening = make_whitening(linear, noise, near, limits)
     evidence = RolloutEvidence(model, windows, near, noise, whitening, limits=limits)
     indices = range(model.size) if along is None else along

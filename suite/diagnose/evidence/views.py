@@ -12,7 +12,6 @@ from suite.diagnose.data.view import SmoothedFlight, View
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.composites import carried
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace, at_bound, usual_first
-from suite.diagnose.estimate.permutation import folds_of
 from suite.diagnose.evidence.evidence import Evaluation, Evidence, flights_agree
 from suite.diagnose.evidence.moments import (
     ForceModel,
@@ -21,7 +20,6 @@ from suite.diagnose.evidence.moments import (
     block_of,
     fast_changes_agree,
     means_of,
-    stretch_numbers,
     weights_of,
     whitened,
 )
@@ -121,7 +119,7 @@ class ViewEvidence(Evidence):
         """Return the fold of each stretch: its flight, or parts of all flights if they are few."""
         if len(np.unique(block.flight)) >= 3:
             return block.flight
-        return folds_of(block.flight, np.arange(len(block.flight), dtype=float), self.limits.folds)
+        return super().folds(block)
 
     def explained_share(
         self, before: Block, after: Evaluation, candidate: Candidate, gains: np.ndarray
@@ -155,10 +153,8 @@ class ViewEvidence(Evidence):
     def _block(self, data: ViewData, indices: Sequence[int] | None = None) -> ViewBlock:
         """Return the block of `data`, whose slopes are along `indices` or all parameters."""
         assert self.weights is not None
-        rows = np.arange(len(data.flight))
-        stretch = rows if self.means else stretch_numbers(data, self.limits)
         along = range(len(self.space.entries)) if indices is None else indices
-        return ViewBlock(**vars(block_of(data, self.weights, stretch, along)), data=data)
+        return ViewBlock(**vars(block_of(data, self.weights, along, self.limits)), data=data)
 
 
 def _attenuated(series: np.ndarray, reliability: np.ndarray) -> np.ndarray:

@@ -209,8 +209,7 @@ class ChangeEvidence(ViewEvidence):
         block, theta = current.block, current.at.theta
         assert isinstance(block, ViewBlock) and self.spread and self.exact_weights and self.weights
         weights = self.weights if named else self.exact_weights
-        stretch = np.arange(len(block.data.flight))
-        equations = block_of(block.data, weights, stretch, block.along).equations
+        equations = block_of(block.data, weights, block.along, self.limits).equations
         without = chi2_fall(equations, theta, self.space, named)
         groups = [candidate.indices for candidate in among]
         gains = [chi2_fall(equations, theta, self.space, [*named, *g]) - without for g in groups]

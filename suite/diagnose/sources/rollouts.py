@@ -15,9 +15,10 @@ from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.colour import measured_noise
 from suite.diagnose.data.hold_out import choose_held_out
+from suite.diagnose.data.noise import Linearisation
 from suite.diagnose.data.sampling import own_spacing_s
 from suite.diagnose.data.steps import has_firmware_loop, rows_show_torque
-from suite.diagnose.data.whitening import Linearisation, block_of, make_whitening
+from suite.diagnose.data.whitening import block_of, make_whitening
 from suite.diagnose.data.windows import LENGTH_S, cut, take
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.parameters import candidates, make_space
@@ -123,7 +124,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
         given.say("no effect brings rollouts of 1 s near these flights: using force and torque")
         return None
     # Choose which stretches are held out, by their information on each parameter.
-    noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
+    noise = measured_noise(linear, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)
     informed = (block_of(whitening, linear, range(model.size), windows).slope ** 2).sum(axis=1)
     is_fitted, names = choose_held_out(logs, windows.flight, windows.start_s, informed, limits)

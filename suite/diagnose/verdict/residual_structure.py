@@ -17,7 +17,8 @@ import numpy as np
 from scipy.stats import gamma
 
 from eval.effects.interface import GRAVITY
-from suite.diagnose.data.whitening import Linearisation, Whitening, block_of
+from suite.diagnose.data.noise import Linearisation
+from suite.diagnose.data.whitening import Whitening, block_of
 from suite.diagnose.data.windows import KNOTS, FlightWindows
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.gauss_newton import Z95

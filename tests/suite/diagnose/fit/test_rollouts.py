@@ -9,6 +9,7 @@ import pytest
 
 from eval.flights.simulate import SENSORS, fly, log_of
 from suite.diagnose.data import colour
+from suite.diagnose.data.noise import Linearisation
 from suite.diagnose.data.whitening import block_of, make_whitening, orthonormal, slow_energy
 from suite.diagnose.data.windows import KNOTS, SLICES, STATE, cut
 from suite.diagnose.estimate.parameters import candidates, make_space
@@ -145,9 +146,14 @@ def windows():
     return found
 
 
+def linear_of(residual):
+    """Return residuals that do not depend on the start."""
+    return Linearisation(residual, np.zeros((*residual.shape, 12)), np.zeros((len(residual), 12)))
+
+
 def measured(residual, windows):
     """Return the noise of residuals that do not depend on the start."""
-    return colour.measured_noise(residual, np.zeros((*residual.shape, 12)), windows)
+    return colour.measured_noise(linear_of(residual), windows)
 
 
 def noise_like(windows, share, lasts_s, rng, group=GROUP):
@@ -215,8 +221,7 @@ def test_where_the_model_lacks_something_the_whole_residual_counts_as_noise(wind
     residual = noise_like(windows, 0.0, 1.0, rng)
     swing = np.sin(6.0 * windows.row_s[..., None] + rng.uniform(0.0, 6.0, (len(residual), 1, 3)))
     residual[..., SLICES["velocity"]] += 8.0 * swing
-    nothing = np.zeros((*residual.shape, 12))
-    noise = colour.residual_as_noise(residual, nothing, windows)
+    noise = colour.residual_as_noise(linear_of(residual), windows)
     np.testing.assert_allclose(noise.sigma[SLICES["velocity"]], 8.0 / np.sqrt(2.0), rtol=0.3)
     share, lasts_s = noise.coloured["velocity"]
     assert share > 0.95 and lasts_s > 0.1
