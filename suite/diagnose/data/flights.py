@@ -295,14 +295,13 @@ def acting_rotors(
     if log.thrust_cmd is None:
         needs = "[motors] in the vehicle file" if log.pwm is not None else "thrust or rotors"
         raise ValueError(f"{log.name}: no signal gives its rotor speeds; it needs {needs}")
-    force = vehicle.mass * np.maximum(log.thrust_cmd, 0.0)
+    force, each = vehicle.mass * np.maximum(log.thrust_cmd, 0.0), log.torque_cmd_b is not None
     torque_b = np.zeros((len(force), 3)) if log.torque_cmd_b is None else log.torque_cmd_b
     nominal, _ = nominal_quadrotor(vehicle)
-    each = mix(nominal.unmixer, nominal.thrust_max, force, torque_b, nominal.unequal_arms)
-    speed = np.sqrt(np.maximum(each, 0.0) / vehicle.rotors.thrust_coefficient)
-    if log.torque_cmd_b is None:
-        return ActingRotors(_lagged(log, vehicle, speed), "commanded thrust", False)
-    return ActingRotors(_lagged(log, vehicle, speed), "commanded thrust and torques", True)
+    thrusts = mix(nominal.unmixer, nominal.thrust_max, force, torque_b, nominal.unequal_arms)
+    speed = np.sqrt(np.maximum(thrusts, 0.0) / vehicle.rotors.thrust_coefficient)
+    source = "commanded thrust and torques" if each else "commanded thrust"
+    return ActingRotors(_lagged(log, vehicle, speed), source, each)
 
 
 def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:

@@ -64,12 +64,12 @@ search for changes starts from a vehicle whose mean forces and torques are those
 def fit_balance(reference: ViewEvidence) -> np.ndarray:
     """Return parameters (P,) with which the model has the mean accelerations of `reference`."""
     space = reference.model.space
-    theta, weights = space.array("start"), None
+    theta = space.array("start")
+    weights = weights_of(reference.residuals(theta), reference.limits)
+    # Here the trims are fitted, and not noise.
+    evidence = replace(reference, weights=weights._replace(trim=np.zeros(3)))
     for names in BALANCE[reference.view.name]:
         indices = [i for i, entry in enumerate(space.entries) if entry.effect in names]
-        weights = weights or weights_of(reference.residuals(theta), reference.limits)
-        weights = weights._replace(trim=np.zeros(3))  # here the trims are fitted, and not noise
-        evidence = replace(reference, weights=weights)
         theta = evidence.fitted(Estimate(theta), indices).at.theta
     return theta
 

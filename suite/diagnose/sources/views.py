@@ -262,15 +262,11 @@ def references_of(
         return {}, None, ()
     before = ready(given.references, given.vehicle, given.limits, given.logs)
     if len(before.names) < 2:
-        raise ValueError(
-            "; ".join(
-                [
-                    f"--reference has {len(before.names)} flight; at least 2 are needed, better 3, "
-                    "to estimate how flights of one vehicle differ",
-                    *before.notes,
-                ]
-            )
+        words = (
+            f"--reference has {len(before.names)} flight; at least 2 are needed, better 3, to "
+            "estimate how flights of one vehicle differ"
         )
+        raise ValueError("; ".join([words, *before.notes]))
     if before.views != flights.views or before.source != flights.source:
         raise ValueError(
             f"the reference flights are driven by {before.source} and allow "
