@@ -157,19 +157,15 @@ def _all_stretches(
     limits: Thresholds,
 ) -> dict[str, _Stretches]:
     """Return the stretches by group of channels, of those in `names` with enough measurements."""
-    groups = {}
-    for name in names:
-        if np.isfinite(sigma[SLICES[name]]).all():
-            stretches = _stretches(residual[..., SLICES[name]], windows, name, limits)
-            if stretches is not None:
-                groups[name] = stretches
-    return groups
+    measured = (name for name in names if np.isfinite(sigma[SLICES[name]]).all())
+    groups = {name: _stretches(residual, windows, name, limits) for name in measured}
+    return {name: stretches for name, stretches in groups.items() if stretches is not None}
 
 
 def _stretches(
-    values: np.ndarray, windows: FlightWindows, name: str, limits: Thresholds
+    residual: np.ndarray, windows: FlightWindows, name: str, limits: Thresholds
 ) -> _Stretches | None:
-    """Return the stretches of `values` (W, N, C), residuals of the group of channels `name`.
+    """Return the stretches of `residual` (W, N, 19) in the group of channels `name`.
 
     None with too few rows. All stretches get the same number of rows: that which nine of ten usable
     windows have.
@@ -186,7 +182,8 @@ def _stretches(
     # Windows with a lost row or jitter stay, since their times differ little from the median times.
     # Windows with a hole are left out.
     alike = np.abs(times_s - time_s).max(axis=1) <= limits.colour_aside * np.diff(time_s).mean()
-    stacked = np.take_along_axis(values[chosen], first_rows[..., None], axis=1)[alike]
+    values = residual[chosen][..., SLICES[name]]
+    stacked = np.take_along_axis(values, first_rows[..., None], axis=1)[alike]
     if not len(stacked):
         return None
     time = (time_s - time_s.mean()) / (time_s[-1] - time_s[0])

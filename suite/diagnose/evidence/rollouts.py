@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -233,17 +233,6 @@ COMPILED = {"xla_cpu_use_fusion_emitters": False}
 """Options of the compiler XLA: its newer code for loops is no faster, and compiles half as fast."""
 
 
-class KnotResponse(NamedTuple):
-    """Response of W windows to a disturbance (force and torque) at each knot, and states there."""
-
-    residual: np.ndarray
-    """(W, N, 19) measured - simulated, without a disturbance."""
-    slope: np.ndarray
-    """(W, N, 19, KNOTS * 6) change of the simulated values per m/s^2 and rad/s^2 in body axes."""
-    knot: Flown
-    """(W, KNOTS, ...) simulated state at the knots."""
-
-
 class RolloutModel:
     """Simulation of windows with one vehicle: their residuals and slopes, compiled."""
 
@@ -277,8 +266,11 @@ class RolloutModel:
         """Return measured - simulated (W, N, 19) at the estimate `at`."""
         return self.linearise(at, windows, []).residual
 
-    def respond(self, at: Estimate, windows: FlightWindows) -> KnotResponse:
-        """Return the response of the rows of each window to forces and torques at its knots."""
+    def respond(self, at: Estimate, windows: FlightWindows) -> tuple[Linearisation, Flown]:
+        """Return residuals and slopes along disturbances, and the states (W, KNOTS, ...) at knots.
+
+        A disturbance is a force [m/s^2] and torque [rad/s^2] in body axes at one of the knots.
+        """
         with jax.enable_x64(True):
             parts = [
                 jax.tree.map(
@@ -286,7 +278,8 @@ class RolloutModel:
                 )
                 for x, w, own in batches(at.free, windows)
             ]
-        return jax.tree.map(lambda *p: np.concatenate(p), *parts)
+        residual, slope, knot = jax.tree.map(lambda *p: np.concatenate(p), *parts)
+        return Linearisation(residual, slope, at.free), knot
 
     def linearise(
         self, at: Estimate, windows: FlightWindows, indices: Sequence[int] | None = None
@@ -320,7 +313,7 @@ def compiled(
 
     def respond(
         given: VehicleArrays, theta: Any, offset: Any, windows: FlightWindows
-    ) -> KnotResponse:
+    ) -> tuple[Any, Any, Flown]:
         none = jnp.zeros((BATCH, KNOTS, 6))
 
         def along(direction: Any) -> Any:
@@ -329,7 +322,7 @@ def compiled(
             return jax.jvp(pushed, (none,), (tangent,), has_aux=True)
 
         error, slopes, flown = jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(KNOTS * 6))
-        return KnotResponse(-error, slopes, at_knots(flown, windows))
+        return -error, slopes, at_knots(flown, windows)
 
     linear = slopes_along(lambda *inputs: fly(*inputs)[0])
     return fly, *(jax.jit(each, compiler_options=COMPILED) for each in (linear, respond))

@@ -199,7 +199,7 @@ class ViewSource(Source):
         lines = {GIVEN: before.value[rows, axis][shown]}
         if found.named:
             lines[FITTED] = measured - after.residual[rows, axis][shown]
-        quantity = QUANTITIES.get(self.name, self.name).capitalize()
+        quantity = QUANTITIES[self.name].capitalize()
         return Series(
             middle[shown] - middle[shown][0],
             measured,

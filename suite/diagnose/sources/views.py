@@ -177,7 +177,7 @@ class MeansSource(ViewSource):
         lines = {GIVEN: zeros}
         if found.named:
             lines[FITTED] = np.append(zeros[:count], (change - left)[:, axis])
-        quantity = QUANTITIES.get(self.name, self.name)
+        quantity = QUANTITIES[self.name]
         return Series(
             1.0 + np.arange(len(zeros)),
             np.concatenate([earlier, change])[:, axis],

@@ -88,9 +88,9 @@ def test_slopes_are_those_of_small_changes_and_a_disturbance_pushes_the_windows(
     np.testing.assert_allclose(linear.slope[..., index], slope, atol=1e-4)
     few = model.linearise(begin, windows, [index])
     np.testing.assert_allclose(few.slope[..., 0], linear.slope[..., index], atol=1e-9)
-    response = model.respond(begin, windows)
+    response, knot = model.respond(begin, windows)
     assert response.slope.shape[-1] == KNOTS * 6
-    assert response.knot.rotor_speed.shape == (len(windows.flight), KNOTS, 4)
+    assert knot.rotor_speed.shape == (len(windows.flight), KNOTS, 4)
     up = response.slope[..., 2::6].sum(axis=-1)[:, :, 2]
     at = np.abs(np.asarray(windows.row_s) - 0.5).argmin(axis=1)
     # 1 m/s^2 along body z for half a second, less what tilt takes of it.

@@ -38,9 +38,7 @@ def places(effect):
 
 def equations_of(slope, residual, **more):
     """Return the normal equations of windows with `slope` (W, N, K) and `residual` (W, N)."""
-    turned = np.swapaxes(slope, 1, 2)
-    cross = (turned @ residual[..., None])[..., 0]
-    return NormalEquations(turned @ slope, cross, (residual**2).sum(1), **more)
+    return NormalEquations(*products(slope, residual[..., None]), (residual**2).sum(1), **more)
 
 
 def test_bounds_hold_and_the_free_solution_is_exact():
