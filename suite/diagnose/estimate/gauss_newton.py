@@ -76,22 +76,6 @@ def chi2_fall(
     return gauss_newton_step(fitted, theta, space)[1]
 
 
-def chi2_by_group(
-    equations: NormalEquations, theta: np.ndarray, space: ParameterSpace, group: np.ndarray
-) -> np.ndarray:
-    """Return the squared error (G,) of each group of stretches, fitted to the other groups.
-
-    It is exact to first order about the parameters `theta` (P,), at which the equations were
-    computed. `group` (B,) is the number of each stretch's group.
-    """
-    errors = []
-    for number in np.unique(group):
-        inside = group == number
-        change, _ = gauss_newton_step(equations, theta, space, ~inside)
-        errors.append(equations.chi2_at(change)[inside].sum())
-    return np.array(errors, dtype=float)
-
-
 def fit(
     evidence: Linearised,
     start: Estimate,

@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from suite.diagnose.estimate.gauss_newton import NormalEquations, solve
-from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
+from suite.diagnose.estimate.gauss_newton import solve
+from suite.diagnose.estimate.parameters import Candidate
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
@@ -45,37 +45,6 @@ def folds_of(flight: np.ndarray, start_s: np.ndarray, folds: int = THRESHOLDS.fo
     fold = np.empty(len(flight), int)
     fold[order] = np.arange(len(flight)) % folds
     return fold
-
-
-def score_candidates(
-    equations: NormalEquations,
-    theta: np.ndarray,
-    space: ParameterSpace,
-    named: Sequence[int],
-    among: Sequence[Candidate],
-    fold: np.ndarray,
-    seed: int = 0,
-    limits: Thresholds = THRESHOLDS,
-) -> list[CandidateScore]:
-    """Return the scores of candidates, each fitted with the `named` parameters, best first.
-
-    The equations were computed at `theta` (P,). `fold` (W,) is the cross-validation fold of each
-    window. A candidate without any effect on the flights gets no score.
-    """
-    along = list(equations.numbers)
-    scale = space.array("step")[along]
-    low, high = ((space.array(end) - theta)[along] / scale for end in ("low", "high"))
-    hessian, gradient = equations.hessian * np.outer(scale, scale), equations.gradient * scale
-    information, columns = np.einsum("wjj->j", hessian), equations.columns_of
-    acting = [c for c in among if information[list(columns(c))].sum() > 1e-9]
-    groups = [tuple(sorted({*named, *columns(c)})) for c in acting]
-    gains, p_values, chance = permutation_test(
-        hessian, gradient, groups, tuple(named), fold, seed, (low, high), limits
-    )
-    scores = [
-        CandidateScore(*values, chance) for values in zip(acting, gains, p_values, strict=True)
-    ]
-    return sorted(scores, key=lambda s: -s.gain)
 
 
 def permutation_test(

@@ -18,7 +18,7 @@ import numpy as np
 from suite.diagnose.estimate.block import Block, Estimate, NormalEquations
 from suite.diagnose.estimate.gauss_newton import fit, intervals95
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
-from suite.diagnose.estimate.permutation import CandidateScore, folds_of, score_candidates
+from suite.diagnose.estimate.permutation import CandidateScore, folds_of, permutation_test
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 LEAST_ERROR = 1e-9
@@ -83,10 +83,25 @@ class Evidence(ABC):
     ) -> list[CandidateScore]:
         """Return the scores of candidates, each fitted with the `named` parameters, best first.
 
-        `current` is this evidence, evaluated along all parameters.
+        `current` is this evidence, evaluated along all parameters. A candidate without any effect
+        on the flights gets no score.
         """
-        equations, theta, fold = current.equations, current.at.theta, self.folds(current.block)
-        return score_candidates(equations, theta, self.space, named, among, fold, seed, self.limits)
+        equations = current.equations
+        along = list(equations.numbers)
+        scale, theta = self.space.array("step")[along], current.at.theta
+        low, high = ((self.space.array(end) - theta)[along] / scale for end in ("low", "high"))
+        hessian, gradient = equations.hessian * np.outer(scale, scale), equations.gradient * scale
+        information, columns = np.einsum("wjj->j", hessian), equations.columns_of
+        acting = [c for c in among if information[list(columns(c))].sum() > 1e-9]
+        groups = [tuple(sorted({*named, *columns(c)})) for c in acting]
+        fold = self.folds(current.block)
+        gains, p_values, chance = permutation_test(
+            hessian, gradient, groups, tuple(named), fold, seed, (low, high), self.limits
+        )
+        scores = [
+            CandidateScore(*values, chance) for values in zip(acting, gains, p_values, strict=True)
+        ]
+        return sorted(scores, key=lambda s: -s.gain)
 
     def folds(self, block: Block) -> np.ndarray:
         """Return the fold (B,) of each stretch; cross-validation leaves out one fold at a time."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.composites import acts_through, begin_of, inactive_at
-from suite.diagnose.estimate.gauss_newton import TINY, chi2_by_group, gauss_newton_step
+from suite.diagnose.estimate.gauss_newton import TINY, gauss_newton_step
 from suite.diagnose.estimate.parameters import Candidate, indices_of
 from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.evidence.evidence import Evaluation, validation_groups
@@ -134,8 +134,13 @@ def cross_validated_chi2(current: Evaluation, indices: Sequence[int]) -> np.ndar
     The fit is linear about the estimate of `current`. Fitted are the parameters at `indices`.
     """
     equations = current.equations.along_numbers(sorted(indices))
-    space, groups = current.evidence.space, validation_groups(current.block.flight)
-    return chi2_by_group(equations, current.at.theta, space, groups)
+    theta, space, errors = current.at.theta, current.evidence.space, []
+    group = validation_groups(current.block.flight)
+    for number in np.unique(group):
+        inside = group == number
+        change, _ = gauss_newton_step(equations, theta, space, ~inside)
+        errors.append(equations.chi2_at(change)[inside].sum())
+    return np.array(errors, dtype=float)
 
 
 @dataclass(frozen=True)
