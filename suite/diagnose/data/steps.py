@@ -191,7 +191,7 @@ def rows_show_torque(vehicle: Vehicle, step_s: float) -> bool:
 
     Those of a firmware's loop always are, as they are smooth.
     """
-    return vehicle.controller.kind != "p" or step_s <= vehicle.rotors.time_constant
+    return has_firmware_loop(vehicle) or step_s <= vehicle.rotors.time_constant
 
 
 def with_hidden_torque(speed: np.ndarray, vehicle: Vehicle, step_s: float) -> np.ndarray:

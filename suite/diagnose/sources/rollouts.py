@@ -73,13 +73,20 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     # Choose the input of the model: commands or measured rotor speeds.
     integrator = integrator_of(logs, given.integrator)
     rotor_input, warnings = rotors_are_input(logs, given.drive, vehicle), list[str]()
-    if given.drive == "auto" and not rotor_input:
-        rotor_input = _needs_rotor_input(logs, vehicle, limits)
-        if rotor_input:
-            warnings.append(
-                "the nominal rate loop does not reproduce the measured rotor speeds, so these are "
-                "the model's input"
+    is_open = given.drive == "auto" and not rotor_input
+    if is_open and flown_by_other_controller(logs, vehicle, limits):
+        without = [log.name for log in logs if log.rotor_speed is None]
+        if without:
+            raise ValueError(
+                "the nominal rate loop does not reproduce the rotor speeds that some flights "
+                f"have, and {', '.join(without)} has none as an input: diagnose the other flights "
+                "without it, or use the commands of all with --drive commands"
             )
+        rotor_input = True
+        warnings.append(
+            "the nominal rate loop does not reproduce the measured rotor speeds, so these are the "
+            "model's input"
+        )
     # Cut the flights into stretches, and simulate each with the given vehicle.
     windows_of = partial(cut, logs, vehicle, rotor_input, limits=limits, integrator=integrator)
     windows, notes = windows_of()
@@ -188,24 +195,6 @@ def can_fly(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
         or (log.rotor_speed is None and (log.rate_cmd_b is None or has_firmware_loop(vehicle)))
         for log in logs
     )
-
-
-def _needs_rotor_input(logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds) -> bool:
-    """Return whether measured rotor speeds must be the input, because another controller flew.
-
-    Raises:
-        ValueError: if they must be, and some flights have no rotor speeds.
-    """
-    if not flown_by_other_controller(logs, vehicle, limits):
-        return False
-    without = [log.name for log in logs if log.rotor_speed is None]
-    if without:
-        raise ValueError(
-            "the nominal rate loop does not reproduce the rotor speeds that some flights have, and "
-            f"{', '.join(without)} has none as an input: diagnose the other flights without it, or "
-            "use the commands of all with --drive commands"
-        )
-    return True
 
 
 def _check_count(count: int, limits: Thresholds) -> None:
