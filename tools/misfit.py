@@ -80,8 +80,8 @@ def rollout_error(
     If `noise` is None, it is measured on these logs.
     """
     model, windows, start = rollouts_along(logs, vehicle, rotor_input=False)
-    linear = model.linearise(start.theta, start.free, windows, model.starts)
-    noise = noise or measured_noise(linear.residual, linear.start_slope, windows)
+    linear = model.linearise(start, windows, model.starts)
+    noise = noise or measured_noise(linear, windows)
     return gap_of(linear, windows, noise).rms, noise
 
 

@@ -128,7 +128,7 @@ def at_threshold(name: str, values: Any, vehicle: Vehicle, logs: Sequence[Flight
     model, windows, start = rollouts_along(logs, vehicle, rotor_input=by_rotors)
     space = model.space
     indices = [k for k, entry in enumerate(space.entries) if entry.effect == name]
-    slope = model.linearise(start.theta, start.free, windows, indices).slope
+    slope = model.linearise(start, windows, indices).slope
     entries = [space.entries[k] for k in indices]
     target = [Column(name, e.parameter, e.component or 0).value(values) for e in entries]
     change = np.array(target) - start.theta[indices]

@@ -174,7 +174,7 @@ def linearised(
     row_s = np.asarray(windows.row_s)
     # Rows after the horizon do not count.
     windows = windows._replace(valid=windows.valid & (row_s < horizon_s + 1e-6)[..., None])
-    linear = model.linearise(start.theta, start.free, windows, [*along, *model.starts])
+    linear = model.linearise(start, windows, [*along, *model.starts])
     # Noise of the channels; scaled to the rate of the rows, NaN for a channel that is not logged.
     vector_sigmas = (sensors.pos, sensors.attitude, sensors.vel, sensors.gyro, sensors.acc)
     sigma = np.array([*np.repeat(vector_sigmas, 3), *[sensors.rotor] * 4])

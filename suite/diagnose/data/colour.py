@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import get_lapack_funcs, solve_triangular
 from scipy.optimize import minimize, minimize_scalar
 
-from suite.diagnose.data.noise import at_least, noise_of, typical_variance
+from suite.diagnose.data.noise import Linearisation, at_least, noise_of, typical_variance
 from suite.diagnose.data.windows import SLICES, FlightWindows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
@@ -72,21 +72,11 @@ class _Process(NamedTuple):
 
 
 def measured_noise(
-    residual: np.ndarray,
-    start_slope: np.ndarray,
-    windows: FlightWindows,
-    limits: Thresholds = THRESHOLDS,
+    linear: Linearisation, windows: FlightWindows, limits: Thresholds = THRESHOLDS
 ) -> Noise:
-    """Estimate the measurement noise from residuals.
-
-    Args:
-        residual: (W, N, 19) measured - simulated.
-        start_slope: (W, N, 19, F) derivative of the simulated values by each window's start state.
-        windows: W stretches of 1 s.
-        limits: the gain in likelihood that autocorrelated noise needs, among others.
-    """
-    sigma = noise_of(residual, windows, limits=limits)
-    residual = _without_start(residual, start_slope, np.where(windows.valid, 1.0 / sigma, 0.0))
+    """Estimate the measurement noise from the residuals of `windows`."""
+    sigma = noise_of(linear.residual, windows, limits=limits)
+    residual = _without_start(linear, np.where(windows.valid, 1.0 / sigma, 0.0))
     sigma = noise_of(residual, windows, limits=limits)
     groups = _all_stretches(residual, sigma, windows, ESTIMATED, limits)
     fits = {name: _fit_by_time(stretches, limits) for name, stretches in groups.items()}
@@ -102,18 +92,15 @@ def measured_noise(
 
 
 def residual_as_noise(
-    residual: np.ndarray,
-    start_slope: np.ndarray,
-    windows: FlightWindows,
-    limits: Thresholds = THRESHOLDS,
+    linear: Linearisation, windows: FlightWindows, limits: Thresholds = THRESHOLDS
 ) -> Noise:
     """Return the noise if the whole residual counts as noise, including the model's error.
 
     It is used where even the best model does not fit: intervals then allow for the bias that the
-    wrong model causes. The arguments are those of `measured_noise`.
+    wrong model causes.
     """
-    sigma = noise_of(residual, windows, limits=limits)
-    residual = _without_start(residual, start_slope, np.where(windows.valid, 1.0 / sigma, 0.0))
+    sigma = noise_of(linear.residual, windows, limits=limits)
+    residual = _without_start(linear, np.where(windows.valid, 1.0 / sigma, 0.0))
     coloured = {}
     for name, stretches in _all_stretches(residual, sigma, windows, SLICES, limits).items():
         rows = len(stretches.time_s)
@@ -130,8 +117,7 @@ def residual_as_noise(
 def colour_filter(noise: Noise, name: str, windows: FlightWindows) -> np.ndarray:
     """Return matrices (W, N, N) that make the rows of the group `name` independent.
 
-    They are applied to rows that are divided by their standard deviation. Rows without a value are
-    unchanged.
+    They apply to rows over their standard deviation, and leave those without a value unchanged.
     """
     valid = np.asarray(np.all(windows.valid[..., SLICES[name]], axis=-1))
     correlation = _correlation(np.asarray(windows.row_s), *noise.coloured[name])
@@ -143,19 +129,17 @@ def colour_filter(noise: Noise, name: str, windows: FlightWindows) -> np.ndarray
 
 
 def _correlation(time_s: np.ndarray, share: float, lasts_s: float) -> np.ndarray:
-    """Return the correlation (..., N, N) of noise at the times `time_s` (..., N).
-
-    `share` of the variance is autocorrelated, with the correlation time `lasts_s` [s].
-    """
+    """Return the correlation (..., N, N) of noise at `time_s` (..., N), see `Noise.coloured`."""
     lag_s = np.abs(time_s[..., :, None] - time_s[..., None, :])
     return (1.0 - share) * np.eye(time_s.shape[-1]) + share * np.exp(-lag_s / lasts_s)
 
 
-def _without_start(residual: np.ndarray, slope: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return `residual` (W, N, 19) without what an error of each window's start state explains.
+def _without_start(linear: Linearisation, weight: np.ndarray) -> np.ndarray:
+    """Return the residuals (W, N, 19) without what an error of each window's start state explains.
 
-    `slope` (W, N, 19, F) is the derivative by the start state, and `weight` (W, N, 19) 1 / noise.
+    `weight` (W, N, 19) is 1 / noise.
     """
+    residual, slope = linear.residual, linear.start_slope
     rows = (slope * np.nan_to_num(weight)[..., None]).reshape(len(slope), -1, slope.shape[-1])
     white = (residual * np.nan_to_num(weight)).reshape(len(slope), -1, 1)
     transposed = np.swapaxes(rows, 1, 2)
@@ -173,19 +157,15 @@ def _all_stretches(
     limits: Thresholds,
 ) -> dict[str, _Stretches]:
     """Return the stretches by group of channels, of those in `names` with enough measurements."""
-    groups = {}
-    for name in names:
-        if np.isfinite(sigma[SLICES[name]]).all():
-            stretches = _stretches(residual[..., SLICES[name]], windows, name, limits)
-            if stretches is not None:
-                groups[name] = stretches
-    return groups
+    measured = (name for name in names if np.isfinite(sigma[SLICES[name]]).all())
+    groups = {name: _stretches(residual, windows, name, limits) for name in measured}
+    return {name: stretches for name, stretches in groups.items() if stretches is not None}
 
 
 def _stretches(
-    values: np.ndarray, windows: FlightWindows, name: str, limits: Thresholds
+    residual: np.ndarray, windows: FlightWindows, name: str, limits: Thresholds
 ) -> _Stretches | None:
-    """Return the stretches of `values` (W, N, C), residuals of the group of channels `name`.
+    """Return the stretches of `residual` (W, N, 19) in the group of channels `name`.
 
     None with too few rows. All stretches get the same number of rows: that which nine of ten usable
     windows have.
@@ -202,7 +182,8 @@ def _stretches(
     # Windows with a lost row or jitter stay, since their times differ little from the median times.
     # Windows with a hole are left out.
     alike = np.abs(times_s - time_s).max(axis=1) <= limits.colour_aside * np.diff(time_s).mean()
-    stacked = np.take_along_axis(values[chosen], first_rows[..., None], axis=1)[alike]
+    values = residual[chosen][..., SLICES[name]]
+    stacked = np.take_along_axis(values, first_rows[..., None], axis=1)[alike]
     if not len(stacked):
         return None
     time = (time_s - time_s.mean()) / (time_s[-1] - time_s[0])
@@ -228,9 +209,8 @@ def _drift_covariance(time_s: np.ndarray, integrations: int) -> np.ndarray:
 def _without_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.ndarray, int, float]:
     """Return the energy (V * C,) without the polynomial, its freedom, and half a log-determinant.
 
-    The energy is the sum of squares of each column after rows are whitened by `process` and the
-    polynomial is subtracted. The freedom is its number of independent rows, and the log-determinant
-    a term of the restricted likelihood.
+    The energy is the sum of squares of each column after rows are whitened by `process`; the
+    log-determinant is a term of the restricted likelihood.
     """
     correlation = _correlation(stretches.time_s, process.share, process.lasts_s)
     lower = np.linalg.cholesky(correlation + process.drift * stretches.drift)
@@ -290,10 +270,7 @@ def _fit_by_time(
 def _with_drift(
     score: Callable[[_Process], float], begin: _Process, drift: float
 ) -> tuple[_Process, float]:
-    """Return the process with the best `score` and the same T as `begin`, and that score.
-
-    The search begins at the share of `begin` and at `drift`.
-    """
+    """Return the process with the best `score` and the T of `begin`, and that score."""
 
     def process_at(x: np.ndarray) -> _Process:
         share = float(1.0 / (1.0 + np.exp(-x[0])))

@@ -1,7 +1,6 @@
-"""Prepares flights for the views: fills missing signals, smooths, splits off held-out flights.
+"""Prepares flights for the views (force and torque): fills missing signals, and smooths.
 
-A view is a part of the dynamics that a log allows to test alone: here the force or the torque. A
-partial log lacks a required signal, which is then derived from others. Rates are derived from the
+A partial log lacks a required signal, which is then derived from others. Rates are derived from the
 attitude. A missing attitude is derived from the path: thrust is along body z, and in slow flight it
 is nearly all of the force, so body z is along the acceleration minus gravity (differential
 flatness; Mellinger and Kumar 2011). Yaw is set to 0. From such an attitude, forces across the
@@ -54,7 +53,7 @@ as means over a second [s]."""
 
 @dataclass(frozen=True)
 class ViewFlights:
-    """Flights, ready for the views that all of them allow."""
+    """Flights, ready for views."""
 
     views: tuple[View, ...]
     """The views that all flights allow."""
@@ -90,9 +89,9 @@ def ready(
     logs, notes = with_fewer_rows(logs, limits)
     rotors = [acting_rotors(log, vehicle, limits) for log in logs]
     complete = [completed(log) for log in posed(logs)]
-    filled = [on_every_row(log, limits) for log in complete]
     rows = [
-        rows_of(log, vehicle, one.speed, limits) for log, one in zip(filled, rotors, strict=True)
+        rows_of(on_every_row(log, limits), vehicle, one.speed, limits)
+        for log, one in zip(complete, rotors, strict=True)
     ]
     # Choose the views, with the axes and widths that the available signals allow.
     inertial = [is_inertial(log) for log in logs]
@@ -200,8 +199,7 @@ SMOOTH_S = 0.1
 def completed(log: FlightLog) -> FlightLog:
     """Return `log` with a missing attitude from its path, and missing rates from the attitude.
 
-    A flight without position gets a constant pose, as only its rotation is used; see `posed` for
-    flights with an accelerometer.
+    A flight without position and accelerometer gets a constant pose, as only its rotation is used.
 
     Raises:
         ValueError: for a log without positions and without rates.
@@ -297,14 +295,13 @@ def acting_rotors(
     if log.thrust_cmd is None:
         needs = "[motors] in the vehicle file" if log.pwm is not None else "thrust or rotors"
         raise ValueError(f"{log.name}: no signal gives its rotor speeds; it needs {needs}")
-    force = vehicle.mass * np.maximum(log.thrust_cmd, 0.0)
+    force, each = vehicle.mass * np.maximum(log.thrust_cmd, 0.0), log.torque_cmd_b is not None
     torque_b = np.zeros((len(force), 3)) if log.torque_cmd_b is None else log.torque_cmd_b
     nominal, _ = nominal_quadrotor(vehicle)
-    each = mix(nominal.unmixer, nominal.thrust_max, force, torque_b, nominal.unequal_arms)
-    speed = np.sqrt(np.maximum(each, 0.0) / vehicle.rotors.thrust_coefficient)
-    if log.torque_cmd_b is None:
-        return ActingRotors(_lagged(log, vehicle, speed), "commanded thrust", False)
-    return ActingRotors(_lagged(log, vehicle, speed), "commanded thrust and torques", True)
+    thrusts = mix(nominal.unmixer, nominal.thrust_max, force, torque_b, nominal.unequal_arms)
+    speed = np.sqrt(np.maximum(thrusts, 0.0) / vehicle.rotors.thrust_coefficient)
+    source = "commanded thrust and torques" if each else "commanded thrust"
+    return ActingRotors(_lagged(log, vehicle, speed), source, each)
 
 
 def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:

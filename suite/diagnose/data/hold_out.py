@@ -26,7 +26,6 @@ def choose_held_out(
 ) -> tuple[np.ndarray, list[str]]:
     """Return for each window (W,) whether it is fitted, and the names of the held-out flights.
 
-    `flight` (W,) is the number of each window's flight, `start_s` (W,) the window's start in it.
     `information` (W, K) is the information of each window on each of K parameters.
 
     Held out are the flights whose information the others contain, too. So a flight with the only
@@ -61,7 +60,7 @@ class Parted(NamedTuple):
     held: dict[str, list[SmoothedFlight]]
     names: list[str]
     """Names of the held-out flights or stretches."""
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...]
     """Views that were left out and why, in words."""
 
 
@@ -74,9 +73,27 @@ def parted(flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRES
     Raises:
         ValueError: if a part of the first view is too short.
     """
-    parts, notes = _split(flights, held, limits), list[str]()
+    count, names = len(flights.names), [flights.names[k] for k in held]
+    fitted_part, held_part = dict[str, list[SmoothedFlight]](), dict[str, list[SmoothedFlight]]()
+    if count > 1:
+        for name, part in flights.smoothed.items():
+            fitted_part[name] = [part[k] for k in range(count) if k not in held]
+            held_part[name] = [part[k] for k in held]
+    else:
+        # The share is of the time in flight, since a log may begin or end on the ground.
+        flown_s = flights.smoothed[flights.views[0].name][0].form.middle_s
+        until_s = float(np.quantile(flown_s, limits.lone_fitted_share))
+        names = [f"{flights.names[0]} from {until_s:.1f} s"]
+        for view in flights.views:
+            (single,) = flights.smoothed[view.name]
+            early = single.rows.time_s <= until_s
+            for part, chosen in ((fitted_part, early), (held_part, ~early)):
+                rows = single.rows._replace(good=np.asarray(single.rows.good) & chosen)
+                split = smoothed(view, rows, limits)._replace(reliability=single.reliability)
+                part[view.name] = [split]
+    notes = list[str]()
     for number, view in enumerate(flights.views):
-        for what, part in (("to fit", parts.fitted), ("held out", parts.held)):
+        for what, part in (("to fit", fitted_part), ("held out", held_part)):
             flown_s = sum(len(one.form.middle_s) for one in part[view.name]) * view.spacing_s
             if flown_s >= limits.least_view_s:
                 continue
@@ -87,30 +104,6 @@ def parted(flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRES
             if number == 0:
                 raise ValueError(f"{', '.join(flights.names)}: {need}")
             notes.append(f"{view.name}: not examined, {need}")
-            del parts.fitted[view.name], parts.held[view.name]
+            del fitted_part[view.name], held_part[view.name]
             break
-    return parts._replace(notes=tuple(notes))
-
-
-def _split(flights: ViewFlights, held: Sequence[int], limits: Thresholds) -> Parted:
-    """Return what `parted` returns, however short the parts are."""
-    count = len(flights.names)
-    if count > 1:
-        inside = [number for number in range(count) if number not in held]
-        fitted_part, held_part = (
-            {name: [part[k] for k in numbers] for name, part in flights.smoothed.items()}
-            for numbers in (inside, held)
-        )
-        return Parted(fitted_part, held_part, [flights.names[k] for k in held])
-    fitted_part, held_part = {}, {}
-    # The share is of the time in flight, since a log may begin or end on the ground.
-    flown_s = flights.smoothed[flights.views[0].name][0].form.middle_s
-    until_s = float(np.quantile(flown_s, limits.lone_fitted_share))
-    for view in flights.views:
-        (single,) = flights.smoothed[view.name]
-        early = single.rows.time_s <= until_s
-        for part, chosen in ((fitted_part, early), (held_part, ~early)):
-            rows = single.rows._replace(good=np.asarray(single.rows.good) & chosen)
-            split = smoothed(view, rows, limits)._replace(reliability=single.reliability)
-            part[view.name] = [split]
-    return Parted(fitted_part, held_part, [f"{flights.names[0]} from {until_s:.1f} s"])
+    return Parted(fitted_part, held_part, names, tuple(notes))

@@ -5,9 +5,8 @@ From there the gyro is integrated to the attitude, and the specific force minus 
 velocity. The drift depends on a few parameters: tilt and velocity at the start, biases of gyro and
 accelerometer, and later changes of the tilt. Drag makes them observable, as the force across the
 thrust is opposite to the velocity (Leishman et al. 2014, doi 10.1109/MCS.2013.2287362). The drag
-coefficients are estimated too, since the vehicle file may lack them; all flights of a vehicle share
-them. The estimate is least squares with priors, for pieces of a flight of about `PIECE_S`. Yaw
-and horizontal position start at 0, far above any ground.
+coefficients, which all flights of a vehicle share, are estimated too, since the vehicle file may
+lack them. The estimate is least squares with priors.
 
 In such flights the model is compared with the accelerometer, not with a derivative of the velocity.
 """
@@ -162,8 +161,9 @@ def _pieces(log: FlightLog) -> list[_Piece]:
     for part in parts:
         prior = LATER if pieces else PRIOR
         pieces.append(_Piece(time_s[part], rate_b[part], acc_b[part], rot, prior))
-        if len(pieces) > 1:
-            pieces[-1].begin_after(pieces[-2])
+        if len(pieces) > 1:  # start where the previous piece ends
+            rot_w, vel_w = pieces[-2].flown()
+            pieces[-1].rot, pieces[-1].vel = rot_w[-1], vel_w[-1]
         if len(parts) > 1:
             _fitted([pieces[-1:]])
     return pieces
@@ -235,11 +235,6 @@ class _Piece:
         rot_w = Rotation.from_rotvec(walk).as_matrix() @ rot_w
         moved = self._integral(self._force_w(rot_w) - [0.0, 0.0, GRAVITY])
         return rot_w, self.vel + vel + moved
-
-    def begin_after(self, before: _Piece) -> None:
-        """Start where the piece `before` ends."""
-        rot_w, vel_w = before.flown()
-        self.rot, self.vel = rot_w[-1], vel_w[-1]
 
     def off(self, drag: np.ndarray, rot_w: np.ndarray, vel_w: np.ndarray) -> np.ndarray:
         """Return the residuals (M, 2) of the mean forces along body x and y for `drag` [m/s^2].

@@ -6,10 +6,30 @@ at a time, and the remainder is noise.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from suite.diagnose.data.windows import CHANNELS, SLICES, FlightWindows
+from suite.diagnose.data.windows import CHANNELS, SLICES, STATE, FlightWindows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+
+
+class Linearisation(NamedTuple):
+    """Residuals of W windows, and derivatives (slopes) of the simulated values by K numbers."""
+
+    residual: np.ndarray
+    """(W, N, 19) measured - simulated; zero where nothing was measured."""
+    slope: np.ndarray
+    """(W, N, 19, K) derivative of the simulated values; often the last F are by the start
+    numbers."""
+    offset: np.ndarray
+    """(W, F) correction of each window's start numbers with which the residuals were computed."""
+
+    @property
+    def start_slope(self) -> np.ndarray:
+        """(W, N, 19, 12) slopes along each window's start state; the last F must be as above."""
+        size = self.offset.shape[1]
+        return self.slope[..., self.slope.shape[-1] - size :][..., :STATE]
 
 
 def rotor_noise(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> float:
@@ -33,17 +53,11 @@ def noise_of(
     rows_together: int | None = None,
     limits: Thresholds = THRESHOLDS,
 ) -> np.ndarray:
-    """Return the standard deviation (19,) of each channel's noise, in its unit.
+    """Return the standard deviation (19,) of each channel's noise in `residual` (W, N, 19).
 
     NaN where nothing was measured. A channel with too few rows in every window gets the RMS of its
-    residuals, which is an upper limit.
-
-    Args:
-        residual: (W, N, 19) measured - simulated.
-        windows: W stretches of 1 s.
-        rows_together: number of rows of a channel from which one polynomial is subtracted; by
-            default `limits.noise_rows`, or all rows of a window with fewer rows.
-        limits: degree of the polynomial, and lower limit of the noise.
+    residuals, which is an upper limit. One polynomial is subtracted from `rows_together` rows of a
+    channel, by default `limits.noise_rows`, or from all rows of a window with fewer rows.
     """
     block_rows, degree = rows_together or limits.noise_rows, limits.noise_degree
     power: list[list[float]] = [[] for _ in range(CHANNELS)]
@@ -81,11 +95,10 @@ def at_least(sigma: np.ndarray, limits: Thresholds = THRESHOLDS) -> np.ndarray:
 
 
 def typical_variance(energy: np.ndarray, freedom: np.ndarray | int) -> np.ndarray:
-    """Return the variance of noise from the `energy` (V, ...) of blocks with `freedom` each.
+    """Return the variance of noise from sums of squares `energy` (V, ...) with `freedom` each.
 
-    The energy is a sum of squares, and `freedom` its degrees of freedom. The variance follows from
-    the median over blocks, so that a few bad blocks do not matter. The median of chi-square with n
-    degrees of freedom, divided by n, is (1 - 2 / 9n)^3 (Wilson and Hilferty 1931).
+    It follows from their median, so that a few bad ones do not matter. The median of chi-square
+    with n degrees of freedom, divided by n, is (1 - 2 / 9n)^3 (Wilson and Hilferty 1931).
     """
     return np.median(energy / freedom / (1.0 - 2.0 / (9.0 * freedom)) ** 3, axis=0)
 
@@ -93,9 +106,7 @@ def typical_variance(energy: np.ndarray, freedom: np.ndarray | int) -> np.ndarra
 def noise_like(speed: np.ndarray, limits: Thresholds = THRESHOLDS) -> np.ndarray:
     """Return simulated noise (T, R) of the same size as the noise of rotor speeds `speed` (T, R).
 
-    With it the effect of the real noise on sums over rows is estimated. The size of a rotor's noise
-    follows from the remainder of a polynomial over a few of its rows. It is zero with too few rows,
-    and NaN where the speed is NaN.
+    It is zero with too few rows, and NaN where the speed is NaN.
     """
     draw = np.random.default_rng(0).standard_normal(speed.shape)
     noise = np.full(speed.shape, np.nan)

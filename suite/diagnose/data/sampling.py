@@ -1,9 +1,8 @@
 """Resamples signals of different sampling rates on common rows and at other times.
 
-A log has one row for each time at which any of its signals was sampled, so a slow signal has no
-value (NaN) in most rows. A signal's own rows are those in which it has a value. Between them,
-measurements are interpolated linearly, and commands are held; neither across a hole, which is a
-long time without a value.
+A log has one row for each time at which any of its signals was sampled. A signal's own rows are
+those in which it has a value. Between them, measurements are interpolated linearly, and commands
+are held; neither across a hole, which is a long time without a value.
 """
 
 from __future__ import annotations
@@ -56,11 +55,7 @@ def on_every_row(log: FlightLog, limits: Thresholds = THRESHOLDS) -> FlightLog:
 def without_slow_rotors(
     logs: Sequence[FlightLog], limits: Thresholds = THRESHOLDS
 ) -> tuple[list[FlightLog], list[str]]:
-    """Return `logs` without rotor speeds that are sampled too slowly, and a note on each such log.
-
-    Too slow means that neighbouring rows are further apart than the longest allowed hole, so that
-    the rotor speeds between them are unknown.
-    """
+    """Return `logs` without rotor speeds whose rows are further apart than a hole, and notes."""
     usable, notes = [], []
     for log in logs:
         spacing_s = 0.0 if log.rotor_speed is None else own_spacing_s(log.time_s, log.rotor_speed)
@@ -135,10 +130,9 @@ def own_spacing_s(time_s: np.ndarray, values: np.ndarray) -> float:
 
 
 def longest_gap_s(time_s: np.ndarray, since_s: float, until_s: float) -> float:
-    """Return the longest time [s] between neighbouring rows from `since_s` to `until_s`.
+    """Return the longest time [s] between rows, at `time_s` (T,), from `since_s` to `until_s`.
 
-    `time_s` (T,) are the times of the rows. The row before `since_s` counts as the first one, and
-    the time after the last row counts up to `until_s`.
+    The row before `since_s` counts as the first one, and the time after the last row counts.
     """
     first_row = max(int(np.searchsorted(time_s, since_s + 1e-9)) - 1, 0)
     rows_s = time_s[first_row : np.searchsorted(time_s, until_s + 1e-9)]
@@ -150,10 +144,7 @@ def longest_gap_s(time_s: np.ndarray, since_s: float, until_s: float) -> float:
 def thinned(valid: np.ndarray, time_s: np.ndarray, most: int) -> np.ndarray:
     """Return the indices of at most `most` rows in which every signal is sampled evenly.
 
-    Args:
-        valid: (N, K) bool, whether each row has a value of each of K signals.
-        time_s: (N,) times of the rows [s].
-        most: largest number of rows.
+    `valid` (N, K) bool says whether each row, at `time_s` (N,) [s], has a value of K signals.
     """
     step = -(-len(valid) // most)
     if step <= 1 or (valid == valid[:1]).all():
@@ -170,10 +161,7 @@ def thinned(valid: np.ndarray, time_s: np.ndarray, most: int) -> np.ndarray:
 
 
 def _filled(time_s: np.ndarray, column: np.ndarray, hole_s: float, held: bool) -> np.ndarray:
-    """Return `column` (T,) with values between its own rows, but NaN in holes.
-
-    They are `held` or interpolated. Rows further apart than `hole_s` [s] are a hole.
-    """
+    """Return `column` (T,), `held` or interpolated between its own rows; it is NaN in holes."""
     own_rows = np.flatnonzero(np.isfinite(column))
     if len(own_rows) < 2:
         return column
@@ -249,10 +237,7 @@ def hold(at_s: np.ndarray, time_s: np.ndarray, series: np.ndarray) -> np.ndarray
 
 
 def voltage_drop(log: FlightLog, at_s: np.ndarray) -> np.ndarray:
-    """Return by how much the battery voltage is below its first value, (S,) [V].
-
-    It is computed at the times `at_s` (S,), and is 0 for a log without a voltage.
-    """
+    """Return the fall of the battery voltage since its first value, (S,) [V]; 0 without any."""
     if log.voltage is None or not np.isfinite(log.voltage).any():
         return np.zeros(len(at_s))
     first_voltage = log.voltage[np.isfinite(log.voltage)][0]
@@ -260,10 +245,9 @@ def voltage_drop(log: FlightLog, at_s: np.ndarray) -> np.ndarray:
 
 
 def follow_lag(commanded: np.ndarray, dt: float, time_constant: float) -> np.ndarray:
-    """Return the rotor speeds (S, 4) at the end of each time step, which follow `commanded` ones.
+    """Return the rotor speeds (S, 4) at the end of each step `dt` [s], behind `commanded` ones.
 
-    They follow with a first-order lag of `time_constant` [s] and begin at the commanded speeds of
-    the first step. `dt` is the length of a step [s].
+    They follow with a first-order lag of `time_constant` [s], from the first commanded speeds on.
     """
     decay = np.exp(-dt / time_constant) if time_constant > 1e-6 else 0.0
     filtered, _ = lfilter([1.0 - decay], [1.0, -decay], commanded, axis=0, zi=decay * commanded[:1])

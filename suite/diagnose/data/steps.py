@@ -1,10 +1,9 @@
 """Places the model's time steps between the rows of a log, and computes its inputs on them.
 
-A command acts from the time of its row on, and the vehicle's rate loop (which turns body rates into
-torques) starts its period at this time. So every step of the model lies between two rows. A sample
-of the loop is an evaluation with new rates. The model's loop samples about as often as that of the
-vehicle, but not more often than every `LONGEST_S`; it predicts the rates over the difference. Where
-measured rotor speeds are the input, they are interpolated with the rotors' lag (first-order delay).
+A command acts from the time of its row on, and the vehicle's rate loop starts its period at this
+time. So every step of the model lies between two rows. A sample of the loop is an evaluation with
+new rates. The model's loop samples about as often as that of the vehicle, but not more often than
+every `LONGEST_S`; it predicts the rates over the difference.
 """
 
 from __future__ import annotations
@@ -56,12 +55,10 @@ class StepGrid(NamedTuple):
 
 
 def step_grid(row_s: np.ndarray, period_s: float, longest_s: float = LONGEST_S) -> StepGrid:
-    """Return steps from the first to the last of `row_s` (R,), R >= 2.
+    """Return steps from the first to the last of `row_s` (R,), R >= 2, when commands may change.
 
-    Args:
-        row_s: (R,) times at which commands may change [s], increasing.
-        period_s: period of the vehicle's rate loop, which restarts at each row [s].
-        longest_s: approximate length of the longest step [s].
+    The vehicle's rate loop restarts its `period_s` [s] at each row. `longest_s` is the approximate
+    length of the longest step [s].
     """
     row_s = np.asarray(row_s, dtype=float)
     spacing = np.diff(row_s)
@@ -112,10 +109,9 @@ def with_lost_rows(time_s: np.ndarray, command: np.ndarray) -> tuple[np.ndarray,
 
 
 def integral_of_held(time_s: np.ndarray, command: np.ndarray) -> np.ndarray:
-    """Return the integral (K, 4) of `command` (K, 4) from the first time to each time.
+    """Return the integral (K, 4) to each `time_s` (K,) of `command` (K, 4), held until the next.
 
-    `time_s` (K,) are the times; each command is held until the next one. Infinite times are padding
-    and add nothing.
+    Infinite times are padding and add nothing.
     """
     finite = np.isfinite(time_s)
     span_s = np.diff(np.where(finite, time_s, time_s[finite].max()))
@@ -149,18 +145,11 @@ def _step_rows(row_s: np.ndarray, shortest_s: float) -> np.ndarray:
 def rotors_at(
     at_s: np.ndarray, time_s: np.ndarray, speed: np.ndarray, vehicle: Vehicle, stride: int = 1
 ) -> np.ndarray:
-    """Return measured rotor speeds (S, 4) at other times.
+    """Return rotor speeds (S, 4) at `at_s` (S,), measured as `speed` (T, 4) at `time_s` (T,).
 
-    Between two rows they follow the first-order response to a constant command. A firmware's rate
-    loop changes its commands all the time, by filtered derivatives of rates. There a spline is more
-    accurate.
-
-    Args:
-        at_s: (S,) times of the result [s].
-        time_s: (T,) times of the log's rows [s].
-        speed: (T, 4) measured speeds, NaN where a rotor was not measured [rad/s].
-        vehicle: vehicle whose rotor lag and kind of rate loop are used.
-        stride: use every `stride`-th measured row of each rotor.
+    Of each rotor every `stride`-th measured row is used. Between two rows the speeds follow the
+    first-order response to a constant command. A firmware's rate loop changes its commands all the
+    time, by filtered derivatives of rates. There a spline is more accurate.
     """
     columns = []
     for column in speed.T:
@@ -200,17 +189,13 @@ def torque_between_rows(vehicle: Vehicle, step_s: float) -> np.ndarray:
 def rows_show_torque(vehicle: Vehicle, step_s: float) -> bool:
     """Return whether rotor speeds `step_s` [s] apart are dense enough to interpolate between them.
 
-    With a firmware's loop, whose speeds are smooth, they always are. Else the lag must not be
-    shorter than `step_s`.
+    Those of a firmware's loop always are, as they are smooth.
     """
-    return vehicle.controller.kind != "p" or step_s <= vehicle.rotors.time_constant
+    return has_firmware_loop(vehicle) or step_s <= vehicle.rotors.time_constant
 
 
 def with_hidden_torque(speed: np.ndarray, vehicle: Vehicle, step_s: float) -> np.ndarray:
-    """Return rotor speeds (S, 4) with the additional torque that rows `step_s` apart do not show.
-
-    The speeds are unchanged if the rows are dense enough (see `rows_show_torque`).
-    """
+    """Return rotor speeds (S, 4) with the torque that sparse rows, `step_s` apart, do not show."""
     if rows_show_torque(vehicle, step_s):
         return speed
     mixer, share = rotor_mixer(vehicle), torque_between_rows(vehicle, step_s)

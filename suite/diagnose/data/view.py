@@ -99,14 +99,8 @@ def near_ground(
 
     A row is on the ground if the vehicle is at rest with too little thrust to fly. Without a
     position the speed is unknown. Then a vehicle is at rest if it does not turn and has too little
-    thrust for longer than a cut of the throttle.
-
-    Args:
-        log: the flight.
-        vehicle: the vehicle.
-        rotor_speed: (T, 4) rotor speeds [rad/s]; None: the commanded thrust is used.
-        limits: thresholds of thrust, speed and time.
-        lasting: whether only a rest longer than a cut of the throttle counts.
+    thrust for longer than a cut of the throttle; with `lasting` only such a rest counts. Without a
+    `rotor_speed` (T, 4) [rad/s] the commanded thrust is used.
     """
     speed_known = "pos" not in log.partial or isinstance(log, InertialLog)
     motion, least = (
@@ -208,13 +202,10 @@ def weak_form(
 ) -> WeakForm:
     """Return bumps of `width_s`, half a width apart, without a bad row or a hole inside.
 
-    Args:
-        time_s: (N,) times of the rows, increasing [s].
-        good: (N,) bool, whether each row can be used.
-        width_s: time from the start of a bump to its end [s].
-        hole_s: rows further apart than this are a hole [s].
-        slope: weight by -w'(t) in place of the bump w(t). Then `mean` takes accelerations to means
-            of their derivatives, and `change` takes positions to mean accelerations.
+    Rows are at `time_s` (N,) [s]; `good` (N,) bool says which can be used, and those further apart
+    than `hole_s` [s] are a hole. With `slope`, the weight is -w'(t) in place of the bump w(t). Then
+    `mean` takes accelerations to means of their derivatives, and `change` takes positions to mean
+    accelerations.
     """
     span = np.diff(time_s)
     middle = 0.5 * (time_s[1:] + time_s[:-1])

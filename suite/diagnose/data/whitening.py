@@ -1,11 +1,10 @@
 """Whitens residuals of windows (1 s stretches of flights) and projects out their start states.
 
-Whitened residuals are in units of independent noise. A window's start state is measured with the
-same noise as its other rows. So it is a nuisance parameter: what a change of its 12 numbers could
-explain is removed (projected out) from residuals and slopes. Errors of the rotor speeds are
-nuisance parameters, too. If measured speeds are the model's input, they have errors at knots
-(support points) all along a window, else only at its start. Additional rows hold a prior on the
-size of these errors. Start numbers are all nuisance parameters of a window: state and rotor speeds.
+A window's start state is measured with the same noise as its other rows. So it is a nuisance
+parameter: what a change of its 12 numbers could explain is removed (projected out) from residuals
+and slopes. Errors of the rotor speeds are nuisance parameters, too. If measured speeds are the
+model's input, they have errors at knots all along a window, else only at its start. Additional rows
+hold a prior on the size of these errors. Start numbers are all these parameters of a window.
 """
 
 from __future__ import annotations
@@ -17,28 +16,10 @@ import numpy as np
 from scipy.special import eval_legendre
 
 from suite.diagnose.data.colour import Noise, colour_filter
-from suite.diagnose.data.noise import rotor_noise
+from suite.diagnose.data.noise import Linearisation, rotor_noise
 from suite.diagnose.data.windows import KNOTS, SLICES, STATE, FlightWindows
 from suite.diagnose.estimate.block import Block
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-
-
-class Linearisation(NamedTuple):
-    """Residuals of W windows, and derivatives (slopes) of the simulated values by K numbers."""
-
-    residual: np.ndarray
-    """(W, N, 19) measured - simulated; zero where nothing was measured."""
-    slope: np.ndarray
-    """(W, N, 19, K) derivative of the simulated values; often the last F are by the start
-    numbers."""
-    offset: np.ndarray
-    """(W, F) correction of each window's start numbers with which the residuals were computed."""
-
-    @property
-    def start_slope(self) -> np.ndarray:
-        """(W, N, 19, 12) slopes along each window's start state; the last F must be as above."""
-        size = self.offset.shape[1]
-        return self.slope[..., self.slope.shape[-1] - size :][..., :STATE]
 
 
 class Whitening(NamedTuple):
@@ -172,10 +153,7 @@ def _filtered(scaled: np.ndarray, filters: Mapping[str, np.ndarray]) -> np.ndarr
 
 
 def slow_energy(whitening: Whitening, residual: np.ndarray) -> np.ndarray:
-    """Return the energy (W, 19) of slow errors in a block's `residual` (W, M), by channel.
-
-    The start numbers are projected out of the residual, so the slow polynomials need no projection.
-    """
+    """Return the energy (W, 19) of slow errors in a block's `residual` (W, M), by channel."""
     rows = residual[:, : whitening.weight[0].size].reshape(whitening.weight.shape)
     amplitude = (np.swapaxes(rows, 1, 2)[:, :, None] @ whitening.slow)[:, :, 0]
     return (amplitude**2).sum(axis=2)

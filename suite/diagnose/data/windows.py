@@ -1,9 +1,8 @@
 """Cuts flight logs into windows of 1 s, in which rollouts (simulated stretches) are compared.
 
-A window starts at a row of the log. It holds the start state, the model's inputs (commands or
-measured rotor speeds) on its time steps (`data/steps.py`), and the measured rows, which are
-compared at their own times. In the burn-in, a short time before the window, the rotors follow the
-commands, so that their speeds at the start are known. Arrays have few shapes, for few compilations.
+A window starts at a row of the log. It holds the start state, the model's inputs on its time steps
+(`data/steps.py`), and the measured rows, which are compared at their own times. In the burn-in, a
+short time before, the rotors follow the commands, so that their speeds at the start are known.
 """
 
 from __future__ import annotations
@@ -286,9 +285,9 @@ def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, stri
 
 
 def _of_one_shape(inputs: Sequence[_Input], like: FlightWindows | None) -> list[_Input]:
-    """Return `inputs` padded to equal numbers of steps and commands, for few compilations.
+    """Return `inputs` padded to equal numbers of steps and commands, or those of `like`.
 
-    If `like` is given, the numbers are those of its windows.
+    There are few such numbers, for few compilations.
     """
 
     def padded_size(counts: Iterable[int], sizes: Sequence[int]) -> int:

@@ -1,9 +1,8 @@
 """Blocks: whitened residuals and Jacobians of stretches of flights, and their normal equations.
 
 A stretch is a piece of a flight whose rows may be correlated. Whitened residuals are in units of
-independent noise. Fit, intervals and search use blocks only, so a new kind of evidence is one class
-that makes blocks. A number is one scalar parameter of the vehicle model; all numbers together form
-one vector (`estimate/parameters.py`). Along a parameter means: by a change of this parameter.
+independent noise. Fit, intervals and search use blocks only. A number is one scalar parameter of
+the vehicle model; all numbers form one vector (`estimate/parameters.py`).
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
+from suite.diagnose.thresholds import Thresholds
 
 
 class Estimate(NamedTuple):
@@ -71,15 +71,17 @@ class Linearised(Protocol):
     """Evidence whose noise is known: all that a fit needs."""
 
     @property
+    def limits(self) -> Thresholds:
+        """Number of steps of a fit, and the fall of chi-square at which it has converged."""
+        ...
+
+    @property
     def space(self) -> ParameterSpace:
         """The parameters."""
         ...
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
-        """Return the block at the estimate `at`, along the parameters at `indices` or along all.
-
-        Evidence that computes all slopes at once may return more columns.
-        """
+        """Return the block at `at`, with slopes at least along `indices`, or along all."""
         ...
 
 
@@ -116,10 +118,6 @@ class NormalEquations(NamedTuple):
         if not candidate.parts:
             place |= {number: numbers.index(number) for number in candidate.indices}
         return [place[number] for number in candidate.indices]
-
-    def repeated(self) -> tuple[int, ...]:
-        """Return the places of the parameters that have two columns."""
-        return tuple(n for k, n in enumerate(self.numbers) if n in self.numbers[:k])
 
     def take(self, columns: Sequence[int]) -> NormalEquations:
         """Return the equations along `columns` only."""
@@ -179,13 +177,8 @@ def without_nuisance(
 ) -> Block:
     """Return the block of rows that have no nuisance parameters.
 
-    Args:
-        residual: (R, C) residuals of R rows and C channels, divided by the noise.
-        slope: (R, C, K) slopes along K parameters, divided by the noise.
-        along: place of each column's parameter in the vector.
-        stretch: (R,) number of each row's stretch, as in `stacked`.
-        flight: (B,) number of each stretch's flight.
-        start_s: (B,) start of each stretch, from the first row of the flight [s].
+    `residual` (R, C) and `slope` (R, C, K), of R rows and C channels, are divided by the noise.
+    `stretch` (R,) is the number of each row's stretch, as in `stacked`; see `Block` for the others.
     """
     count, size = len(flight), slope.shape[2]
     residual = stacked(residual, stretch).reshape(count, -1)

@@ -8,16 +8,20 @@ compared with single effects; all its parameters count. If it wins, its parts ar
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from eval.effects import EFFECTS
-from suite.diagnose.estimate.parameters import JOIN, Candidate, ParameterSpace
+from suite.diagnose.estimate.parameters import (
+    JOIN,
+    Candidate,
+    ParameterSpace,
+    indices_of,
+    parameter_of,
+)
 
 
-@dataclass(frozen=True)
-class Composite:
+class Composite(NamedTuple):
     """Effects that are tested as one hypothesis."""
 
     parts: tuple[str, ...]
@@ -29,17 +33,10 @@ class Composite:
     on its own."""
 
 
+WIND, PASSED_ON = "constant_wind", "a wind and the drag that passes it on"
 COMPOSITES = (
-    Composite(
-        ("constant_wind", "linear_drag"),
-        "a wind and the drag that passes it on",
-        carried="constant_wind",
-    ),
-    Composite(
-        ("constant_wind", "quadratic_drag"),
-        "a wind and the drag that passes it on",
-        carried="constant_wind",
-    ),
+    Composite((WIND, "linear_drag"), PASSED_ON, carried=WIND),
+    Composite((WIND, "quadratic_drag"), PASSED_ON, carried=WIND),
     Composite(("mass_offset", "com_offset"), "a payload: its mass, and where it sits"),
 )
 """All composites."""
@@ -54,8 +51,7 @@ def composites(among: Sequence[Candidate]) -> list[Candidate]:
         parts = [c for name in composite.parts for c in among if c.name == name]
         if len(parts) == len(composite.parts):
             name = JOIN.join(composite.parts)
-            indices = tuple(sorted(i for part in parts for i in part.indices))
-            candidates.append(Candidate(name, indices, name, tuple(parts)))
+            candidates.append(Candidate(name, tuple(indices_of(parts)), name, tuple(parts)))
     return candidates
 
 
@@ -88,47 +84,32 @@ def in_words(sets: Sequence[tuple[str, ...]]) -> list[str]:
     return lines
 
 
-@dataclass(frozen=True)
-class Inactive:
-    """Parameters that change nothing at the present estimate, and values at which they do.
-
-    An example is a wind without a drag.
-    """
-
-    indices: tuple[int, ...]
-    """Places of these parameters in the vector of all."""
-    theta: np.ndarray
-    """(P,) all parameters; the effects through which the inactive ones act have usual sizes."""
-
-
 def inactive_at(
     space: ParameterSpace, theta: np.ndarray, among: Sequence[Candidate], acts: np.ndarray
-) -> Inactive | None:
-    """Return the parameters that act only through others, and so change nothing at `theta` (P,).
+) -> tuple[tuple[int, ...], np.ndarray] | None:
+    """Return the parameters that change nothing at `theta` (P,), such as a wind without a drag.
 
-    None where there are none. If several composites contain them, the first composite counts.
-    `acts` (P,) bool marks the parameters that change the model at `theta`.
+    They act only through other effects. Returned are their places, and all parameters (P,) with
+    usual sizes of these effects; None where there are none. If several composites contain them, the
+    first one counts. `acts` (P,) bool marks the parameters that change the model at `theta`.
     """
     for composite in COMPOSITES:
         composite_candidate = next((c for c in among if c.name == JOIN.join(composite.parts)), None)
         if composite.carried is None or composite_candidate is None:
             continue
-        carried_indices = next(
-            part for part in composite_candidate.parts if part.name == composite.carried
-        ).indices
+        carried_indices = carried([composite_candidate])[0].indices
         if acts[list(carried_indices)].any() or theta[list(carried_indices)].any():
             continue  # it acts, or it was named and the effect through which it acts was dropped
         raised, usual = theta.copy(), usual_size(space)
         carrier_indices = [i for i in composite_candidate.indices if i not in carried_indices]
         raised[carrier_indices] = theta[carrier_indices] + usual[carrier_indices]
-        return Inactive(carried_indices, raised)
+        return carried_indices, raised
     return None
 
 
 def usual_size(space: ParameterSpace) -> np.ndarray:
     """Return the usual magnitude (P,) of every parameter: the middle of its usual range."""
-    usual = {(e.name, p.name): p.typical for e in EFFECTS.values() for p in e.parameters}
-    return np.array([np.mean(usual[entry.effect, entry.parameter]) for entry in space.entries])
+    return np.array([np.mean(parameter_of(entry).typical) for entry in space.entries])
 
 
 def begin_of(
@@ -141,18 +122,13 @@ def begin_of(
 ) -> np.ndarray:
     """Return the parameters (P,) with which the fit of a composite begins.
 
-    A linear fit identifies a drag, and the product of drag and wind. The wind is that product over
-    the drag, relative to the drag's usual size. If the drag of the linear fit is too small, the
-    fit begins with `LEAST_USUAL` of the usual drag.
+    A linear fit at `theta` (P,) identifies a drag, and the product of drag and wind. The wind is
+    that product over the drag, relative to the drag's usual size. If the drag of the linear fit is
+    too small, the fit begins with `LEAST_USUAL` of the usual drag.
 
-    Args:
-        space: parameters of the vehicle.
-        theta: (P,) values of all parameters at which the linear fit was computed.
-        candidate: the composite.
-        inactive: places of its parameters that act through the others. Their slopes were computed
-            with the others at their usual size.
-        change: (P,) change of all parameters by the linear fit.
-        information: (P,) information of the flights on each parameter.
+    `inactive` are the places of the parameters of `candidate` that act through the others. Their
+    slopes were computed with the others at their usual size. `change` (P,) is the change of all
+    parameters by the linear fit, and `information` (P,) that of the flights on each parameter.
     """
     begin = np.clip(theta + change, space.array("low"), space.array("high"))
     carrier_indices = np.array([i for i in candidate.indices if i not in inactive])

@@ -1,8 +1,7 @@
 """Fits parameters by Gauss-Newton with bounds and step halving, and computes 95 % intervals.
 
-All functions work on blocks, which are the linearised residuals of stretches of flights, and on
-their normal equations (`estimate/block.py`). So every kind of evidence uses them. J is the Jacobian
-of the model and r the residual; chi-square is the squared error over the noise variance.
+All functions work on blocks and their normal equations (`estimate/block.py`). J is the Jacobian of
+the model and r the residual; chi-square is the squared error over the noise variance.
 """
 
 from __future__ import annotations
@@ -17,20 +16,15 @@ from scipy.stats import t as student
 
 from suite.diagnose.estimate.block import Block, Estimate, Linearised, NormalEquations
 from suite.diagnose.estimate.parameters import ParameterSpace
-from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
 def solve(
     hessian: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray, scale: np.ndarray
 ) -> np.ndarray:
-    """Return the change (K,) of K parameters within bounds that lowers chi-square most.
+    """Return the change (K,) of K parameters, from `low` to `high`, that lowers chi-square most.
 
-    Args:
-        hessian: (K, K) J'J.
-        gradient: (K,) J'r.
-        low: (K,) lower bound of the change.
-        high: (K,) upper bound of the change.
-        scale: (K,) usual size of each parameter. In these units the equations are well conditioned.
+    `hessian` is J'J and `gradient` J'r. `scale` (K,) is the usual size of each parameter: in these
+    units the equations are well conditioned.
 
     Raises:
         ValueError: for values that are not finite.
@@ -62,11 +56,8 @@ def gauss_newton_step(
 ) -> tuple[np.ndarray, float]:
     """Return the best change (K,) of the parameters, and the expected fall of chi-square.
 
-    Args:
-        equations: normal equations along the K fitted parameters, computed at `theta`.
-        theta: (P,) values of all parameters.
-        space: bounds of all parameters.
-        inside: (B,) bool, whether each stretch is fitted; all are if not given.
+    `equations` are along the K fitted parameters, computed at `theta` (P,). `inside` (B,) bool says
+    which stretches are fitted; all are if not given.
     """
     hessian, gradient = equations.sums(inside)
     indices = np.array(equations.numbers, dtype=int)
@@ -85,44 +76,22 @@ def chi2_fall(
     return gauss_newton_step(fitted, theta, space)[1]
 
 
-def chi2_by_group(
-    equations: NormalEquations, theta: np.ndarray, space: ParameterSpace, group: np.ndarray
-) -> np.ndarray:
-    """Return the squared error (G,) of each group of stretches, fitted to the other groups.
-
-    It is exact to first order about the parameters `theta` (P,), at which the equations were
-    computed. `group` (B,) is the number of each stretch's group.
-    """
-    errors = []
-    for number in np.unique(group):
-        inside = group == number
-        change, _ = gauss_newton_step(equations, theta, space, ~inside)
-        errors.append(equations.chi2_at(change)[inside].sum())
-    return np.array(errors, dtype=float)
-
-
 def fit(
     evidence: Linearised,
     start: Estimate,
     indices: Sequence[int],
     rounds: int | None = None,
     known: Block | None = None,
-    limits: Thresholds = THRESHOLDS,
 ) -> tuple[Estimate, Block]:
-    """Fit the parameters at `indices` and the nuisance parameters of every stretch.
+    """Fit the parameters at `indices` and the nuisance parameters of every stretch, from `start`.
 
-    Args:
-        evidence: evidence whose noise is known.
-        start: estimate with which the fit begins.
-        indices: places of the fitted parameters in the vector.
-        rounds: largest number of steps; by default that of `limits`.
-        known: the block at `start`, if it was computed before.
-        limits: number of steps, and the fall of chi-square at which the fit has converged.
+    It takes at most `rounds` steps, by default those of the evidence's `limits`. `known` is the
+    block at `start`, if it was computed before.
 
     Returns:
         The best estimate, and the block at this estimate.
     """
-    places, space = np.array(indices, dtype=int), evidence.space
+    places, space, limits = np.array(indices, dtype=int), evidence.space, evidence.limits
     low, high = space.array("low")[places], space.array("high")[places]
     best, block = start, known or evidence.linearise(start, indices)
     for steps_done in range(limits.fit_rounds if rounds is None else rounds):

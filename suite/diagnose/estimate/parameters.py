@@ -1,8 +1,8 @@
 """The parameters of all effects as one vector, and the candidates that a diagnosis may name.
 
 A number is one scalar of the vector, such as the x component of a drag coefficient. A candidate is
-an effect of the catalogue that may explain how flights differ from the model. It may also be one
-component of an effect, such as one motor, or several effects as one hypothesis (a composite).
+an effect that may explain how flights differ from the model; or one component of an effect, such as
+one motor, or several effects as one hypothesis (a composite).
 """
 
 from __future__ import annotations
@@ -115,13 +115,7 @@ def effects_at(layout: ParameterLayout, base: Mapping[str, Any], theta: Array) -
 
 
 def refuse_own_motion(vehicle: Vehicle) -> None:
-    """Refuse a vehicle with an effect that has a state of its own, such as a swinging load.
-
-    No log holds that state, so no stretch of a flight can be simulated.
-
-    Raises:
-        ValueError: if there is such an effect. The message says what to do.
-    """
+    """Raise a ValueError for an effect with a state of its own, such as a swinging load."""
     for name in vehicle.effects:
         if EFFECTS[name].start is not None:
             raise ValueError(
@@ -132,9 +126,6 @@ def refuse_own_motion(vehicle: Vehicle) -> None:
 
 def make_space(vehicle: Vehicle) -> ParameterSpace:
     """Return the space of all numbers that flights of `vehicle` can identify.
-
-    It does not contain random effects, effects with a state of their own, known constants, and
-    components that no flight shows.
 
     Raises:
         ValueError: for a vehicle whose file has an effect with a motion of its own.
@@ -193,8 +184,7 @@ def with_fitted(
 def candidates(space: ParameterSpace, voltage: bool, has: Collection[str]) -> list[Candidate]:
     """Return the candidates that can be identified from the signals of the logs.
 
-    `has` names the signals other than the `voltage` that some effects need: `acc_b` for an
-    accelerometer, `command` for commands as the model's input.
+    `has` names further signals: `acc_b` (an accelerometer), `command` (commands as the input).
     """
     chosen = []
     for name, effect in EFFECTS.items():
@@ -224,15 +214,14 @@ def indices_of(chosen: Sequence[Candidate]) -> list[int]:
 def implausible(
     space: ParameterSpace, theta: np.ndarray, candidate: Candidate, limits: Thresholds = THRESHOLDS
 ) -> list[str]:
-    """Return a phrase for each implausible number of `candidate`, with its value in `theta` (P,).
+    """Return a phrase for each number of `candidate` with an implausible value in `theta` (P,).
 
-    A number is implausible if it is a few times larger than the upper end of its usual range in the
-    catalogue (see `Thresholds.implausible_times`).
+    It is far above the usual range in the catalogue (see `Thresholds.implausible_times`).
     """
     phrases = []
     for index in candidate.indices:
         entry = space.entries[index]
-        parameter = _parameter(entry)
+        parameter = parameter_of(entry)
         # The usual range is one of values (`whole`), or of differences from no effect.
         size = abs(theta[index] - (0.0 if parameter.whole else _neutral(entry)))
         if size > limits.implausible_times * parameter.typical[1]:
@@ -272,12 +261,12 @@ def usual_first(
     return far, len(effects), min(list(EFFECTS).index(name) for name in effects)
 
 
-def _parameter(entry: FittedNumber) -> Parameter:
+def parameter_of(entry: FittedNumber) -> Parameter:
     """Return the parameter in the catalogue to which a number belongs."""
     return next(p for p in EFFECTS[entry.effect].parameters if p.name == entry.parameter)
 
 
 def _neutral(entry: FittedNumber) -> float:
     """Return the value at which the effect is absent; the file's value if the vehicle sets it."""
-    neutral = _parameter(entry).neutral
+    neutral = parameter_of(entry).neutral
     return entry.start if callable(neutral) else float(neutral)

@@ -1,8 +1,8 @@
 """Gain of each candidate effect, and its p-value by draws of the null hypothesis.
 
 The gain is the fall of the squared error. The p-value is the probability that the best of all
-candidates gains as much under the null hypothesis, that no effect is missing. The distribution of
-gains under this hypothesis is called the null below.
+candidates gains as much if no effect is missing. The distribution of gains in that case is called
+the null below.
 
 Where windows (1 s of a flight) are fitted, a gain is cross-validated, and the null is drawn by a
 permutation test. Where a few flights are compared by their mean residuals, most candidates look
@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from suite.diagnose.estimate.gauss_newton import NormalEquations, solve
-from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
+from suite.diagnose.estimate.gauss_newton import solve
+from suite.diagnose.estimate.parameters import Candidate
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
@@ -39,44 +39,12 @@ def folds_of(flight: np.ndarray, start_s: np.ndarray, folds: int = THRESHOLDS.fo
     """Return the cross-validation fold (W,) of each window: 0, 1, 2 and so on along every flight.
 
     A fold is not a flight, because a single flight may be the only one that identifies a parameter,
-    as a chirp (a command of rising frequency) identifies the gain of a rate loop. `flight` (W,) is
-    the number of each window's flight, `start_s` (W,) the start of the window in it [s].
+    as a chirp (a command of rising frequency) identifies the gain of a rate loop.
     """
     order = np.lexsort((start_s, flight))
     fold = np.empty(len(flight), int)
     fold[order] = np.arange(len(flight)) % folds
     return fold
-
-
-def score_candidates(
-    equations: NormalEquations,
-    theta: np.ndarray,
-    space: ParameterSpace,
-    named: Sequence[int],
-    among: Sequence[Candidate],
-    fold: np.ndarray,
-    seed: int = 0,
-    limits: Thresholds = THRESHOLDS,
-) -> list[CandidateScore]:
-    """Return the scores of candidates, each fitted with the `named` parameters, best first.
-
-    The equations were computed at `theta` (P,). `fold` (W,) is the cross-validation fold of each
-    window. A candidate without any effect on the flights gets no score.
-    """
-    along = list(equations.numbers)
-    scale = space.array("step")[along]
-    low, high = ((space.array(end) - theta)[along] / scale for end in ("low", "high"))
-    hessian, gradient = equations.hessian * np.outer(scale, scale), equations.gradient * scale
-    information, columns = np.einsum("wjj->j", hessian), equations.columns_of
-    acting = [c for c in among if information[list(columns(c))].sum() > 1e-9]
-    groups = [tuple(sorted({*named, *columns(c)})) for c in acting]
-    gains, p_values, chance = permutation_test(
-        hessian, gradient, groups, tuple(named), fold, seed, (low, high), limits
-    )
-    scores = [
-        CandidateScore(*values, chance) for values in zip(acting, gains, p_values, strict=True)
-    ]
-    return sorted(scores, key=lambda s: -s.gain)
 
 
 def permutation_test(
@@ -98,15 +66,10 @@ def permutation_test(
     nearly as good is subtracted, too. With too few windows the null is drawn from the measured
     noise instead.
 
-    Args:
-        hessian: (W, K, K) of the normal equations, with columns scaled to similar size.
-        gradient: (W, K) of the normal equations.
-        groups: columns that are fitted together, including those of `always`.
-        always: columns that are always fitted; gains are relative to a fit of these alone.
-        fold: (W,) cross-validation fold of each window.
-        seed: seed of the draws.
-        room: lowest (K,) and highest (K,) change of each column; no bounds if not given.
-        limits: number of draws, and thresholds.
+    The columns of `hessian` (W, K, K) and `gradient` (W, K) are scaled to similar size. `groups`
+    contain the columns `always`; gains are relative to a fit of these alone. `fold` (W,) is the
+    cross-validation fold of each window, and `room` the lowest and highest change (K,) of each
+    column.
     """
     if not groups:
         return [], [], 0.0
@@ -163,7 +126,10 @@ def permutation_test(
         signs = rng.choice([-1.0, 1.0], (draws, len(fold)))
         drawn = [(signs[:, i] @ unexplained[i], signs[:, o] @ unexplained[o]) for i, o in folds]
     else:
-        noise = _noise_gradients(hessian, draws, rng)
+        # The covariance of the gradient by noise alone is the Hessian.
+        values, vectors = np.linalg.eigh(hessian)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+        noise = (root @ rng.standard_normal((draws, *gradient.shape, 1)))[..., 0]
         drawn = [(noise[:, i].sum(axis=1), noise[:, o].sum(axis=1)) for i, o in folds]
     null = np.max([gain_by_chance(group) for group in groups], axis=0) - gain_by_chance(always)
     return falls, [_p_value(null >= fall) for fall in falls], float(np.quantile(null, 0.99))
@@ -172,14 +138,6 @@ def permutation_test(
 def _p_value(as_extreme: np.ndarray) -> float:
     """Return a p-value from draws of the null; `as_extreme` (D,) is true for those that count."""
     return float((1 + as_extreme.sum()) / (1 + len(as_extreme)))
-
-
-def _noise_gradients(hessian: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
-    """Return draws (D, W, K) of the gradient by noise alone: its covariance is `hessian`."""
-    values, vectors = np.linalg.eigh(hessian)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    normal = rng.standard_normal((draws, *hessian.shape[:2], 1))
-    return (root @ normal)[..., 0]
 
 
 def corrected_p_values(
@@ -192,15 +150,11 @@ def corrected_p_values(
 ) -> list[float]:
     """Return for each group the probability that the best of all groups gains as much by chance.
 
-    Args:
-        gains: fall of chi-square by each group, after the columns `always` are fitted.
-        slope: (F, 3, P) derivative of F flights' means by P parameters (columns), in units of
-            independent noise.
-        groups: columns that are fitted together, such as all parameters of a candidate.
-        always: columns that are always fitted.
-        variance_ratios: (D, 3) draws of each axis's estimated variance over the true variance. The
-            smallest possible p-value is 1 / (D + 1).
-        rng: generator of the noise. If it has drawn `variance_ratios`, it must not be seeded again.
+    `gains` are the falls of chi-square by each group, after the columns `always` are fitted.
+    `slope` (F, 3, P) is the derivative of F flights' means by P parameters (columns), in units of
+    independent noise. `variance_ratios` (D, 3) are draws of each axis's estimated variance over the
+    true variance; if `rng` has drawn them, it must not be seeded again. The smallest possible
+    p-value is 1 / (D + 1).
     """
     draws = len(variance_ratios)
     noise = rng.standard_normal((draws, len(slope), 3))

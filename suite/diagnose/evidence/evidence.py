@@ -2,27 +2,30 @@
 
 Evidence is the differences between simulation and flights, divided by their noise. Each kind of it
 is one subclass: the errors of rollouts (simulated stretches of 1 s), or those of force or torque. A
-subclass linearises its residuals along the model's parameters and estimates their noise; the other
-methods have defaults. A block is the result of a linearisation (`estimate/block.py`), and a stretch
-is a piece of a flight whose residuals may be correlated.
+subclass linearises its residuals (see `estimate/block.py`) and estimates their noise; the other
+methods have defaults.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from suite.diagnose.estimate.block import Block, Estimate, NormalEquations
+from suite.diagnose.estimate.gauss_newton import fit, intervals95
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
-from suite.diagnose.estimate.permutation import CandidateScore, folds_of, score_candidates
+from suite.diagnose.estimate.permutation import CandidateScore, folds_of, permutation_test
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 LEAST_ERROR = 1e-9
 """Lower limit of a squared error in a denominator, in units of the noise variance."""
 
 
+@dataclass(frozen=True, kw_only=True)
 class Evidence(ABC):
     """Whitened residuals (in units of independent noise), and how the parameters change them."""
 
@@ -41,24 +44,29 @@ class Evidence(ABC):
         """Return the block at the estimate `at`, with slopes along `indices` or all parameters."""
 
     @abstractmethod
-    def estimate_noise(self, at: Estimate) -> tuple[Evidence, Block]:
-        """Return this evidence with noise estimated from its residuals at `at`, and its block.
+    def estimate_noise(self, at: Estimate) -> Evaluation:
+        """Evaluate this evidence at `at` along all parameters, with noise estimated there."""
 
-        The block has slopes along all parameters.
+    def relinearise(self, at: Estimate) -> Evaluation:
+        """Evaluate this evidence at `at` along all parameters, with its noise unchanged."""
+        return Evaluation(self, at, self.linearise(at))
+
+    def misfit_as_noise(self, best: Evaluation) -> Evidence | None:
+        """Return this evidence with the whole residual of the `best` model as its noise.
+
+        None if that residual is measurement noise only.
         """
-
-    def relinearise(self, at: Estimate) -> tuple[Evidence, Block]:
-        """Return this evidence, noise unchanged, and its block at `at` along all parameters."""
-        return self, self.linearise(at)
-
-    def misfit_as_noise(self, at: Estimate, block: Block) -> tuple[Evidence, Block] | None:
-        """Return this evidence with the best model's whole residual as its noise, and its block.
-
-        None if that residual is measurement noise only. `at` and `block` are those of the best
-        model.
-        """
-        del at, block
         return None
+
+    def fitted(
+        self,
+        start: Estimate,
+        indices: Sequence[int],
+        rounds: int | None = None,
+        known: Block | None = None,
+    ) -> Evaluation:
+        """Evaluate this evidence at the fit of the parameters at `indices`; see `fit`."""
+        return Evaluation(self, *fit(self, start, indices, rounds, known))
 
     @property
     def flights_differ_p(self) -> float:
@@ -71,55 +79,70 @@ class Evidence(ABC):
         return self.limits.name_p_value
 
     def scores(
-        self,
-        block: Block,
-        equations: NormalEquations,
-        theta: np.ndarray,
-        named: Sequence[int],
-        among: Sequence[Candidate],
-        seed: int,
+        self, current: Evaluation, named: Sequence[int], among: Sequence[Candidate], seed: int
     ) -> list[CandidateScore]:
         """Return the scores of candidates, each fitted with the `named` parameters, best first.
 
-        `block` was computed at `theta` (P,), with slopes along all parameters.
+        `current` is this evidence, evaluated along all parameters. A candidate without any effect
+        on the flights gets no score.
         """
-        fold = self.folds(block)
-        return score_candidates(equations, theta, self.space, named, among, fold, seed, self.limits)
+        equations = current.equations
+        along = list(equations.numbers)
+        scale, theta = self.space.array("step")[along], current.at.theta
+        low, high = ((self.space.array(end) - theta)[along] / scale for end in ("low", "high"))
+        hessian, gradient = equations.hessian * np.outer(scale, scale), equations.gradient * scale
+        information, columns = np.einsum("wjj->j", hessian), equations.columns_of
+        acting = [c for c in among if information[list(columns(c))].sum() > 1e-9]
+        groups = [tuple(sorted({*named, *columns(c)})) for c in acting]
+        fold = self.folds(current.block)
+        gains, p_values, chance = permutation_test(
+            hessian, gradient, groups, tuple(named), fold, seed, (low, high), self.limits
+        )
+        scores = [
+            CandidateScore(*values, chance) for values in zip(acting, gains, p_values, strict=True)
+        ]
+        return sorted(scores, key=lambda s: -s.gain)
 
     def folds(self, block: Block) -> np.ndarray:
         """Return the fold (B,) of each stretch; cross-validation leaves out one fold at a time."""
         return folds_of(block.flight, block.start_s, self.limits.folds)
 
-    def groups(self, block: Block) -> np.ndarray:
-        """Return the group (B,) of each stretch: its flight, or its third of a single flight.
-
-        `explained_share` tests whether the groups agree.
-        """
-        return validation_groups(block.flight)
-
     def explained_share(
-        self, before: Block, at: Estimate, after: Block, candidate: Candidate, gains: np.ndarray
+        self, before: Block, after: Evaluation, candidate: Candidate, gains: np.ndarray
     ) -> float | None:
         """Return the share of the squared error that a candidate explains; None if rejected.
 
-        The blocks are those without (`before`) and with the candidate (`after`, at the estimate
-        `at`). `gains` (G,) are the falls of the squared error of each group, fitted to the other
-        groups.
+        `before` is the block without the candidate. `gains` (G,) are the falls of the squared error
+        of each group of stretches (see `validation_groups`), fitted to the other groups.
         """
-        del at, candidate, gains
-        return 1.0 - float((after.residual**2).sum() / max((before.residual**2).sum(), LEAST_ERROR))
+        chi2 = (after.block.residual**2).sum()
+        return 1.0 - float(chi2 / max((before.residual**2).sum(), LEAST_ERROR))
 
     def preference(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
         """Return the sort key of candidates that fit about equally well; the smallest wins."""
-        del at, candidate
         return ()
 
 
-def validation_groups(flight: np.ndarray) -> np.ndarray:
-    """Return the cross-validation group (M,) of each row: its flight, or its third of a single one.
+class Evaluation(NamedTuple):
+    """Evidence and one estimate of the parameters, with the block at that estimate."""
 
-    `flight` (M,) is the number of each row's flight.
-    """
+    evidence: Evidence
+    at: Estimate
+    block: Block
+
+    @property
+    def equations(self) -> NormalEquations:
+        """The block's normal equations."""
+        return self.block.equations
+
+    def half_widths(self, indices: Sequence[int]) -> np.ndarray:
+        """Return the half-widths (K,) of the 95 % intervals of the parameters at `indices`."""
+        equations = self.equations.along_numbers(indices)
+        return intervals95(equations, self.evidence.flights_differ_p).half_width
+
+
+def validation_groups(flight: np.ndarray) -> np.ndarray:
+    """Return the cross-validation group (M,) of each row: its flight, or third of a single one."""
     if len(np.unique(flight)) > 1:
         return flight
     return np.arange(len(flight)) * 3 // len(flight)

@@ -1,8 +1,7 @@
 """Linearises models of flights by JAX: one function for rollouts, forces and torques.
 
-A model takes a vehicle, its parameters, nuisance parameters, and data: N pieces of flights, such as
-windows or rows. Numbers of pieces and of directions in one call are fixed, so that each model is
-compiled once for all vehicles and flights.
+Numbers of pieces of flights (windows or rows) and of directions in one call are fixed, so that each
+model is compiled once for all vehicles and flights.
 """
 
 from __future__ import annotations
@@ -64,8 +63,8 @@ def linearised(
         theta: (P,) parameters.
         offset: (N, F) nuisance parameters of each piece of the data.
         data: N pieces, as a named tuple of arrays (N, ...).
-        indices: K places of the directions among parameters and then nuisance parameters; with
-            None all of them.
+        indices: K places of the directions among parameters and then nuisance parameters, or None
+            for all.
         size: number of pieces in one call.
     """
     directions = np.eye(len(theta) + offset.shape[1])
@@ -96,10 +95,9 @@ def batches(
 
 
 def slopes_along(model: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that gives the values of `model`, and their slopes along directions.
+    """Return `model` (vehicle, theta, offset, data) with slopes along a fifth argument.
 
-    `model` takes (vehicle, theta, offset, data). The new function takes a fifth argument, the K
-    directions (K, P + F): of the parameters, and then of the nuisance parameters of every piece.
+    That are K directions (K, P + F): of parameters, then of nuisance parameters of every piece.
     """
 
     def linear(given: VehicleArrays, theta: Any, offset: Any, data: Any, directions: Any) -> Any:

@@ -129,10 +129,7 @@ class Weights(NamedTuple):
 
 
 def means_of(values: np.ndarray, flight: np.ndarray) -> np.ndarray:
-    """Return the means (F, ...) of `values` (M, ...) over each flight.
-
-    `flight` (M,) is the number of the flight of each value.
-    """
+    """Return the means (F, ...) of `values` (M, ...) over each flight, by its number (M,)."""
     return np.array([values[flight == number].mean(axis=0) for number in np.unique(flight)])
 
 
@@ -159,10 +156,7 @@ def weights_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> Weights:
 
 
 def _autocorrelation_time(deviations: list[np.ndarray], limits: Thresholds) -> np.ndarray:
-    """Return the autocorrelation time (3,): a sum up to the first lag without correlation.
-
-    A lag is a distance in moments, and `deviations` are those of each flight from its mean.
-    """
+    """Return the autocorrelation time (3,) in moments: a sum up to the first uncorrelated lag."""
     power = np.sum([(series**2).sum(axis=0) for series in deviations], axis=0)
     total, correlated = np.ones(3), np.ones(3, bool)
     for lag in range(1, limits.longest_memory):
@@ -229,26 +223,18 @@ def _pose_whitened(
     return shrunk(residual), shrunk(slope)
 
 
-def stretch_numbers(data: ViewData, limits: Thresholds = THRESHOLDS) -> np.ndarray:
-    """Return the number (M,) of the stretch of each moment.
-
-    A stretch is a piece of a flight so long that two stretches count as independent.
-    """
-    time_block = (data.middle_s / limits.view_block_s).astype(int)
-    _, stretch = np.unique(np.stack([data.flight, time_block]), axis=1, return_inverse=True)
-    return stretch.ravel()
-
-
-def block_of(data: ViewData, weights: Weights, stretch: np.ndarray, along: Sequence[int]) -> Block:
-    """Return the block (whitened stretches) of `data`.
-
-    `along` are the parameters of its slopes, and `stretch` (M,) is the number of the stretch of
-    each moment.
-    """
+def block_of(
+    data: ViewData, weights: Weights, along: Sequence[int], limits: Thresholds = THRESHOLDS
+) -> Block:
+    """Return the block of `data`, with slopes `along` parameters."""
     residual, slope = whitened(data, weights)
-    first = np.unique(stretch, return_index=True)[1]
+    # Stretches are so long that they are independent.
+    time_block = (data.middle_s / limits.view_block_s).astype(int)
+    _, first, stretch = np.unique(
+        np.stack([data.flight, time_block]), axis=1, return_index=True, return_inverse=True
+    )
     return without_nuisance(
-        residual, slope, along, stretch, data.flight[first], data.middle_s[first]
+        residual, slope, along, stretch.ravel(), data.flight[first], data.middle_s[first]
     )
 
 
@@ -265,28 +251,20 @@ def successive_changes(data: ViewData) -> ViewData:
 def fast_share(
     data: ViewData, columns: Sequence[int], change: np.ndarray, limits: Thresholds
 ) -> tuple[float, float]:
-    """Return the share of a fitted effect that fast changes confirm, and its uncertainty.
+    """Return the share of a fitted effect that fast changes confirm, and its 95 % half-width.
 
     A controller makes the motors compensate a disturbance of the body. If it balances a slow torque
     that the model lacks, the motors' torque causes no rotation. That looks like a larger inertia or
     less thrust, but only in slow changes. If the model is right, changes from one moment to the
     next give the same parameters as all moments do (a specification test; Hausman 1978, doi
-    10.2307/1913827).
+    10.2307/1913827). The share is computed to first order.
 
-    Args:
-        data: residuals with the effect in the model.
-        columns: columns of the effect's K parameters in the slopes.
-        change: (K,) fitted parameters minus those of the vehicle file.
-        limits: length of independent stretches.
-
-    Returns:
-        The share to first order, 1 if fast changes show the full effect and 0 if they show none of
-        it; and the half-width of its 95 % interval.
+    `data` has the effect in the model. `columns` are those of the effect's K parameters in the
+    slopes, and `change` (K,) is their fitted value minus that of the vehicle file.
     """
     fast = successive_changes(data)
     fast = fast._replace(slope=(fast.slope[..., list(columns)] @ change)[..., None])
-    stretch = stretch_numbers(fast, limits)
-    equations = block_of(fast, weights_of(fast, limits), stretch, [0]).equations
+    equations = block_of(fast, weights_of(fast, limits), [0], limits).equations
     hessian, gradient = equations.sums()
     share = 1.0 + float(gradient[0]) / max(float(hessian[0, 0]), 1e-300)
     return share, float(intervals95(equations).half_width[0])

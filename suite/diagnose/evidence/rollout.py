@@ -1,9 +1,7 @@
 """Simulates windows (1 s stretches of flights) with the model, and compares them with the logs.
 
 Each window starts from its measured state. Its inputs are the logged commands, which pass through
-the rate loop, or the measured rotor speeds. A window has S time steps, after Q steps of burn-in, in
-which the rotors follow the commands; then their speeds at the start are known. All functions are
-JAX and take many windows at a time.
+the rate loop, or the measured rotor speeds. All functions are JAX and take many windows at a time.
 """
 
 from __future__ import annotations
@@ -201,10 +199,7 @@ def _acting_commands(windows: FlightWindows, delay: Any) -> Any:
 
 
 def _hats(time_s: Any) -> Any:
-    """Return the hat function of each knot at the times `time_s` (B, S) [s], (B, S, KNOTS).
-
-    It is 1 at its knot, 0 at the neighbouring knots, and linear between them.
-    """
+    """Return the hat function (B, S, KNOTS) of each knot at `time_s` (B, S) [s]: 1 at its knot."""
     place = time_s / LENGTH_S * (KNOTS - 1)
     return jnp.maximum(0.0, 1.0 - jnp.abs(place[..., None] - jnp.arange(KNOTS)))
 
@@ -212,8 +207,7 @@ def _hats(time_s: Any) -> Any:
 def _places(time_s: Any, edge_s: Any) -> Any:
     """Return the places of times `time_s` (B, N) among the ends `edge_s` (B, S + 1) of the steps.
 
-    A place consists of the number of the step, the time since the start of that step [s], and the
-    length of that step [s], each (B, N).
+    They are the numbers of the steps, the times since their starts, and their lengths [s], (B, N).
     """
     ends = edge_s.shape[1] - 1
     step = jax.vmap(partial(jnp.searchsorted, side="right"))(edge_s, time_s + 1e-9) - 1

@@ -1,9 +1,8 @@
 """Rollouts (simulated stretches of 1 s) as evidence on the model's parameters.
 
-`RolloutModel` computes the errors of rollouts and their Jacobian, compiled once for all vehicles.
-`RolloutEvidence` divides both by the measurement noise, and removes what a change of the unknown
-start states could explain. A window is the data of one stretch. Start numbers are what is unknown
-at its start: 12 numbers of the state, and errors of the rotor speeds.
+`RolloutModel` computes the errors of rollouts and their Jacobian. `RolloutEvidence` divides both by
+the measurement noise, and removes what a change of the unknown start numbers could explain: 12
+numbers of the state, and errors of the rotor speeds.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,17 +21,12 @@ from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import assemble
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.colour import Noise, measured_noise, residual_as_noise
+from suite.diagnose.data.noise import Linearisation
 from suite.diagnose.data.steps import LONGEST_S, step_s
-from suite.diagnose.data.whitening import (
-    Linearisation,
-    Whitening,
-    block_of,
-    make_whitening,
-    slow_energy,
-)
+from suite.diagnose.data.whitening import Whitening, block_of, make_whitening, slow_energy
 from suite.diagnose.data.windows import KNOTS, LENGTH_S, SLICES, STATE, FlightWindows, cut, take
 from suite.diagnose.estimate.block import Block, Estimate
-from suite.diagnose.estimate.gauss_newton import fit, gauss_newton_step
+from suite.diagnose.estimate.gauss_newton import gauss_newton_step
 from suite.diagnose.estimate.parameters import (
     Candidate,
     ParameterLayout,
@@ -40,7 +34,7 @@ from suite.diagnose.estimate.parameters import (
     effects_at,
     make_space,
 )
-from suite.diagnose.evidence.evidence import Evidence, flights_agree
+from suite.diagnose.evidence.evidence import Evaluation, Evidence, flights_agree
 from suite.diagnose.evidence.linearise import (
     BATCH,
     VehicleArrays,
@@ -64,8 +58,6 @@ class RolloutEvidence(Evidence):
     """The same windows, each shortened to the time in which the linearisation holds."""
     noise: Noise
     whitening: Whitening
-    limits: Thresholds = THRESHOLDS  # pyrefly: ignore[bad-override]
-    misfit_is_noise: bool = False  # pyrefly: ignore[bad-override]
 
     @property
     def space(self) -> ParameterSpace:
@@ -79,67 +71,56 @@ class RolloutEvidence(Evidence):
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
         """Return the block at `at`, with slopes along `indices`; see `Evidence`."""
-        linear = self.model.linearise(at.theta, at.free, self.trusted, indices)
+        linear = self.model.linearise(at, self.trusted, indices)
         along = range(self.model.size) if indices is None else indices
         return block_of(self.whitening, linear, along, self.windows)
 
-    def estimate_noise(self, at: Estimate) -> tuple[RolloutEvidence, Block]:
-        """Return this evidence with its noise estimated at `at`; see `Evidence`."""
+    def estimate_noise(self, at: Estimate) -> Evaluation:
+        """Evaluate this evidence with its noise estimated at `at`; see `Evidence`."""
         # The trusted windows are chosen again, as a better model stays near the flight for longer.
-        return rollout_evidence(self.model, self.windows, self._linear(at), self.limits)
+        linear = self.model.linearise(at, self.windows)
+        new, block = rollout_evidence(self.model, self.windows, linear, self.limits)
+        return Evaluation(new, at, block)
 
-    def relinearise(self, at: Estimate) -> tuple[RolloutEvidence, Block]:
-        """Return this evidence with its noise unchanged; see `Evidence`."""
-        linear = self._linear(at)
+    def relinearise(self, at: Estimate) -> Evaluation:
+        """Evaluate this evidence with its noise unchanged; see `Evidence`."""
+        linear = self.model.linearise(at, self.windows)
         new, block = rollout_evidence(self.model, self.windows, linear, self.limits, self.noise)
-        return replace(new, misfit_is_noise=self.misfit_is_noise), block
+        return Evaluation(replace(new, misfit_is_noise=self.misfit_is_noise), at, block)
 
-    def misfit_as_noise(self, at: Estimate, block: Block) -> tuple[RolloutEvidence, Block] | None:
+    def misfit_as_noise(self, best: Evaluation) -> RolloutEvidence | None:
         """Return this evidence with its whole residual as noise; see `Evidence`."""
-        slow, expected = self.slow_errors(block)
+        slow, expected = self.slow_errors(best.block)
         if slow.sum() <= self.limits.structure_rotor_input * expected.sum():
             return None
-        linear = self._linear(at)
-        noise = residual_as_noise(linear.residual, linear.start_slope, self.trusted, self.limits)
+        linear = self.model.linearise(best.at, self.windows)
+        noise = residual_as_noise(linear, self.trusted, self.limits)
         whitening = make_whitening(linear, noise, self.trusted, self.limits)
-        new = replace(self, noise=noise, whitening=whitening, misfit_is_noise=True)
-        return new, block_of(whitening, linear, range(self.model.size), self.windows)
+        return replace(self, noise=noise, whitening=whitening, misfit_is_noise=True)
 
     def explained_share(
-        self, before: Block, at: Estimate, after: Block, candidate: Candidate, gains: np.ndarray
+        self, before: Block, after: Evaluation, candidate: Candidate, gains: np.ndarray
     ) -> float | None:
         """Return the share of the error that a candidate explains; see `Evidence`."""
         if self.misfit_is_noise and not flights_agree(gains):
             return None
-        return super().explained_share(before, at, after, candidate, gains)
+        return super().explained_share(before, after, candidate, gains)
 
     def slow_errors(self, block: Block) -> tuple[np.ndarray, np.ndarray]:
         """Return the energy (W, 12) of slow errors of the state, and that by noise alone."""
         energy = slow_energy(self.whitening, block.residual)
         return energy[:, :STATE], self.whitening.slow_freedom[:, :STATE]
 
-    def _linear(self, at: Estimate) -> Linearisation:
-        """Return the full windows, linearised at `at` along all parameters and start numbers."""
-        return self.model.linearise(at.theta, at.free, self.windows, None)
 
+def start_estimate(
+    model: RolloutModel, windows: FlightWindows, theta: np.ndarray | None = None
+) -> Estimate:
+    """Return the parameters `theta` (P,), or the vehicle file's, with the true start states.
 
-def start_estimate(model: RolloutModel, windows: FlightWindows) -> Estimate:
-    """Return the vehicle file's parameters, and the start states that it gives (`true_starts`)."""
-    theta = model.space.array("start")
-    return Estimate(theta, true_starts(model, theta, windows))
-
-
-ACC_ROW = 9
-"""The acceleration at a window's start is computed from the velocities there and in this row,
-counted among the rows with a velocity."""
-
-
-def true_starts(model: RolloutModel, theta: np.ndarray, windows: FlightWindows) -> np.ndarray:
-    """Return the true start states minus the logged ones, (W, F), given the delay of logged poses.
-
-    The delay is an effect (the clock offset) with its value in `theta` (P,). Over the delay,
-    position and attitude change by velocity and rates, and the velocity by the acceleration.
+    Logged poses have a delay, an effect (the clock offset) in `theta`. Over the delay, position and
+    attitude change by velocity and rates, and the velocity by the acceleration.
     """
+    theta = model.space.array("start") if theta is None else theta
     delay_s = pose_delay(model.space.effects(theta))
     offset = np.zeros((len(windows.flight), model.free))
     offset[:, :3] = delay_s * windows.vel_w
@@ -151,7 +132,7 @@ def true_starts(model: RolloutModel, theta: np.ndarray, windows: FlightWindows) 
     span_s = np.asarray(windows.row_s)[window, row][:, None]
     acc_w = (np.asarray(windows.row_vel_w)[window, row] - windows.vel_w) / np.maximum(span_s, 1e-3)
     offset[:, 6:9] = delay_s * np.where(has_vel.any(axis=1, keepdims=True), acc_w, 0.0)
-    return offset
+    return Estimate(theta, offset)
 
 
 def rollouts_along(
@@ -164,8 +145,6 @@ def rollouts_along(
     limits: Thresholds = THRESHOLDS,
 ) -> tuple[RolloutModel, FlightWindows, Estimate]:
     """Return the model of rollouts of `vehicle` along `logs`, the windows, and the start of a fit.
-
-    The arguments are those of `cut` and `fly_windows`.
 
     Raises:
         ValueError: if no flight has a window.
@@ -215,9 +194,9 @@ def rollout_evidence(
     numbers. If no `noise` is given, it is estimated from `linear`.
     """
     near = trusted(windows, linear.residual, limits)
-    noise = noise or measured_noise(linear.residual, linear.start_slope, near, limits)
+    noise = noise or measured_noise(linear, near, limits)
     whitening = make_whitening(linear, noise, near, limits)
-    evidence = RolloutEvidence(model, windows, near, noise, whitening, limits)
+    evidence = RolloutEvidence(model, windows, near, noise, whitening, limits=limits)
     indices = range(model.size) if along is None else along
     return evidence, block_of(whitening, linear, indices, windows)
 
@@ -243,23 +222,15 @@ def is_hopeless(
     few = np.unique(np.linspace(0, len(windows.flight) - 1, limits.hopeless_windows).astype(int))
     evidence, block = rollout_evidence(model, take(windows, few), take(linear, few), limits)
     at = Estimate(start, linear.offset[few])
-    _, block = fit(evidence, at, informed, limits.hopeless_rounds, block, limits)
-    return is_far(float((block.residual**2).sum()))
+    best = evidence.fitted(at, informed, limits.hopeless_rounds, block)
+    return is_far(float((best.block.residual**2).sum()))
 
 
+ACC_ROW = 9
+"""The acceleration at a window's start is computed from the velocities there and in this row,
+counted among the rows with a velocity."""
 COMPILED = {"xla_cpu_use_fusion_emitters": False}
 """Options of the compiler XLA: its newer code for loops is no faster, and compiles half as fast."""
-
-
-class KnotResponse(NamedTuple):
-    """Response of W windows to a disturbance (force and torque) at each knot, and states there."""
-
-    residual: np.ndarray
-    """(W, N, 19) measured - simulated, without a disturbance."""
-    slope: np.ndarray
-    """(W, N, 19, KNOTS * 6) change of the simulated values per m/s^2 and rad/s^2 in body axes."""
-    knot: Flown
-    """(W, KNOTS, ...) simulated state at the knots."""
 
 
 class RolloutModel:
@@ -288,40 +259,38 @@ class RolloutModel:
         self.dt = step_s(vehicle)
         """About the length of a step [s]."""
         self.integrator = integrator
-        kind = (space.layout, rotor_input, voltage, integrator)
-        _, self._linear, self._respond = compiled(*kind)
+        functions = compiled(space.layout, rotor_input, voltage, integrator)
+        _, self._linear, self._respond = functions
 
-    def residual(self, theta: np.ndarray, offset: np.ndarray, windows: FlightWindows) -> np.ndarray:
-        """Return measured - simulated (W, N, 19), with start numbers changed by `offset` (W, F)."""
-        return self.linearise(theta, offset, windows, []).residual
+    def residual(self, at: Estimate, windows: FlightWindows) -> np.ndarray:
+        """Return measured - simulated (W, N, 19) at the estimate `at`."""
+        return self.linearise(at, windows, []).residual
 
-    def respond(
-        self, theta: np.ndarray, offset: np.ndarray, windows: FlightWindows
-    ) -> KnotResponse:
-        """Return the response of the rows of each window to forces and torques at its knots."""
+    def respond(self, at: Estimate, windows: FlightWindows) -> tuple[Linearisation, Flown]:
+        """Return residuals and slopes along disturbances, and the states (W, KNOTS, ...) at knots.
+
+        A disturbance is a force [m/s^2] and torque [rad/s^2] in body axes at one of the knots.
+        """
         with jax.enable_x64(True):
             parts = [
                 jax.tree.map(
-                    lambda x, n=own: np.asarray(x)[:n], self._respond(self.given, theta, x, w)
+                    lambda x, n=own: np.asarray(x)[:n], self._respond(self.given, at.theta, x, w)
                 )
-                for x, w, own in batches(offset, windows)
+                for x, w, own in batches(at.free, windows)
             ]
-        return jax.tree.map(lambda *p: np.concatenate(p), *parts)
+        residual, slope, knot = jax.tree.map(lambda *p: np.concatenate(p), *parts)
+        return Linearisation(residual, slope, at.free), knot
 
     def linearise(
-        self,
-        theta: np.ndarray,
-        offset: np.ndarray,
-        windows: FlightWindows,
-        indices: Sequence[int] | None,
+        self, at: Estimate, windows: FlightWindows, indices: Sequence[int] | None = None
     ) -> Linearisation:
-        """Return residuals and slopes at `theta` (P,), with starts changed by `offset` (W, F).
+        """Return residuals and slopes at the estimate `at`.
 
         The slopes are along the parameters at `indices`; places in `starts` mean start numbers.
         With None they are along all parameters and then all start numbers.
         """
-        values, slope = linearised(self._linear, self.given, theta, offset, windows, indices, BATCH)
-        return Linearisation(-values, slope, offset)
+        values, slope = linearised(self._linear, self.given, *at, windows, indices, BATCH)
+        return Linearisation(-values, slope, at.free)
 
 
 @cache
@@ -330,8 +299,8 @@ def compiled(
 ) -> tuple[Callable[..., Any], ...]:
     """Return three functions of (vehicle, theta, offset, windows), kept as compiling is slow.
 
-    The first gives simulated - measured and the simulated states, and takes a disturbance, too. The
-    second is that of `slopes_along`, and the third gives the response to disturbances at the knots.
+    The first gives simulated - measured and the simulated states (and takes a disturbance), the
+    second that of `slopes_along`, the third the response to disturbances at the knots.
     """
 
     def fly(
@@ -344,7 +313,7 @@ def compiled(
 
     def respond(
         given: VehicleArrays, theta: Any, offset: Any, windows: FlightWindows
-    ) -> KnotResponse:
+    ) -> tuple[Any, Any, Flown]:
         none = jnp.zeros((BATCH, KNOTS, 6))
 
         def along(direction: Any) -> Any:
@@ -353,7 +322,7 @@ def compiled(
             return jax.jvp(pushed, (none,), (tangent,), has_aux=True)
 
         error, slopes, flown = jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(KNOTS * 6))
-        return KnotResponse(-error, slopes, at_knots(flown, windows))
+        return -error, slopes, at_knots(flown, windows)
 
     linear = slopes_along(lambda *inputs: fly(*inputs)[0])
     return fly, *(jax.jit(each, compiler_options=COMPILED) for each in (linear, respond))

@@ -1,8 +1,4 @@
-"""Force and torque as evidence on the model's parameters.
-
-A view is one part of the dynamics, force or torque. Measured mean accelerations are compared with
-those of the model. The noise of the residuals is estimated from the residuals themselves.
-"""
+"""Force and torque as evidence: measured mean accelerations compared with those of the model."""
 
 from __future__ import annotations
 
@@ -16,8 +12,7 @@ from suite.diagnose.data.view import SmoothedFlight, View
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.composites import carried
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace, at_bound, usual_first
-from suite.diagnose.estimate.permutation import folds_of
-from suite.diagnose.evidence.evidence import Evidence, flights_agree
+from suite.diagnose.evidence.evidence import Evaluation, Evidence, flights_agree
 from suite.diagnose.evidence.moments import (
     ForceModel,
     ViewData,
@@ -25,11 +20,9 @@ from suite.diagnose.evidence.moments import (
     block_of,
     fast_changes_agree,
     means_of,
-    stretch_numbers,
     weights_of,
     whitened,
 )
-from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
 @dataclass(frozen=True)
@@ -46,7 +39,6 @@ class ViewEvidence(Evidence):
     view: View
     model: ForceModel
     flights: Sequence[SmoothedFlight]
-    limits: Thresholds = THRESHOLDS  # pyrefly: ignore[bad-override]
     carried: np.ndarray | None = None
     """(M, 3) residual that follows from reference flights (is carried over from them); it is
     subtracted."""
@@ -71,10 +63,7 @@ class ViewEvidence(Evidence):
         return Estimate(self.space.array("start"))
 
     def residuals(self, theta: np.ndarray, indices: Sequence[int] | None = ()) -> ViewData:
-        """Return the residuals at the parameters `theta` (P,), with slopes along `indices`.
-
-        With None as indices the slopes are along all parameters.
-        """
+        """Return the residuals at `theta` (P,), with slopes along `indices`, or all with None."""
         parts = [self._residuals(n, theta, indices) for n in range(len(self.flights))]
         # Flights may have different numbers of unknowns of the pose: pad with zeros.
         widest = max(part.pose_slope.shape[2] for part in parts)
@@ -120,40 +109,41 @@ class ViewEvidence(Evidence):
         """Return the block at `at`, with slopes along `indices`; see `Evidence`."""
         return self._block(self.residuals(at.theta, indices), indices)
 
-    def estimate_noise(self, at: Estimate) -> tuple[ViewEvidence, ViewBlock]:
-        """Return this evidence with its noise estimated at `at`; see `Evidence`."""
+    def estimate_noise(self, at: Estimate) -> Evaluation:
+        """Evaluate this evidence with its noise estimated at `at`; see `Evidence`."""
         data = self.residuals(at.theta, None)
         evidence = replace(self, weights=weights_of(data, self.limits))
-        return evidence, evidence._block(data)
+        return Evaluation(evidence, at, evidence._block(data))
 
     def folds(self, block: Block) -> np.ndarray:
         """Return the fold of each stretch: its flight, or parts of all flights if they are few."""
         if len(np.unique(block.flight)) >= 3:
             return block.flight
-        return folds_of(block.flight, np.arange(len(block.flight), dtype=float), self.limits.folds)
+        return super().folds(block)
 
     def explained_share(
-        self, before: Block, at: Estimate, after: Block, candidate: Candidate, gains: np.ndarray
+        self, before: Block, after: Evaluation, candidate: Candidate, gains: np.ndarray
     ) -> float | None:
         """Return the share of the error that a candidate explains; see `Evidence`.
 
         None if a value is at a physical bound, if flights disagree, if fast changes contradict the
         candidate, or if the share is too small.
         """
-        assert isinstance(before, ViewBlock) and isinstance(after, ViewBlock)
-        if at_bound(self.space, at.theta, candidate) or not flights_agree(gains):
+        theta, fitted = after.at.theta, after.block
+        assert isinstance(before, ViewBlock) and isinstance(fitted, ViewBlock)
+        if at_bound(self.space, theta, candidate) or not flights_agree(gains):
             return None
         # Both errors are weighted by the noise estimated with the candidate: in an estimate without
         # it, a slow effect would count as noise.
-        noise = weights_of(after.data, self.limits)
+        noise = weights_of(fitted.data, self.limits)
         chi2_after, chi2_before = (
-            float((whitened(block.data, noise)[0] ** 2).sum()) for block in (after, before)
+            float((whitened(block.data, noise)[0] ** 2).sum()) for block in (fitted, before)
         )
         share = 1.0 - chi2_after / chi2_before
         indices = list(candidate.indices)
-        columns = [after.along.index(index) for index in indices]
-        change = (at.theta - self.space.array("start"))[indices]
-        consistent = fast_changes_agree(after.data, columns, change, self.limits)
+        columns = [fitted.along.index(index) for index in indices]
+        change = (theta - self.space.array("start"))[indices]
+        consistent = fast_changes_agree(fitted.data, columns, change, self.limits)
         return share if share >= self.limits.least_view_share and consistent else None
 
     def preference(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
@@ -163,10 +153,8 @@ class ViewEvidence(Evidence):
     def _block(self, data: ViewData, indices: Sequence[int] | None = None) -> ViewBlock:
         """Return the block of `data`, whose slopes are along `indices` or all parameters."""
         assert self.weights is not None
-        rows = np.arange(len(data.flight))
-        stretch = rows if self.means else stretch_numbers(data, self.limits)
         along = range(len(self.space.entries)) if indices is None else indices
-        return ViewBlock(**vars(block_of(data, self.weights, stretch, along)), data=data)
+        return ViewBlock(**vars(block_of(data, self.weights, along, self.limits)), data=data)
 
 
 def _attenuated(series: np.ndarray, reliability: np.ndarray) -> np.ndarray:
@@ -180,8 +168,7 @@ def _attenuated(series: np.ndarray, reliability: np.ndarray) -> np.ndarray:
 def view_candidates(among: Sequence[Candidate], block: Block) -> list[Candidate]:
     """Return the candidates that change a view's accelerations, without faults of sensors.
 
-    Of a composite (several effects as one hypothesis), each effect has to change them, alone or
-    through another effect.
+    Each effect of a composite has to change them, alone or through another effect.
     """
     acts, acting_through_others = block.acts(), carried(among)
 

@@ -154,6 +154,7 @@ class ResidualEvidence:
     """(C,) standard deviation of the residuals, by channel; None to estimate it."""
     weights: tuple[np.ndarray, ...] = ()
     """Weights (N, C) of the residuals, one array for each flight."""
+    limits = LIMITS
 
     @property
     def space(self) -> ParameterSpace:
@@ -250,7 +251,7 @@ def fit(
         # Fit the free numbers; each round has new weights.
         for _ in range(ROUNDS if free else 0):
             before, evidence = at, evidence.weighed(at)
-            at, _ = fit_numbers(evidence, at, free, limits=LIMITS)
+            at, _ = fit_numbers(evidence, at, free)
             if (at.theta == before.theta).all():
                 break
         # Reset the number with the widest interval to its start, until all intervals are narrow.

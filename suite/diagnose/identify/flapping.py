@@ -53,9 +53,8 @@ def flapping_of(
     # Search for flapping alone, as a diagnosis searches for an effect.
     all_candidates = candidates(evidence.model.space, voltage, ())
     flapping = [candidate for candidate in all_candidates if candidate.name == FLAPPING]
-    weighed, block = evidence.estimate_noise(evidence.start)
-    allowed = view_candidates(flapping, block)
-    result = search(weighed, evidence.start, allowed, known=(weighed, block))
+    begin = evidence.estimate_noise(evidence.start)
+    result = search(begin, view_candidates(flapping, begin.block))
     if not result.named:
         return None
     value = float(result.estimate.theta[result.indices[0]])

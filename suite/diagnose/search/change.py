@@ -1,10 +1,9 @@
 """Finds what has changed in a vehicle since reference flights, earlier flights of the same vehicle.
 
 The vehicle file need not be right: the residual of the reference flights (its mean, and its
-dependence on velocity) is subtracted from the residual of the later flights. The reference flights
-also show how much flights of an unchanged vehicle differ (`rotor_spread`). Their mean has an error,
-too, which is common to all later flights. A change is named if it is large compared with that
-spread; all candidates are tested together (`estimate/permutation.py`).
+dependence on velocity) is subtracted from that of the later flights. The reference flights also
+show how much flights of an unchanged vehicle differ (`rotor_spread`). A change is named if it is
+large compared with that spread.
 
 Some effects, such as a drag, only act in motion, and hardly change the mean of a flight. So where
 no mean has changed, each candidate is fitted to each flight alone. The fitted values of the
@@ -24,10 +23,10 @@ from scipy.stats import ttest_ind
 
 from suite.diagnose.data.view import SmoothedFlight
 from suite.diagnose.estimate.block import Block, Estimate, NormalEquations, without_nuisance
-from suite.diagnose.estimate.gauss_newton import chi2_fall, fit
+from suite.diagnose.estimate.gauss_newton import chi2_fall
 from suite.diagnose.estimate.parameters import Candidate, at_bound, usual_first
 from suite.diagnose.estimate.permutation import CandidateScore, corrected_p_values
-from suite.diagnose.evidence.evidence import Evidence, flights_agree
+from suite.diagnose.evidence.evidence import Evaluation, Evidence, flights_agree
 from suite.diagnose.evidence.moments import (
     ViewData,
     Weights,
@@ -38,15 +37,14 @@ from suite.diagnose.evidence.moments import (
     whitened,
 )
 from suite.diagnose.evidence.views import ViewBlock, ViewEvidence, view_candidates
-from suite.diagnose.search.evaluation import Evaluation, NamedEffect, SearchResult
+from suite.diagnose.search.evaluation import NamedEffect, SearchResult
 
 
 def _motion_inputs(task: ViewEvidence, theta: np.ndarray) -> np.ndarray:
     """Return the inputs (M, 9) of a regression that explains a model's error by the motion.
 
-    They are the velocity, the speed times the velocity, and the model's accelerations at the
-    parameters `theta` (P,), which stand for an error of the model's gain or delay. Each flight's
-    mean is subtracted.
+    They are the velocity, the speed times the velocity, and the model's accelerations at `theta`
+    (P,), which stand for an error of its gain or delay; all without each flight's mean.
     """
     motion = []
     for flight in task.flights:
@@ -66,13 +64,13 @@ search for changes starts from a vehicle whose mean forces and torques are those
 def fit_balance(reference: ViewEvidence) -> np.ndarray:
     """Return parameters (P,) with which the model has the mean accelerations of `reference`."""
     space = reference.model.space
-    theta, weights = space.array("start"), None
+    theta = space.array("start")
+    weights = weights_of(reference.residuals(theta), reference.limits)
+    # Here the trims are fitted, and not noise.
+    evidence = replace(reference, weights=weights._replace(trim=np.zeros(3)))
     for names in BALANCE[reference.view.name]:
         indices = [i for i, entry in enumerate(space.entries) if entry.effect in names]
-        weights = weights or weights_of(reference.residuals(theta), reference.limits)
-        weights = weights._replace(trim=np.zeros(3))  # here the trims are fitted, and not noise
-        evidence = replace(reference, weights=weights)
-        theta = fit(evidence, Estimate(theta), indices, limits=reference.limits)[0].theta
+        theta = evidence.fitted(Estimate(theta), indices).at.theta
     return theta
 
 
@@ -81,8 +79,7 @@ def less_reference_residual(
 ) -> ViewEvidence:
     """Return the evidence of `flights`, from which the reference flights' residual is subtracted.
 
-    That residual is computed at the parameters `theta` (P,) of `fit_balance`, and is described by
-    its mean and a ridge regression on the motion.
+    That residual, at `theta` (P,), is described by its mean and a ridge regression on the motion.
     """
     data, inputs = reference.residuals(theta), _motion_inputs(reference, theta)
     deviation = centred(data.residual, data.flight)
@@ -112,6 +109,15 @@ class RotorSpread:
     prior: int
     """Weight of the pooled estimate in `along`, in degrees of freedom."""
 
+    def words(self, count: int) -> tuple[str, ...]:
+        """Return a text for people on how much the `count` reference flights differ."""
+        return (
+            f"The {count} reference flights differ as if each rotor's thrust varied by "
+            f"{100 * self.share:.1f} % from flight to flight ({self.freedom} degrees of freedom). "
+            "The differences along each axis count as well. A change is named if it exceeds these "
+            "differences significantly.",
+        )
+
     def variance_ratios(self, view: str, draws: int, rng: np.random.Generator) -> np.ndarray:
         """Return draws (D, 3) of the estimated variance over the true one, by axis of `view`.
 
@@ -128,10 +134,7 @@ class RotorSpread:
 def _moderated(
     pooled: np.ndarray | float, square: np.ndarray, freedom: np.ndarray, prior: int
 ) -> np.ndarray:
-    """Return a weighted mean of the pooled variance and of each axis's own (Smyth 2004).
-
-    `square` is the sum of squares of an axis with `freedom`, and `prior` the weight of `pooled`.
-    """
+    """Return a weighted mean of the pooled variance and of each axis's own (Smyth 2004)."""
     return (prior * pooled + square) / (prior + freedom)
 
 
@@ -192,27 +195,21 @@ class ChangeEvidence(ViewEvidence):
         """Probability that a step of the search names a change although nothing has changed."""
         return self.limits.change_p_value
 
-    def estimate_noise(self, at: Estimate) -> tuple[ChangeEvidence, ViewBlock]:
-        """Return this evidence with its noise unchanged, since it is known; see `Evidence`."""
-        return self, self.linearise(at)
+    def estimate_noise(self, at: Estimate) -> Evaluation:
+        """Evaluate this evidence with its noise unchanged, since it is known; see `Evidence`."""
+        return self.relinearise(at)
 
     def scores(
-        self,
-        block: Block,
-        equations: NormalEquations,
-        theta: np.ndarray,
-        named: Sequence[int],
-        among: Sequence[Candidate],
-        seed: int,
+        self, current: Evaluation, named: Sequence[int], among: Sequence[Candidate], seed: int
     ) -> list[CandidateScore]:
         """Return the scores of all candidates close to the best, best first, see `Evidence`.
 
         The means of few flights contain little information: nearly every candidate is close.
         """
+        block, theta = current.block, current.at.theta
         assert isinstance(block, ViewBlock) and self.spread and self.exact_weights and self.weights
         weights = self.weights if named else self.exact_weights
-        stretch = np.arange(len(block.data.flight))
-        equations = block_of(block.data, weights, stretch, block.along).equations
+        equations = block_of(block.data, weights, block.along, self.limits).equations
         without = chi2_fall(equations, theta, self.space, named)
         groups = [candidate.indices for candidate in among]
         gains = [chi2_fall(equations, theta, self.space, [*named, *g]) - without for g in groups]
@@ -232,12 +229,12 @@ class ChangeEvidence(ViewEvidence):
         return sorted((s for s in scores if s.gain >= least), key=lambda s: -s.gain)
 
     def explained_share(
-        self, before: Block, at: Estimate, after: Block, candidate: Candidate, gains: np.ndarray
+        self, before: Block, after: Evaluation, candidate: Candidate, gains: np.ndarray
     ) -> float | None:
         """Return the share of the error that a candidate explains; see `Evidence`."""
-        if at_bound(self.space, at.theta, candidate) or not flights_agree(gains):
+        if at_bound(self.space, after.at.theta, candidate) or not flights_agree(gains):
             return None
-        return Evidence.explained_share(self, before, at, after, candidate, gains)
+        return Evidence.explained_share(self, before, after, candidate, gains)
 
     def preference(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
         """Return a sort key: plausible candidates, then few parameters, then the catalogue."""
@@ -247,11 +244,8 @@ class ChangeEvidence(ViewEvidence):
 
 def change_evidence(
     reference: ViewEvidence, flights: Sequence[SmoothedFlight], spread: RotorSpread
-) -> tuple[ChangeEvidence, Estimate]:
-    """Return the evidence of changes in `flights` since `reference`, and the start of its search.
-
-    `spread` is the spread of flights of the unchanged vehicle.
-    """
+) -> Evaluation:
+    """Return the evidence of changes in `flights` since `reference`, at the start of its search."""
     start = fit_balance(reference)
     task, count = less_reference_residual(reference, start, flights), len(reference.flights)
     gain, data = rotor_gain(task), task.residuals(start)
@@ -272,9 +266,10 @@ def change_evidence(
     # even one that explains much less than the best (a share of 1 switches that limit off).
     limits = replace(task.limits, rival_share=1.0)
     evidence = ChangeEvidence(
-        task.view, task.model, flights, limits, task.carried, True, with_gain_error, weights, spread
-    )
-    return evidence, Estimate(start)
+        task.view, task.model, flights, task.carried, True, with_gain_error, weights, spread,
+        limits=limits,
+    )  # fmt: skip
+    return evidence.relinearise(Estimate(start))
 
 
 BOUND_SHARE = 0.1
@@ -310,8 +305,8 @@ def search_motion_change(
 ) -> SearchResult | None:
     """Return the candidate that has changed since `reference`; None where none is significant.
 
-    The parameters of the result are total values, not changes. Both sets need at least two flights.
-    Bonferroni's correction counts the number of searched `views`.
+    Its parameters are total values, not changes. Both sets need at least two flights. Bonferroni's
+    correction counts the searched `views`.
     """
     start, limits, space = fit_balance(reference), task.limits, task.space
     sets = [within_flights(one.residuals(start, None)) for one in (reference, task)]

@@ -1,29 +1,18 @@
-"""Fits candidate effects from one estimate of the parameters; defines the result of a search.
-
-A candidate is an effect, or several as one hypothesis (a composite), that may explain the residuals
-of flights. A block is what a linearisation gives: residuals and slopes (`estimate/block.py`).
-"""
+"""Fits candidate effects from one estimate of the parameters; defines the result of a search."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.estimate.block import Block, Estimate, NormalEquations
+from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.composites import acts_through, begin_of, inactive_at
-from suite.diagnose.estimate.gauss_newton import (
-    TINY,
-    chi2_by_group,
-    fit,
-    gauss_newton_step,
-    intervals95,
-)
+from suite.diagnose.estimate.gauss_newton import TINY, gauss_newton_step
 from suite.diagnose.estimate.parameters import Candidate, indices_of
 from suite.diagnose.estimate.permutation import CandidateScore
-from suite.diagnose.evidence.evidence import Evidence
+from suite.diagnose.evidence.evidence import Evaluation, validation_groups
 
 
 @dataclass(frozen=True)
@@ -45,34 +34,23 @@ class NamedEffect:
     """Share of the squared error that the effect explains."""
 
 
-class Evaluation(NamedTuple):
-    """Evidence and one estimate of the parameters, with the block at that estimate."""
-
-    evidence: Evidence
-    at: Estimate
-    block: Block
-
-    @property
-    def equations(self) -> NormalEquations:
-        """The block's normal equations."""
-        return self.block.equations
+def fitted_by(named: Sequence[NamedEffect]) -> list[int]:
+    """Return the places of the named effects' parameters in the vector of all."""
+    return indices_of([name.candidate for name in named])
 
 
-def evaluated_at(
-    linearised: tuple[Evidence, Block], at: Estimate, among: Sequence[Candidate] = ()
-) -> Evaluation:
-    """Return the evaluation at an estimate, with further columns for inactive parameters.
+def with_inactive(current: Evaluation, among: Sequence[Candidate]) -> Evaluation:
+    """Return the evaluation `current` with further columns for inactive parameters.
 
-    A wind acts only through a drag: without a drag the wind's column of slopes is zero. Then a
-    second column is added, computed with a drag of usual size (see `estimate/composites.py`).
-    Some columns become secants (see `with_secants`).
+    Without a drag, a wind's column of slopes is zero. Then a second column is added, computed with
+    a drag of usual size (see `inactive_at`). Some columns become secants (see `with_secants`).
     """
-    evidence, block = linearised
-    block = with_secants(evidence, block, at, among)
+    evidence, at, _ = current
+    block = with_secants(current, among)
     inactive = inactive_at(evidence.space, at.theta, among, block.acts())
     if inactive is not None:
-        indices = inactive.indices
-        active = evidence.linearise(Estimate(inactive.theta, at.free), indices)
+        indices, raised = inactive
+        active = evidence.linearise(Estimate(raised, at.free), indices)
         columns = [active.along.index(index) for index in indices]
         block = replace(
             block,
@@ -83,16 +61,14 @@ def evaluated_at(
     return Evaluation(evidence, at, block)
 
 
-def with_secants(
-    evidence: Evidence, block: Block, at: Estimate, among: Sequence[Candidate]
-) -> Block:
-    """Return `block` with secants in place of tangents where these lead to a worse minimum.
+def with_secants(current: Evaluation, among: Sequence[Candidate]) -> Block:
+    """Return the block with secants in place of tangents where these lead to a worse minimum.
 
-    A delay longer than the time between two rows is such a case: the tangent at no delay leads
-    nowhere near it. So the model is evaluated at the parameter's values `tried`. If the best of
-    them lowers chi-square more than a linear fit along the tangent, the column becomes the secant
-    to this value. A fit's first step then leads there. The arguments are those of `evaluated_at`.
+    A delay longer than the time between two rows is such a case. So the model is evaluated at the
+    parameter's values `tried`. If the best of them lowers chi-square more than a linear fit along
+    the tangent, the column becomes the secant to this value. A fit's first step then leads there.
     """
+    evidence, at, block = current
     entries, start = evidence.space.entries, evidence.space.array("start")
     for index in indices_of(among):
         if not entries[index].tried or at.theta[index] != start[index]:
@@ -121,24 +97,19 @@ def with_secants(
     return block
 
 
-def fit_with(
-    start: Evaluation, others: Sequence[int], candidate: Candidate
-) -> tuple[Estimate, Block]:
-    """Fit `candidate` together with the parameters at `others`, from the estimate of `start`.
-
-    Returned are the fitted estimate and the block there.
-    """
+def fit_with(start: Evaluation, others: Sequence[int], candidate: Candidate) -> Evaluation:
+    """Fit `candidate` together with the parameters at `others`, from the estimate of `start`."""
     evidence, limits, estimate = start.evidence, start.evidence.limits, start.at
     indices = sorted({*others, *candidate.indices})
-    inactive = [index for index in start.equations.repeated() if index in candidate.indices]
+    numbers = start.equations.numbers  # those of inactive parameters have two columns
+    inactive = [n for k, n in enumerate(numbers) if n in numbers[:k] and n in candidate.indices]
     if not candidate.parts or not inactive:
         rounds = limits.bilinear_rounds if acts_through(candidate) else None
-        return fit(evidence, estimate, indices, rounds, start.block, limits)
+        return evidence.fitted(estimate, indices, rounds, start.block)
     # A composite with an inactive part: begin where a linear fit with the second columns leads.
     change, information = linear_change(start, others, candidate)
     theta = begin_of(evidence.space, estimate.theta, candidate, inactive, change, information)
-    begin = Estimate(theta, estimate.free)
-    return fit(evidence, begin, indices, limits.bilinear_rounds, None, limits)
+    return evidence.fitted(Estimate(theta, estimate.free), indices, limits.bilinear_rounds)
 
 
 def linear_change(
@@ -157,15 +128,19 @@ def linear_change(
     return change, information
 
 
-def cross_validated_chi2(
-    evidence: Evidence, block: Block, at: Estimate, indices: Sequence[int]
-) -> np.ndarray:
+def cross_validated_chi2(current: Evaluation, indices: Sequence[int]) -> np.ndarray:
     """Return the squared error (G,) of each group of stretches, fitted to the other groups.
 
-    The fit is linear about the estimate `at`. Fitted are the parameters at `indices`.
+    The fit is linear about the estimate of `current`. Fitted are the parameters at `indices`.
     """
-    equations = block.equations.along_numbers(sorted(indices))
-    return chi2_by_group(equations, at.theta, evidence.space, evidence.groups(block))
+    equations = current.equations.along_numbers(sorted(indices))
+    theta, space, errors = current.at.theta, current.evidence.space, []
+    group = validation_groups(current.block.flight)
+    for number in np.unique(group):
+        inside = group == number
+        change, _ = gauss_newton_step(equations, theta, space, ~inside)
+        errors.append(equations.chi2_at(change)[inside].sum())
+    return np.array(errors, dtype=float)
 
 
 @dataclass(frozen=True)
@@ -196,7 +171,7 @@ class SearchResult:
     @property
     def indices(self) -> list[int]:
         """Places of the named effects' parameters in the vector of all."""
-        return indices_of(self.candidates)
+        return fitted_by(self.named)
 
     @property
     def moved(self) -> np.ndarray:
@@ -205,23 +180,16 @@ class SearchResult:
 
     def half_widths(self) -> np.ndarray:
         """Return the half-widths (K,) of the 95 % intervals of the named effects' parameters."""
-        equations = self.judged.equations.along_numbers(self.indices)
-        return intervals95(equations, self.judged.evidence.flights_differ_p).half_width
+        return self.judged.half_widths(self.indices)
 
     def refitted(self, named: Sequence[NamedEffect]) -> SearchResult:
         """Return this result with only the effects `named`, fitted again."""
-        indices = indices_of([one.candidate for one in named])
+        indices = fitted_by(named)
         theta = self.start.theta.copy()
         theta[indices] = self.estimate.theta[indices]
         begin = Estimate(theta, self.estimate.free) if named else self.start
-        evidence = self.judged.evidence
-        last = judged = Evaluation(evidence, *fit(evidence, begin, indices, limits=evidence.limits))
+        last = judged = self.judged.evidence.fitted(begin, indices)
         if self.judged is not self.last:
             block = self.last.evidence.linearise(judged.at, indices)
             last = Evaluation(self.last.evidence, judged.at, block)
         return replace(self, named=tuple(named), last=last, judged=judged)
-
-    def fitted_anew(self, begin: Estimate, indices: Sequence[int]) -> Estimate:
-        """Return the estimate with only the parameters at `indices` fitted, from `begin`."""
-        evidence = self.judged.evidence
-        return fit(evidence, begin, indices, limits=evidence.limits)[0]

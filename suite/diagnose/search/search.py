@@ -3,8 +3,7 @@
 A candidate is an effect of the catalogue, or several as one hypothesis (a composite). It is named
 if it lowers the error on left-out stretches of the flights by more than the best of all candidates
 does by chance, and if it passes further tests of the evidence. An alternative (`rivals` in the
-code) is another candidate that explains the same flights about as well; the diagnosis prints it as
-`A or B`. All kinds of evidence use this search.
+code) is another candidate that explains the same flights about as well.
 """
 
 from __future__ import annotations
@@ -15,18 +14,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.estimate.block import Block, Estimate
-from suite.diagnose.estimate.gauss_newton import chi2_fall, fit
-from suite.diagnose.estimate.parameters import Candidate, indices_of
+from suite.diagnose.estimate.block import Estimate
+from suite.diagnose.estimate.gauss_newton import chi2_fall
+from suite.diagnose.estimate.parameters import Candidate
 from suite.diagnose.estimate.permutation import CandidateScore
-from suite.diagnose.evidence.evidence import Evidence
+from suite.diagnose.evidence.evidence import Evaluation, Evidence
 from suite.diagnose.search.evaluation import (
-    Evaluation,
     NamedEffect,
     SearchResult,
     cross_validated_chi2,
-    evaluated_at,
     fit_with,
+    fitted_by,
+    with_inactive,
 )
 from suite.diagnose.thresholds import Thresholds
 
@@ -53,21 +52,16 @@ class _Trial(NamedTuple):
 
 
 def search(
-    evidence: Evidence,
-    start: Estimate,
+    begin: Evaluation,
     among: Sequence[Candidate],
     say: Callable[[str], None] = lambda _: None,
     seed: int = 0,
-    known: tuple[Evidence, Block] | None = None,
 ) -> SearchResult:
-    """Return the candidates of `among` that explain the residual of the evidence at `start`.
-
-    `known` is the result of `evidence.estimate_noise(start)`, if it was computed before.
-    """
-    limits = evidence.limits
+    """Return the candidates of `among` that explain the residual of the evaluation `begin`."""
+    limits, start = begin.evidence.limits, begin.at
     task = SearchTask(among, say, seed)
-    current = evaluated_at(known or evidence.estimate_noise(start), start, among)
-    first = _scores(task, current, [], among)
+    current = with_inactive(begin, among)
+    first = current.evidence.scores(current, [], among, seed)
     named: list[NamedEffect] = []
     # Forward selection: add the best candidate, then drop names that it has made unnecessary.
     for _ in range(2 * limits.most_names):  # a name that was dropped may be named again
@@ -80,24 +74,21 @@ def search(
         name, at = best
         new_names = _one_name_per_effect(name)
         known = current.evidence.estimate_noise(at)
-        named, at = _drop_unneeded(task, known[0], at, [*named, *new_names], len(new_names) == 1)
-        current = evaluated_at(known if at is best[1] else known[0].relinearise(at), at, among)
+        named, at = _drop_unneeded(
+            task, known.evidence, at, [*named, *new_names], len(new_names) == 1
+        )
+        current = with_inactive(known if at is best[1] else known.evidence.relinearise(at), among)
     named, at = _settle(task, current.evidence, current.at, named)
     last = judged = _final_fit(current.evidence, at, named)
     # If even the best model leaves more than noise, decide again with the residual as noise.
-    misfit = last.evidence.misfit_as_noise(last.at, last.block)
+    misfit = last.evidence.misfit_as_noise(last)
     if misfit is not None:
         say("the model leaves more than noise: names are judged by what it leaves")
-        named, at = _settle(task, misfit[0], last.at, named)
-        judged = _final_fit(misfit[0], at, named)
-        block = last.evidence.linearise(judged.at, _indices(named))
+        named, at = _settle(task, misfit, last.at, named)
+        judged = _final_fit(misfit, at, named)
+        block = last.evidence.linearise(judged.at, fitted_by(named))
         last = Evaluation(last.evidence, judged.at, block)
     return SearchResult(tuple(named), start, last, judged, first)
-
-
-def _indices(named: Sequence[NamedEffect]) -> list[int]:
-    """Return the places of the named effects' parameters in the vector of all."""
-    return indices_of([name.candidate for name in named])
 
 
 def _one_name_per_effect(name: NamedEffect) -> list[NamedEffect]:
@@ -105,20 +96,10 @@ def _one_name_per_effect(name: NamedEffect) -> list[NamedEffect]:
     return [replace(name, candidate=single) for single in name.candidate.singles]
 
 
-def _scores(
-    task: SearchTask, current: Evaluation, others: Sequence[int], among: Sequence[Candidate]
-) -> list[CandidateScore]:
-    """Return the scores of `among`, each fitted in addition to the parameters at `others`."""
-    return current.evidence.scores(
-        current.block, current.equations, current.at.theta, others, among, task.seed
-    )
-
-
 def _final_fit(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Evaluation:
     """Fit all names with many steps, as some effects saturate; without names keep the estimate."""
-    indices, limits = _indices(named), evidence.limits
-    rounds = limits.last_rounds if indices else 0
-    return Evaluation(evidence, *fit(evidence, at, indices, rounds, None, limits))
+    indices = fitted_by(named)
+    return evidence.fitted(at, indices, evidence.limits.last_rounds if indices else 0)
 
 
 def _best_candidate(
@@ -129,23 +110,18 @@ def _best_candidate(
     known: Sequence[CandidateScore] | None = None,
     tested: Candidate | None = None,
 ) -> tuple[NamedEffect, Estimate] | None:
-    """Return the candidate that explains most in addition to `named`, and the fit with it.
+    """Return the candidate of `among` that explains most in addition to `named`, and its fit.
 
-    None where no candidate passes all tests.
-
-    Args:
-        task: inputs of the search.
-        current: evaluation with the present names, without the candidate.
-        named: names that are fitted together with every candidate.
-        among: the candidates.
-        known: scores of the candidates, if they were computed before.
-        tested: candidate of a name that was taken out of `current`, to be tested against the other
-            candidates. If given, all that could replace it are fitted, significant or not.
+    None where no candidate passes all tests. `current` is the evaluation with the present names.
+    `known` are the scores of the candidates, if they were computed before. `tested` is a candidate
+    that was taken out of `current`, to be tested against the others. If given, all that could
+    replace it are fitted, significant or not.
     """
     evidence, limits, space = current.evidence, current.evidence.limits, current.evidence.space
-    others = _indices(named)
+    others = fitted_by(named)
     unnamed = [c for c in among if not set(c.indices) & set(others)]
-    scores = {s.candidate: s for s in known or _scores(task, current, others, unnamed)}
+    known = known or evidence.scores(current, others, unnamed, task.seed)
+    scores = {score.candidate: score for score in known}
     # Choose the candidates that are worth a fit: those with good scores ...
     shortlist = list(scores)
     if tested is None:
@@ -165,14 +141,13 @@ def _best_candidate(
         single = [c for c in shortlist if not c.parts][: limits.short_list]
         shortlist = [c for c in shortlist if c.parts or c in single]
     # Fit each of them, and keep those that pass the tests of the evidence.
-    errors_before = cross_validated_chi2(evidence, current.block, current.at, others)
+    errors_before = cross_validated_chi2(current, others)
     chi2_before, trials = float(current.equations.chi2.sum()), list[_Trial]()
     for candidate in shortlist:
-        at, block = fit_with(current, others, candidate)
-        indices = [*others, *candidate.indices]
-        gains = errors_before - cross_validated_chi2(evidence, block, at, indices)
-        share = evidence.explained_share(current.block, at, block, candidate, gains)
-        chi2 = float((block.residual**2).sum())
+        fitted = fit_with(current, others, candidate)
+        gains = errors_before - cross_validated_chi2(fitted, [*others, *candidate.indices])
+        share = evidence.explained_share(current.block, fitted, candidate, gains)
+        chi2 = float((fitted.block.residual**2).sum())
         outcome = f"lowers the squared error by {chi2_before - chi2:,.0f} times the noise variance"
         if share is None:
             outcome = "rejected: flights disagree, or a value is implausible or explains too little"
@@ -182,7 +157,7 @@ def _best_candidate(
                 candidate, scores[candidate].p_value, scores[candidate].gain,
                 gains=tuple(gains.tolist()), share=share,
             )  # fmt: skip
-            trials.append(_Trial(chi2 + len(candidate.indices), name, at))
+            trials.append(_Trial(chi2 + len(candidate.indices), name, fitted.at))
     costs = {trial.name.candidate: trial.cost for trial in trials}
     trials = [trial for trial in trials if needs_all_parts(costs, trial.name.candidate, limits)]
     if not trials:
@@ -218,14 +193,14 @@ def _replace_or_drop(
     """Test the name at `place` of `named` as if it were added last, against the candidates `among`.
 
     The best candidate takes its place; that may be the same effect. If none passes, the name is
-    dropped. Returned are the new names and the fit with them.
+    dropped. Returned are the new names and their fit.
     """
     tested, theta = named[place].candidate, at.theta.copy()
     theta[list(tested.indices)] = evidence.space.array("start")[list(tested.indices)]
     without = Estimate(theta, at.free)
     others = [*named[:place], *named[place + 1 :]]
     among = [c for c in among if tested not in c.parts]
-    current = evaluated_at(evidence.relinearise(without), without, among)
+    current = with_inactive(evidence.relinearise(without), among)
     best = _best_candidate(task, current, others, among, None, tested)
     if best is None:
         return others, without
@@ -253,15 +228,12 @@ def _drop_unneeded(
 def _settle(
     task: SearchTask, evidence: Evidence, at: Estimate, named: list[NamedEffect]
 ) -> tuple[list[NamedEffect], Estimate]:
-    """Refit all names together and test each against all candidates, until no name changes.
-
-    Returned are the names and the fit with them.
-    """
+    """Refit all names and test each against all candidates, until none changes; return both."""
     for _ in range(evidence.limits.settle_rounds):
         before = [name.candidate for name in named]
         if not before:
             break
-        at, _ = fit(evidence, at, indices_of(before), limits=evidence.limits)
+        at = evidence.fitted(at, fitted_by(named)).at
         place = 0
         while place < len(named):
             count = len(named)
@@ -292,8 +264,7 @@ def needs_all_parts(
 ) -> bool:
     """Return whether no single part of a composite explains about as much as the composite.
 
-    `costs` holds chi-square plus the number of parameters, by fitted candidate. True for a
-    candidate that is not a composite.
+    `costs` holds chi-square plus the number of parameters, by fitted candidate.
     """
     limit = costs[candidate] + limits.rival_chi2
     return all(limit < costs.get(part, np.inf) for part in candidate.parts)

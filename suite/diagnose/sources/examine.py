@@ -1,10 +1,7 @@
 """The steps of a diagnosis for one source of evidence (rollouts, force or torque).
 
-A source compares flights with the model in one way (`source.py`). The steps are search, test on
-held-out flights, test of relevance, and analysis of the remaining error. `diagnose.py` calls
-`examine` for each source, and then `one_cause` on all findings.
-
-The argument `found` is always the result of a search: named effects and their fitted parameters.
+The steps are search, test on held-out flights, test of relevance, and analysis of the remaining
+error. The argument `found` is always the result of a search: named effects and their fit.
 """
 
 from __future__ import annotations
@@ -16,7 +13,7 @@ import numpy as np
 
 from eval.effects import EFFECTS
 from suite.diagnose.estimate.block import Estimate
-from suite.diagnose.estimate.gauss_newton import TINY, fit, intervals95
+from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.estimate.parameters import Candidate, effects_in, indices_of
 from suite.diagnose.search.evaluation import NamedEffect, SearchResult
 from suite.diagnose.sources.source import TOO_SMALL, Finding, Source
@@ -161,7 +158,10 @@ def confirmed(
         while lost:
             withdrawn += [candidate.label for candidate in lost]
             found = found.refitted([one for one in found.named if one.candidate not in lost])
-            lost = _without_influence(found)
+            equations = found.judged.equations.along_numbers(found.indices)
+            information = np.einsum("wkk->k", equations.hessian)
+            informed = {i for i, v in zip(found.indices, information, strict=True) if v > 0.0}
+            lost = [one for one in found.candidates if not informed & set(one.indices)]
         after = source.gap(found, found.estimate.theta)
     return found, after, {}, withdrawn
 
@@ -211,18 +211,8 @@ def control(source: Source, found: SearchResult) -> tuple[str, Gap] | None:
     wrong = next((candidate for candidate in single if candidate.name not in excluded), None)
     if wrong is None:
         return None
-    theta = found.fitted_anew(found.start, list(wrong.indices)).theta
-    return wrong.label, source.gap(found, theta)
-
-
-def _without_influence(found: SearchResult) -> list[Candidate]:
-    """Return the named effects on which these flights have no information.
-
-    An example is a wind without a drag.
-    """
-    information = np.einsum("wkk->k", found.judged.equations.along_numbers(found.indices).hessian)
-    informed = {i for i, value in zip(found.indices, information, strict=True) if value > 0.0}
-    return [candidate for candidate in found.candidates if not informed & set(candidate.indices)]
+    fitted = found.judged.evidence.fitted(found.start, list(wrong.indices))
+    return wrong.label, source.gap(found, fitted.at.theta)
 
 
 def _without_each(source: Source, found: SearchResult) -> dict[str, Gap]:
@@ -235,19 +225,16 @@ def _without_each(source: Source, found: SearchResult) -> dict[str, Gap]:
             theta = found.estimate.theta.copy()
             theta[list(one.indices)] = start[list(one.indices)]
             without = Estimate(theta, found.estimate.free)
-            theta = found.fitted_anew(without, indices_of(others)).theta
+            theta = found.judged.evidence.fitted(without, indices_of(others)).at.theta
         gaps[one.label] = source.gap(found, theta)
     return gaps
 
 
 def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate, str]]:
-    """Return the named effects of `found` that the evidence of `by` contradicts.
+    """Return the named effects of `found` that the evidence of `by` contradicts, and both values.
 
     Each effect is fitted to that evidence, together with the effects that `by` names. It is
     contradicted if a parameter differs significantly from its value in `found`.
-
-    Returns:
-        For each such effect, its candidate and a text with both values.
     """
     refused = []
     widths = dict(zip(found.indices, found.half_widths(), strict=True))
@@ -258,11 +245,10 @@ def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate,
         if not evidence.linearise(by.estimate, indices).acts().any() or candidate in by.candidates:
             continue
         fitted = sorted({*by.indices, *indices})
-        best, block = fit(evidence, by.estimate, fitted, limits=evidence.limits)
-        equations = block.equations.along_numbers(fitted)
-        half = intervals95(equations, evidence.flights_differ_p).half_width
+        best = evidence.fitted(by.estimate, fitted)
+        half = best.half_widths(fitted)
         for index in indices:
-            value, other = found.estimate.theta[index], best.theta[index]
+            value, other = found.estimate.theta[index], best.at.theta[index]
             other_half = float(half[fitted.index(index)])
             if abs(value - other) > CONTRADICTION * (widths[index] + other_half):
                 words = f"{value:.3g} here, {other:.3g} ± {other_half:.2g} there"

@@ -1,8 +1,7 @@
 """The source of evidence `whole`: whole flights, simulated in stretches of 1 s (rollouts).
 
-Its residuals are the differences between measured and simulated states. `FlightWindows` holds the
-stretches, here also called windows. W is their number, N the number of rows of each, and 19 the
-number of channels (position, attitude, velocity, rates, accelerometer, rotor speeds).
+Arrays have W windows (stretches), N rows of each, and 19 channels (position, attitude, velocity,
+rates, accelerometer, rotor speeds).
 """
 
 from __future__ import annotations
@@ -31,15 +30,16 @@ from suite.diagnose.data.windows import (
 from suite.diagnose.estimate.gauss_newton import TINY, Z95, gauss_newton_step
 from suite.diagnose.estimate.parameters import Candidate
 from suite.diagnose.estimate.permutation import folds_of
+from suite.diagnose.evidence.evidence import Evaluation
 from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.rollouts import (
     RolloutEvidence,
     RolloutModel,
     rollout_evidence,
-    true_starts,
+    start_estimate,
 )
 from suite.diagnose.evidence.views import ViewEvidence
-from suite.diagnose.search.evaluation import Evaluation, SearchResult
+from suite.diagnose.search.evaluation import SearchResult
 from suite.diagnose.sources.source import (
     FITTED,
     GIVEN,
@@ -175,11 +175,11 @@ class RolloutSource(Source):
         """
         model, estimate, indices = self.model, found.estimate, found.indices
         windows = of_rollouts(found.last).trusted
-        slope = model.linearise(estimate.theta, estimate.free, windows, indices).slope
+        slope = model.linearise(estimate, windows, indices).slope
         model_error = np.zeros(len(indices))
         if self.coarser is not None and len(indices):
             directions = [*indices, *model.starts]
-            linear = model.linearise(estimate.theta, estimate.free, self.coarser, directions)
+            linear = model.linearise(estimate, self.coarser, directions)
             options = (found.last.evidence.limits, of_rollouts(found.last).noise, indices)
             equations = rollout_evidence(model, self.coarser, linear, *options)[1].equations
             change, _ = gauss_newton_step(equations, estimate.theta, model.space)
@@ -259,7 +259,7 @@ class RolloutSource(Source):
             return None
         voltage = all(log.voltage is not None for log in self.logs)
         model = ForceModel(self.vehicle, self.space, voltage)
-        return residual_swing(ViewEvidence(FORCE, model, flights, self.limits), theta)
+        return residual_swing(ViewEvidence(FORCE, model, flights, limits=self.limits), theta)
 
     def explained_by_steps(self, found: SearchResult) -> bool:
         """Return whether MuJoCo's Euler steps explain a named delay between pose and rates.
@@ -297,8 +297,8 @@ class RolloutSource(Source):
         correction = start_correction(self.model, best, windows, noise, self.limits)
 
         def errors(theta: np.ndarray) -> np.ndarray:
-            start = true_starts(self.model, theta, windows) + correction
-            return self.model.residual(theta, start, windows)
+            at = start_estimate(self.model, windows, theta)
+            return self.model.residual(at._replace(free=at.free + correction), windows)
 
         named = {FITTED: errors(best)} if found.named else {}
         return windows, {GIVEN: errors(self.start.theta), **named}
@@ -347,9 +347,8 @@ def structure_where(
 ) -> str | None:
     """Return in words the quantity that a structured residual depends on; None if it is noise.
 
-    The energy of slow errors and its expectation are from `RolloutEvidence.slow_errors`. With
-    measured rotor speeds as the input, or commands of which the log lacks some, the noise is less
-    certain. The thresholds are then higher.
+    `slow_errors` are from `RolloutEvidence.slow_errors`. With measured rotor speeds as the input,
+    or commands of which the log lacks some, the noise is less certain, and the thresholds higher.
     """
     slow, expected = slow_errors
     shape = residual.shapes[0] if residual.shapes else None
@@ -373,10 +372,7 @@ def structure_where(
 
 
 def _worst_channels(slow: np.ndarray, expected: np.ndarray) -> str:
-    """Return in words the three channels whose slow errors exceed the expected ones most.
-
-    `slow` and `expected` (12,) are energies of the errors by channel.
-    """
+    """Return in words the three channels whose `slow` errors (12,) exceed the `expected` most."""
     energy = np.maximum(slow / np.maximum(expected, 1e-9) - 1.0, 0.0)
     worst = [k for k in np.argsort(-energy)[:3] if energy[k] > 0]
     # Each group of channels has three axes.
@@ -384,10 +380,7 @@ def _worst_channels(slow: np.ndarray, expected: np.ndarray) -> str:
 
 
 def pose_delays(found: SearchResult) -> dict[str, float]:
-    """Return the delay [s] of the logged pose that each named effect describes, by its name.
-
-    Only effects that describe such a delay have an entry.
-    """
+    """Return the delay [s] of the logged pose by name, of those named effects that describe one."""
     values = found.judged.evidence.space.effects(found.estimate.theta)
     named = dict.fromkeys(candidate.name for candidate in found.candidates)
     return {name: float(pose_delay({name: values[name]})) for name in named if EFFECTS[name].late}

@@ -1,8 +1,7 @@
 """Makes the source of evidence `whole`, which compares simulated stretches of 1 s with flights.
 
-Such a stretch is a rollout: it starts from a measured state, and commands or rotor speeds drive it.
-Some stretches are fitted, the others held out. `FlightWindows` holds the stretches, here also
-called windows; W is their number.
+Such a stretch (a window; W is their number) is a rollout: it starts from a measured state, and
+commands or rotor speeds drive it. Some stretches are fitted, the others held out.
 """
 
 from __future__ import annotations
@@ -16,12 +15,14 @@ from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.colour import measured_noise
 from suite.diagnose.data.hold_out import choose_held_out
+from suite.diagnose.data.noise import Linearisation
 from suite.diagnose.data.sampling import own_spacing_s
 from suite.diagnose.data.steps import has_firmware_loop, rows_show_torque
-from suite.diagnose.data.whitening import Linearisation, block_of, make_whitening
+from suite.diagnose.data.whitening import block_of, make_whitening
 from suite.diagnose.data.windows import LENGTH_S, cut, take
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.parameters import candidates, make_space
+from suite.diagnose.evidence.evidence import Evaluation
 from suite.diagnose.evidence.rollouts import (
     RolloutModel,
     is_hopeless,
@@ -72,13 +73,20 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     # Choose the input of the model: commands or measured rotor speeds.
     integrator = integrator_of(logs, given.integrator)
     rotor_input, warnings = rotors_are_input(logs, given.drive, vehicle), list[str]()
-    if given.drive == "auto" and not rotor_input:
-        rotor_input = _needs_rotor_input(logs, vehicle, limits)
-        if rotor_input:
-            warnings.append(
-                "the nominal rate loop does not reproduce the measured rotor speeds, so these are "
-                "the model's input"
+    is_open = given.drive == "auto" and not rotor_input
+    if is_open and flown_by_other_controller(logs, vehicle, limits):
+        without = [log.name for log in logs if log.rotor_speed is None]
+        if without:
+            raise ValueError(
+                "the nominal rate loop does not reproduce the rotor speeds that some flights "
+                f"have, and {', '.join(without)} has none as an input: diagnose the other flights "
+                "without it, or use the commands of all with --drive commands"
             )
+        rotor_input = True
+        warnings.append(
+            "the nominal rate loop does not reproduce the measured rotor speeds, so these are the "
+            "model's input"
+        )
     # Cut the flights into stretches, and simulate each with the given vehicle.
     windows_of = partial(cut, logs, vehicle, rotor_input, limits=limits, integrator=integrator)
     windows, notes = windows_of()
@@ -94,7 +102,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     voltage = all(log.voltage is not None for log in logs)
     model = RolloutModel(vehicle, make_space(vehicle), rotor_input, voltage, integrator)
     start = start_estimate(model, windows)
-    linear = model.linearise(start.theta, start.free, windows, None)
+    linear = model.linearise(start, windows)
     is_finite = _finite(linear, limits)
     if not is_finite.all():
         diverged = int((~is_finite).sum())
@@ -106,7 +114,13 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     all_windows, windows, linear = windows, take(windows, is_finite), take(linear, is_finite)
     if coarser is not None:
         limits = with_model_error(model, start.theta, windows, linear, coarser, limits)
-    coarser_share = 0.0 if coarser is None or not rotor_input else _coarser_share(logs, vehicle)
+    # See `RolloutSource.sizes` for these shares.
+    dense = all(
+        log.rotor_speed is None
+        or rows_show_torque(vehicle, own_spacing_s(log.time_s, log.rotor_speed))
+        for log in logs
+    )
+    coarser_share = 0.0 if coarser is None or not rotor_input else (0.5 if dense else 2.0)
     if not rotor_input and commands_are_slow(logs, limits):
         fewer = take(windows_of(fewer_commands=all_windows)[0], is_finite)
         held = with_held_commands(model, start.theta, windows, linear, fewer, limits)
@@ -117,7 +131,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
         given.say("no effect brings rollouts of 1 s near these flights: using force and torque")
         return None
     # Choose which stretches are held out, by their information on each parameter.
-    noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
+    noise = measured_noise(linear, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)
     informed = (block_of(whitening, linear, range(model.size), windows).slope ** 2).sum(axis=1)
     is_fitted, names = choose_held_out(logs, windows.flight, windows.start_s, informed, limits)
@@ -137,14 +151,14 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     held_flights = np.unique(not_fitted.flight).tolist()
     held, _ = windows_of(stride_s=limits.gap_stride_s, only=held_flights, since_s=since_s)
     assert held is not None
-    begin = start_estimate(model, held)
-    flies = _finite(model.linearise(begin.theta, begin.free, held, []), limits)
+    flies = _finite(model.linearise(start_estimate(model, held), held, []), limits)
     if not flies.all():
         held = take(held, flies)
         warnings.append(f"{(~flies).sum()} held-out stretches left out: the model diverges there")
     # Effects on a signal that the logs lack, or that the model does not use, are not candidates.
     signals = {"acc_b"} if any(log.acc_b is not None for log in logs) else set()
     single = candidates(model.space, voltage, signals if rotor_input else signals | {"command"})
+    evidence, block = rollout_evidence(model, fitted, take(linear, is_fitted), limits)
     source = RolloutSource(
         name="whole",
         about="whole flights, in rollouts of a second",
@@ -152,8 +166,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
         unit="times the noise",
         measure=MEASURE,
         horizon_s=LENGTH_S,
-        weighed=rollout_evidence(model, fitted, take(linear, is_fitted), limits),
-        start=start_estimate(model, fitted),
+        begin=Evaluation(evidence, start_estimate(model, fitted), block),
         candidates=[*single, *composites(single)],
         limits=limits,
         small_explains=True,
@@ -174,42 +187,14 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
 def can_fly(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
     """Return whether rollouts of these flights can be simulated.
 
-    The logs must have all signals of the state. They must also have measured rotor speeds, or
-    commands to a rate loop without integrators and filters: these have an unknown state.
+    The logs need all signals of the state, and measured rotor speeds or commands to a rate loop
+    without integrators and filters (whose state is unknown).
     """
     return not any(
         log.partial
         or (log.rotor_speed is None and (log.rate_cmd_b is None or has_firmware_loop(vehicle)))
         for log in logs
     )
-
-
-def _coarser_share(logs: Sequence[FlightLog], vehicle: Vehicle) -> float:
-    """Return `coarser_share` of a source driven by rotor speeds; see `RolloutSource.sizes`."""
-    rows_are_dense = all(
-        log.rotor_speed is None
-        or rows_show_torque(vehicle, own_spacing_s(log.time_s, log.rotor_speed))
-        for log in logs
-    )
-    return 0.5 if rows_are_dense else 2.0
-
-
-def _needs_rotor_input(logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds) -> bool:
-    """Return whether measured rotor speeds must be the input, because another controller flew.
-
-    Raises:
-        ValueError: if they must be, and some flights have no rotor speeds.
-    """
-    if not flown_by_other_controller(logs, vehicle, limits):
-        return False
-    without = [log.name for log in logs if log.rotor_speed is None]
-    if without:
-        raise ValueError(
-            "the nominal rate loop does not reproduce the rotor speeds that some flights have, and "
-            f"{', '.join(without)} has none as an input: diagnose the other flights without it, or "
-            "use the commands of all with --drive commands"
-        )
-    return True
 
 
 def _check_count(count: int, limits: Thresholds) -> None:

@@ -3,8 +3,7 @@
 A source belongs to one view (part of the dynamics): whole flights (rollouts), forces or torques. It
 has the flights that are fitted and those that are held out to test the result. A new source is one
 subclass of `Source` and one function that makes it from flights, with an entry in `SOURCES`
-(`suite/diagnose/diagnose.py`). Search, held-out test, relevance, verdict, JSON and report use only
-this interface.
+(`suite/diagnose/diagnose.py`).
 
 Arrays of parameters have P entries: all parameters of all effects in the catalogue.
 """
@@ -20,9 +19,9 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.estimate.block import Block, Estimate
+from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
-from suite.diagnose.evidence.evidence import Evidence
+from suite.diagnose.evidence.evidence import Evaluation
 from suite.diagnose.search.evaluation import NamedEffect, SearchResult
 from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import Thresholds
@@ -103,11 +102,9 @@ class Source(ABC):
     """For people: definition of the gap."""
     horizon_s: float
     """Length of the windows over which the gap is measured [s]."""
-    weighed: tuple[Evidence, Block]
-    """The fitted flights with the weights of their residuals, and the linearisation of these
-    residuals, both at the start of the search."""
-    start: Estimate
-    """The vehicle file's parameters, from which the search starts."""
+    begin: Evaluation
+    """The fitted flights with their noise, evaluated along all parameters at the vehicle file's
+    parameters, from which the search starts."""
     candidates: Sequence[Candidate]
     """Effects that the search tries."""
     limits: Thresholds
@@ -123,7 +120,12 @@ class Source(ABC):
     @property
     def space(self) -> ParameterSpace:
         """The catalogue's parameters."""
-        return self.weighed[0].space
+        return self.begin.evidence.space
+
+    @property
+    def start(self) -> Estimate:
+        """The parameters from which the search starts."""
+        return self.begin.at
 
     @property
     def window(self) -> str:
@@ -140,7 +142,7 @@ class Source(ABC):
 
     def search(self, say: Callable[[str], None], seed: int) -> SearchResult:
         """Search for the effects that explain the fitted flights."""
-        return search(self.weighed[0], self.start, self.candidates, say, seed, self.weighed)
+        return search(self.begin, self.candidates, say, seed)
 
     def is_worse(self, before: Gap, after: Gap) -> bool:
         """Return whether held-out flights contradict effects that change the gap to `after`.
@@ -187,13 +189,9 @@ def sizes_by_effect(
     """Return the size of each named effect and the upper end of its 95 % interval, by name.
 
     The upper end is zero if the model's own error may be the whole effect (see `beyond_error`).
-
-    Args:
-        found: result of a search with K named parameters.
-        slope: (..., K) derivatives of the flights' errors with respect to these parameters.
-        size_of: function from a change of the flights' errors to its size.
-        model_error: (K,) changes of the parameters that the model's own numerical error may cause.
-            They are subtracted before the upper end is computed.
+    `slope` (..., K) are derivatives of the flights' errors by the K named parameters, and `size_of`
+    takes a change of these errors to its size. The model's own numerical error may change the
+    parameters by `model_error` (K,); this is subtracted before the upper end is computed.
     """
     entries, width, change = found.last.evidence.space.entries, found.half_widths(), found.moved
     certain = np.sign(change) * np.maximum(np.abs(change) - model_error, 0.0)

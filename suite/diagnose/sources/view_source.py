@@ -1,9 +1,8 @@
 """The sources of evidence `force` and `torque`, which compare mean accelerations with the model.
 
-Each is a view: one part of the dynamics, with all other signals as measured. Accelerations are
-averaged over short windows; M is the number of these means. A black box, a ridge regression without
-physics, is fitted to the same flights. It estimates how much of the error any model could explain,
-and whether structure remains beyond the named effects.
+Accelerations are averaged over short windows; M is the number of these means. A black box, a ridge
+regression without physics, is fitted to the same flights. It estimates how much of the error any
+model could explain, and whether structure remains beyond the named effects.
 """
 
 from __future__ import annotations
@@ -73,10 +72,7 @@ class ViewSource(Source):
         return round(self.limits.view_block_s / self.view.spacing_s)
 
     def _within(self, residual: np.ndarray, flight: np.ndarray) -> np.ndarray:
-        """Return the `residual` (M, 3) without each flight's mean (its trim).
-
-        A mean is no error within the flight. `flight` (M,) is the number of each row's flight.
-        """
+        """Return the `residual` (M, 3) without each flight's mean (its trim)."""
         return centred(residual, flight)
 
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
@@ -110,7 +106,8 @@ class ViewSource(Source):
             swing = residual_swing(self.all_flights, found.estimate.theta)
             force = self._unexplained_force(found.estimate.theta, gaps[1], seed)
             if force and not structured:
-                structured, beyond = True, max(beyond, share_of_energy(*gaps, self._noise_power))
+                energy, left = (max(gap.energy.mean() - self._noise_power, 0.0) for gap in gaps)
+                structured, beyond = True, max(beyond, float(left / max(energy, left, TINY)))
                 where = (
                     f"a force of {force:.2g} m/s^2 beyond the noise, which no logged signal "
                     "predicts"
@@ -156,7 +153,6 @@ class ViewSource(Source):
         assert isinstance(evidence, ViewEvidence)
         before = self.held.residuals(found.start.theta)
         after = self.held.residuals(found.estimate.theta)
-        spread = self._repeatability(found)
         # Fit one black box to the error of the given vehicle, and a second one to the error that
         # remains with the named effects. Both are tested on the held-out flights.
         inputs, held_inputs = (
@@ -178,13 +174,8 @@ class ViewSource(Source):
             )
         )
         variance = (centred(before.residual, before.flight) ** 2).mean(axis=0)
-        return Shares(closed, np.maximum(explainable, closed), with_both - closed, variance, spread)
-
-    def _repeatability(self, found: SearchResult) -> np.ndarray:
-        """Return the standard deviation (3,) of the flights' means; NaN with too few flights."""
-        evidence = found.last.evidence
-        assert isinstance(evidence, ViewEvidence)
-        return np.where(np.isfinite(evidence.repeatability), evidence.repeatability, np.nan)
+        beyond, spread = with_both - closed, evidence.repeatability
+        return Shares(closed, np.maximum(explainable, closed), beyond, variance, spread)
 
     def series(self, found: SearchResult) -> Series:
         """Return the stretch of a held-out flight that the named effects change most.
@@ -207,9 +198,8 @@ class ViewSource(Source):
         measured = (before.value + before.residual)[rows, axis][shown]
         lines = {GIVEN: before.value[rows, axis][shown]}
         if found.named:
-            named = measured - after.residual[rows, axis][shown]
-            lines[FITTED] = named
-        quantity = QUANTITIES.get(self.name, self.name).capitalize()
+            lines[FITTED] = measured - after.residual[rows, axis][shown]
+        quantity = QUANTITIES[self.name].capitalize()
         return Series(
             middle[shown] - middle[shown][0],
             measured,
@@ -231,7 +221,7 @@ class Shares(NamedTuple):
     variance: np.ndarray
     """Variance of the error of the given vehicle [the view's unit squared]."""
     repeatability: np.ndarray
-    """Standard deviation of the flights' means [the view's unit]; NaN with too few flights."""
+    """Standard deviation of the flights' means [the view's unit]; infinite with too few flights."""
 
     def total(self, by_axis: np.ndarray) -> float:
         """Return the share of all axes together from the shares by axis (3,); at least 0."""
@@ -239,24 +229,10 @@ class Shares(NamedTuple):
 
     def along(self, axis: int) -> dict[str, float | None]:
         """Return the entries of diagnosis.json for one axis."""
-        values = {
-            "repeatability": self.repeatability,
-            "closed": self.closed,
-            "explainable": self.explainable,
+        shares = {
+            key: getattr(self, key)[axis] for key in ("repeatability", "closed", "explainable")
         }
-        return {
-            key: float(shares[axis]) if np.isfinite(shares[axis]) else None
-            for key, shares in values.items()
-        }
-
-
-def share_of_energy(before: Gap, after: Gap, noise_power: float) -> float:
-    """Return the ratio of the mean squared errors after and before naming, minus the noise.
-
-    `noise_power` is the mean square of the noise, which is subtracted from both errors.
-    """
-    remaining = max(float(after.energy.mean()) - noise_power, 0.0)
-    return remaining / max(float(before.energy.mean()) - noise_power, remaining, TINY)
+        return {key: float(share) if np.isfinite(share) else None for key, share in shares.items()}
 
 
 RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
@@ -271,9 +247,8 @@ def inputs_of(flight: SmoothedFlight) -> np.ndarray:
 def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> np.ndarray:
     """Return the weights (K, 3) with which `inputs` (M, K) explain `error` (M, 3) best.
 
-    They are those of a ridge regression, chosen in cross-validation over flights. Each flight's
-    mean (its trim) is subtracted from inputs and error. `flight` (M,) is the number of each row's
-    flight. A single flight is split into thirds.
+    They are those of a ridge regression, chosen in cross-validation over flights, of which each
+    flight's mean (its trim) is no part. A single flight is split into thirds.
     """
     groups = validation_groups(flight)
     inputs, error = centred(inputs, flight), centred(error, flight)
@@ -301,10 +276,7 @@ def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> 
 
 
 def closed_share(before: np.ndarray, after: np.ndarray, flight: np.ndarray) -> np.ndarray:
-    """Return the share (3,) of the variance within flights that `before` has and `after` lacks.
-
-    Both are errors (M, 3); `flight` (M,) is the number of each row's flight.
-    """
+    """Return the share (3,) of the variance within flights that `before` has and `after` lacks."""
     power = (centred(before, flight) ** 2).sum(axis=0)
     return 1.0 - (centred(after, flight) ** 2).sum(axis=0) / np.maximum(power, TINY)
 

@@ -1,29 +1,38 @@
 """Makes the sources of evidence `force` and `torque` from flights.
 
 Each belongs to one view (part of the dynamics), and compares mean accelerations of the flights with
-the vehicle file. If reference flights of the same vehicle are given, they search for a change since
-the reference flights instead.
+the vehicle file. If reference flights (earlier flights of the same vehicle) are given, they search
+for a change since these instead. The means of whole flights are compared first. If no mean has
+changed, the fallback searches for a change that shows only in motion.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from eval.effects import EFFECTS
-from suite.diagnose.data.flights import ready
+from suite.diagnose.data.flights import ViewFlights, ready
 from suite.diagnose.data.hold_out import choose_held_out, parted
 from suite.diagnose.data.inertial import UNSEEN, is_inertial
-from suite.diagnose.data.view import View
 from suite.diagnose.estimate.composites import composites
-from suite.diagnose.estimate.parameters import candidates, make_space
-from suite.diagnose.evidence.moments import ForceModel
+from suite.diagnose.estimate.gauss_newton import TINY
+from suite.diagnose.estimate.parameters import Candidate, candidates, make_space
+from suite.diagnose.evidence.moments import ForceModel, means_of
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
-from suite.diagnose.sources.change import references_of, since_reference, spread_words
-from suite.diagnose.sources.source import DiagnosisInput, SourceSet
-from suite.diagnose.sources.view_source import ViewSource
+from suite.diagnose.search.change import (
+    RotorSpread,
+    change_evidence,
+    less_reference_residual,
+    rotor_spread,
+    search_motion_change,
+)
+from suite.diagnose.search.evaluation import SearchResult
+from suite.diagnose.sources.source import FITTED, GIVEN, DiagnosisInput, Series, SourceSet
+from suite.diagnose.sources.view_source import NO_AGREEMENT, QUANTITIES, Shares, ViewSource
 from suite.diagnose.verdict.actuators import find_rotor_lag
 
 BASE_S, ROW_S = 5.0, 4e-4
@@ -31,6 +40,10 @@ BASE_S, ROW_S = 5.0, 4e-4
 MEASURE = (
     "RMS over the axes of the residual of {about} on held-out flights [{unit}], both "
     "sides smoothed over {width:g} s, without each flight's constant offset"
+)
+MEANS_MEASURE = (
+    "RMS over the axes of the residual of {about} on held-out flights [{unit}], as the mean of "
+    "each flight less the mean of the reference flights"
 )
 UNTESTED = "a change that depends on the motion, such as a drag, was not tested: {}"
 """Warning if only constant changes since reference flights are tested."""
@@ -56,7 +69,7 @@ def by_views(given: DiagnosisInput) -> SourceSet:
         limits = replace(limits, least_view_share=limits.least_inertial_share)
         not_shown = [f"without a position these flights do not show {what}" for what in UNSEEN]
     evidence = {
-        view.name: ViewEvidence(view, model, flights.smoothed[view.name], limits)
+        view.name: ViewEvidence(view, model, flights.smoothed[view.name], limits=limits)
         for view in flights.views
     }
     # `earlier` is the evidence of the reference flights by view; empty if there are none.
@@ -67,7 +80,7 @@ def by_views(given: DiagnosisInput) -> SourceSet:
               f"about {BASE_S + rows * ROW_S:.0f} s")  # fmt: skip
     # Choose the held-out flights by their information, so that the fitted flights keep enough.
     first = evidence[flights.views[0].name]
-    block = first.estimate_noise(first.start)[1]
+    block = first.estimate_noise(first.start).block
     information = (block.slope**2).sum(axis=1)
     start_s = np.zeros(len(information))
     is_fitted, _ = choose_held_out(logs, block.flight, start_s, information, limits)
@@ -84,8 +97,15 @@ def by_views(given: DiagnosisInput) -> SourceSet:
     for name in parts.fitted:
         one = evidence[name]
         to_fit, held_out = (replace(one, flights=p[name]) for p in (parts.fitted, parts.held))
+        view, unit = one.view, "m/s^2" if one.view.in_world else "rad/s^2"
         shared: dict[str, Any] = {
-            **_descriptions(one.view),
+            "name": name,
+            "about": view.about,
+            "subject": f"error of the {name}",
+            "unit": unit,
+            "measure": MEASURE.format(about=view.about, unit=unit, width=view.width_s),
+            "horizon_s": view.width_s,
+            "view": view,
             "limits": limits,
             "floor": flights.floor[name],
         }
@@ -96,15 +116,12 @@ def by_views(given: DiagnosisInput) -> SourceSet:
                 )
             )
             continue
-        weighed = to_fit.estimate_noise(to_fit.start)
-        tried = view_candidates([*allowed, *composites(allowed)], weighed[1])
+        begin = to_fit.estimate_noise(to_fit.start)
+        tried = view_candidates([*allowed, *composites(allowed)], begin.block)
         whole = one if one.view.in_world else None
         sources.append(
-            ViewSource(
-                weighed=weighed, start=to_fit.start, candidates=tried, held=held_out,
-                all_flights=whole, **shared,
-            )
-        )  # fmt: skip
+            ViewSource(begin=begin, candidates=tried, held=held_out, all_flights=whole, **shared)
+        )
     lag = None if references else find_rotor_lag(logs, vehicle, limits)
     return SourceSet(
         tuple(sources),
@@ -112,15 +129,157 @@ def by_views(given: DiagnosisInput) -> SourceSet:
         flights.source,
         (*flights.notes, *parts.notes, *not_shown, *left_out, *untested),
         (lag,) if lag else (),
-        spread_words(spread, len(references)),
+        spread.words(len(references)) if spread else (),
     )
 
 
-def _descriptions(view: View) -> dict[str, Any]:
-    """Return the fields of a source that depend only on its view, by name."""
-    about = {"about": view.about, "unit": "m/s^2" if view.in_world else "rad/s^2"}
-    measure = MEASURE.format(**about, width=view.width_s)
-    return {
-        **about, "name": view.name, "view": view, "horizon_s": view.width_s, "measure": measure,
-        "subject": f"error of the {view.name}",
-    }  # fmt: skip
+@dataclass(frozen=True, kw_only=True)
+class MeansSource(ViewSource):
+    """Source for a change of the mean acceleration of whole flights since reference flights.
+
+    Its noise floor is what an unchanged vehicle shows: how the means of the reference flights
+    differ.
+    """
+
+    reference: ViewEvidence
+    """The reference flights."""
+    reason = NO_AGREEMENT
+    block = 1  # means of flights are independent
+    window = "means of whole flights"
+
+    def _within(self, residual: np.ndarray, flight: np.ndarray) -> np.ndarray:
+        """Return the means, from which nothing is subtracted."""
+        return residual
+
+    def _shares(self, found: SearchResult) -> Shares:
+        """Return the shares that the named effects explain; a black box has nothing to explain."""
+        before, after = (
+            (self.held.residuals(at.theta).residual ** 2).mean(axis=0)
+            for at in (found.start, found.estimate)
+        )
+        closed = 1.0 - after / np.maximum(before, TINY)
+        evidence = found.last.evidence
+        assert isinstance(evidence, ViewEvidence)
+        spread = evidence.repeatability
+        return Shares(closed, np.maximum(closed, 0.0), np.zeros(3), before, spread)
+
+    def series(self, found: SearchResult) -> Series:
+        """Return the mean of every reference flight and held-out flight, see `Source`.
+
+        The axis is the one along which the named effects change the means most.
+        """
+        start, end = found.start.theta, found.estimate.theta
+        earlier = _deviations(self.reference, start)
+        change, left = (self.held.residuals(theta).residual for theta in (start, end))
+        size = np.abs(change - left if found.named else change).mean(axis=0)
+        axis = max(self.view.axes, key=lambda k: float(size[k]))
+        count, zeros = len(earlier), np.zeros(len(earlier) + len(change))
+        lines = {GIVEN: zeros}
+        if found.named:
+            lines[FITTED] = np.append(zeros[:count], (change - left)[:, axis])
+        quantity = QUANTITIES[self.name]
+        return Series(
+            1.0 + np.arange(len(zeros)),
+            np.concatenate([earlier, change])[:, axis],
+            lines,
+            f"Change of the mean {quantity} along body {'xyz'[axis]} [{self.unit}]",
+            f"Each point is the mean of a flight, less the mean of the {count} reference flights: "
+            f"flights 1 to {count} are the reference flights, the others the held-out ones.",
+            x_label="flight",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionSource(ViewSource):
+    """Source for a change since reference flights that shows only in motion."""
+
+    reference: ViewEvidence
+    """The reference flights, before the change."""
+    fitted: ViewEvidence
+    """The flights after the change."""
+    views: int
+    """Number of views that are searched; the search corrects for it."""
+
+    def search(self, say: Callable[[str], None], seed: int) -> SearchResult:
+        """Search for an effect that has changed since the reference flights, see `Source`."""
+        found = search_motion_change(self.reference, self.fitted, self.candidates, self.views)
+        return found or SearchResult((), self.start, self.begin, self.begin, [])
+
+
+def since_reference(
+    reference: ViewEvidence,
+    evidence: ViewEvidence,
+    held: ViewEvidence,
+    spread: RotorSpread,
+    allowed: Sequence[Candidate],
+    means_only: bool,
+    shared: dict[str, Any],
+) -> ViewSource:
+    """Return the source that searches for a change since the `reference` flights.
+
+    `evidence` has the flights to fit, `held` the held-out ones. With `means_only` there is no
+    fallback. `shared` are fields of both sources.
+    """
+    begin = change_evidence(reference, evidence.flights, spread)
+    theta = begin.at.theta
+    shared = {**shared, "begin": begin, "names_small": True, "reference": reference}
+    in_motion = MotionSource(
+        candidates=allowed, held=held, fitted=evidence, views=len(spread.along), **shared
+    )
+    means = replace(less_reference_residual(reference, theta, held.flights), means=True)
+    # The floor is the standard deviation of the mean of a flight of an unchanged vehicle.
+    deviations = _deviations(reference, theta)
+    shared |= {
+        "measure": MEANS_MEASURE.format(about=shared["about"], unit=shared["unit"]),
+        "floor": deviations.std(axis=0, ddof=1) * np.sqrt(1.0 + 1.0 / len(deviations)),
+    }
+    return MeansSource(
+        candidates=view_candidates(allowed, begin.block),
+        held=means,
+        fallback=None if means_only else in_motion,
+        **shared,
+    )
+
+
+def _deviations(reference: ViewEvidence, theta: np.ndarray) -> np.ndarray:
+    """Return the mean residual (F, 3) of each of F flights, less that of all flights."""
+    data = reference.residuals(theta)
+    means = means_of(data.residual, data.flight)
+    return means - means.mean(axis=0)
+
+
+def references_of(
+    given: DiagnosisInput, flights: ViewFlights, evidence: Mapping[str, ViewEvidence]
+) -> tuple[dict[str, ViewEvidence], RotorSpread | None, tuple[str, ...]]:
+    """Return the evidence of the reference flights by view, the spread between flights, and notes.
+
+    `flights` and `evidence` are those of the other flights. A note tells of an unusable flight.
+
+    Raises:
+        ValueError: if less than two are usable, or their signals differ from the other flights'.
+    """
+    if not given.references:
+        return {}, None, ()
+    before = ready(given.references, given.vehicle, given.limits, given.logs)
+    if len(before.names) < 2:
+        words = (
+            f"--reference has {len(before.names)} flight; at least 2 are needed, better 3, to "
+            "estimate how flights of one vehicle differ"
+        )
+        raise ValueError("; ".join([words, *before.notes]))
+    if before.views != flights.views or before.source != flights.source:
+        raise ValueError(
+            f"the reference flights are driven by {before.source} and allow "
+            f"{_view_words(before)}, the others by {flights.source} and {_view_words(flights)}: "
+            "log the same signals in both"
+        )
+    earlier = {n: replace(one, flights=before.smoothed[n]) for n, one in evidence.items()}
+    return earlier, rotor_spread([*earlier.values(), *evidence.values()]), before.notes
+
+
+def _view_words(flights: ViewFlights) -> str:
+    """Return a text with the views of flights, their axes and the width of their windows."""
+    return " and ".join(
+        f"{view.name} (along {''.join('xyz'[k] for k in view.axes)}, means of {view.width_s:g} s)"
+        for view in flights.views
+    )

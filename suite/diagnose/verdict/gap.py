@@ -24,13 +24,8 @@ from typing import NamedTuple
 import numpy as np
 
 from suite.diagnose.data.colour import Noise
-from suite.diagnose.data.whitening import (
-    Linearisation,
-    block_of,
-    make_whitening,
-    rotor_spread,
-    slow_energy,
-)
+from suite.diagnose.data.noise import Linearisation
+from suite.diagnose.data.whitening import block_of, make_whitening, rotor_spread, slow_energy
 from suite.diagnose.data.windows import (
     LENGTH_S,
     SLICES,
@@ -39,7 +34,7 @@ from suite.diagnose.data.windows import (
     FlightWindows,
     take,
 )
-from suite.diagnose.evidence.rollouts import RolloutModel, true_starts
+from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 HORIZONS_S = (0.1, 0.5, 1.0)
@@ -132,12 +127,12 @@ def remaining_share(before: Gap, after: Gap) -> float:
 def from_true_starts(
     model: RolloutModel, theta: np.ndarray, windows: FlightWindows, indices: Sequence[int] = ()
 ) -> Linearisation:
-    """Return the residuals of `windows` from their true start states (see `true_starts`).
+    """Return the residuals of `windows` from their true start states (see `start_estimate`).
 
     The slopes are along the parameters at `indices` and then along the start numbers.
     """
-    offset = true_starts(model, theta, windows)
-    return model.linearise(theta, offset, windows, [*indices, *model.starts])
+    at = start_estimate(model, windows, theta)
+    return model.linearise(at, windows, [*indices, *model.starts])
 
 
 def start_correction(

@@ -20,16 +20,11 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from suite.diagnose.data.colour import Noise, measured_noise
-from suite.diagnose.data.noise import at_least
+from suite.diagnose.data.noise import Linearisation, at_least
 from suite.diagnose.data.sampling import own_spacing_s
-from suite.diagnose.data.whitening import (
-    Linearisation,
-    Whitening,
-    block_of,
-    make_whitening,
-    slow_energy,
-)
+from suite.diagnose.data.whitening import Whitening, block_of, make_whitening, slow_energy
 from suite.diagnose.data.windows import SLICES, FlightWindows
+from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.thresholds import Thresholds
 
@@ -50,7 +45,7 @@ def with_model_error(
     `linear` has slopes along all parameters and start numbers at `theta` (P,). `coarser` are the
     same W stretches with longer steps and fewer rotor speeds.
     """
-    noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
+    noise = measured_noise(linear, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)
     difference = _difference(model, theta, linear, coarser)
     return _raised(_rms(difference, linear, noise, whitening, windows), limits)
@@ -72,7 +67,7 @@ def with_held_commands(
 
     Args: see `with_model_error`; `fewer` are the same stretches with every second command.
     """
-    noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
+    noise = measured_noise(linear, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)
     difference = _difference(model, theta, linear, fewer)
     rms, residual = (
@@ -122,7 +117,7 @@ def _difference(
     model: RolloutModel, theta: np.ndarray, linear: Linearisation, other: FlightWindows
 ) -> np.ndarray:
     """Return by how much the residuals (W, N, 19) of `other` differ; NaN where one diverges."""
-    difference = model.residual(theta, linear.offset, other) - linear.residual
+    difference = model.residual(Estimate(theta, linear.offset), other) - linear.residual
     finite = np.isfinite(difference).all(axis=(1, 2), keepdims=True)
     return np.where(finite, difference, np.nan)
 

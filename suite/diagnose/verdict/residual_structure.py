@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import gamma
 
 from eval.effects.interface import GRAVITY
-from suite.diagnose.data.whitening import Linearisation, Whitening, block_of
+from suite.diagnose.data.whitening import Whitening, block_of
 from suite.diagnose.data.windows import KNOTS, FlightWindows
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.gauss_newton import Z95
@@ -73,12 +73,10 @@ def disturbance_equations(
     limits: Thresholds = THRESHOLDS,
 ) -> DisturbanceEquations:
     """Return the normal equations of a disturbance that may explain the residual at `estimate`."""
-    response = model.respond(estimate.theta, estimate.free, windows)
-    columns = range(response.slope.shape[-1])
-    disturbed = Linearisation(response.residual, response.slope, estimate.free)
-    equations = block_of(whitening, disturbed, columns, windows).equations
-    shapes = shape_library(response.knot, np.asarray(windows.start_s), limits)
-    return DisturbanceEquations(equations.hessian, equations.gradient, response.knot, shapes)
+    disturbed, knot = model.respond(estimate, windows)
+    equations = block_of(whitening, disturbed, range(6 * KNOTS), windows).equations
+    shapes = shape_library(knot, np.asarray(windows.start_s), limits)
+    return DisturbanceEquations(equations.hessian, equations.gradient, knot, shapes)
 
 
 def residual_structure(

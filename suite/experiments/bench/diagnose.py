@@ -40,7 +40,7 @@ def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = 3) -> Comparis
         task.nominal, task.space, rotor_input=True, voltage=False, integrator="euler"
     )
     start = start_estimate(model, task.windows)
-    residual = model.residual(start.theta, start.free, task.windows)
+    residual = model.residual(start, task.windows)
     problem = sysid_baseline.prepare(task, noise_of(residual, task.windows))
     answers: dict[str, tuple[np.ndarray, NormalEquations]] = {}
 
@@ -74,7 +74,7 @@ def refit(model: RolloutModel, task: sysid_baseline.Task) -> tuple[np.ndarray, N
     used_values = 0
     while True:
         directions = [*indices, *model.starts]
-        linear = model.linearise(state.theta, state.free, task.windows, directions)
+        linear = model.linearise(state, task.windows, directions)
         evidence, known = rollout_evidence(model, task.windows, linear, along=indices)
         state, block = fit(evidence, state, indices, known=known)
         if evidence.trusted.valid.sum() <= used_values:

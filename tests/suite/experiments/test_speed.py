@@ -57,7 +57,7 @@ def test_both_sides_have_the_same_residuals():
         task.nominal, task.space, rotor_input=True, voltage=False, integrator="euler"
     )
     begin = start_estimate(model, task.windows)
-    residual = model.residual(begin.theta, begin.free, task.windows)
+    residual = model.residual(begin, task.windows)
     noise = noise_of(residual, task.windows)
     problem = sysid_baseline.prepare(task, noise)
     theirs = np.array(problem.residual(task.array("start"), problem.params)[0])

@@ -10,7 +10,7 @@ from suite.common.report import html
 from suite.diagnose.diagnose import SOURCES, diagnose
 from suite.diagnose.estimate.block import Block, Estimate, without_nuisance
 from suite.diagnose.estimate.parameters import Candidate, make_space
-from suite.diagnose.evidence.evidence import Evidence
+from suite.diagnose.evidence.evidence import Evaluation, Evidence
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.sources.source import Remaining, Source, SourceSet
@@ -55,9 +55,9 @@ class Thermometer(Evidence):
         rows = (residual[:, None] / self.sigma, slope[:, None] / self.sigma)
         return without_nuisance(*rows, along, stretch, self.flight[first], 1.0 * first)
 
-    def estimate_noise(self, at: Estimate) -> tuple[Evidence, Block]:
-        found = replace(self, sigma=float(self.sigma * self.linearise(at).residual.std()))
-        return found, found.linearise(at)
+    def estimate_noise(self, at: Estimate) -> Evaluation:
+        sigma = float(self.sigma * self.linearise(at).residual.std())
+        return replace(self, sigma=sigma).relinearise(at)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +101,7 @@ def sources(wind, drag=0.0, alike=0.0, rows=100, kind=ThermometerSource):
 
     source = kind(
         name="air", about="temperatures", subject="temperature", unit="K off", measure="RMS [K]",
-        horizon_s=1.0, weighed=part(flight < 3).estimate_noise(START), start=START,
+        horizon_s=1.0, begin=part(flight < 3).estimate_noise(START),
         candidates=[Candidate(name, (p,), name) for name, p in zip(NAMES, PLACES, strict=True)],
         limits=THRESHOLDS, held=part(flight == 3),
     )  # fmt: skip

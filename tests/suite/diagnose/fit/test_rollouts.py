@@ -9,6 +9,7 @@ import pytest
 
 from eval.flights.simulate import SENSORS, fly, log_of
 from suite.diagnose.data import colour
+from suite.diagnose.data.noise import Linearisation
 from suite.diagnose.data.whitening import block_of, make_whitening, orthonormal, slow_energy
 from suite.diagnose.data.windows import KNOTS, SLICES, STATE, cut
 from suite.diagnose.estimate.parameters import candidates, make_space
@@ -73,7 +74,7 @@ def linearised(flown):
     """Return the model of the shared diagnosis, its windows, and their slopes along everything."""
     model, windows = flown.model, flown.cut(1.0)
     begin = rollouts.start_estimate(model, windows)
-    return model, windows, model.linearise(begin.theta, begin.free, windows, None)
+    return model, windows, model.linearise(begin, windows)
 
 
 def test_slopes_are_those_of_small_changes_and_a_disturbance_pushes_the_windows(linearised):
@@ -81,14 +82,15 @@ def test_slopes_are_those_of_small_changes_and_a_disturbance_pushes_the_windows(
     begin = rollouts.start_estimate(model, windows)
     index = model.space.layout.index(("linear_drag", "coefficient", 0))
     step = 1e-4 * (np.arange(model.size) == index)
-    ends = [model.residual(begin.theta + s * step, begin.free, windows) for s in (-1, 1)]
+    moved = (begin._replace(theta=begin.theta + sign * step) for sign in (-1, 1))
+    ends = [model.residual(at, windows) for at in moved]
     slope = (ends[0] - ends[1]) / 2e-4
     np.testing.assert_allclose(linear.slope[..., index], slope, atol=1e-4)
-    few = model.linearise(begin.theta, begin.free, windows, [index])
+    few = model.linearise(begin, windows, [index])
     np.testing.assert_allclose(few.slope[..., 0], linear.slope[..., index], atol=1e-9)
-    response = model.respond(begin.theta, begin.free, windows)
+    response, knot = model.respond(begin, windows)
     assert response.slope.shape[-1] == KNOTS * 6
-    assert response.knot.rotor_speed.shape == (len(windows.flight), KNOTS, 4)
+    assert knot.rotor_speed.shape == (len(windows.flight), KNOTS, 4)
     up = response.slope[..., 2::6].sum(axis=-1)[:, :, 2]
     at = np.abs(np.asarray(windows.row_s) - 0.5).argmin(axis=1)
     # 1 m/s^2 along body z for half a second, less what tilt takes of it.
@@ -144,9 +146,14 @@ def windows():
     return found
 
 
+def linear_of(residual):
+    """Return residuals that do not depend on the start."""
+    return Linearisation(residual, np.zeros((*residual.shape, 12)), np.zeros((len(residual), 12)))
+
+
 def measured(residual, windows):
     """Return the noise of residuals that do not depend on the start."""
-    return colour.measured_noise(residual, np.zeros((*residual.shape, 12)), windows)
+    return colour.measured_noise(linear_of(residual), windows)
 
 
 def noise_like(windows, share, lasts_s, rng, group=GROUP):
@@ -214,8 +221,7 @@ def test_where_the_model_lacks_something_the_whole_residual_counts_as_noise(wind
     residual = noise_like(windows, 0.0, 1.0, rng)
     swing = np.sin(6.0 * windows.row_s[..., None] + rng.uniform(0.0, 6.0, (len(residual), 1, 3)))
     residual[..., SLICES["velocity"]] += 8.0 * swing
-    nothing = np.zeros((*residual.shape, 12))
-    noise = colour.residual_as_noise(residual, nothing, windows)
+    noise = colour.residual_as_noise(linear_of(residual), windows)
     np.testing.assert_allclose(noise.sigma[SLICES["velocity"]], 8.0 / np.sqrt(2.0), rtol=0.3)
     share, lasts_s = noise.coloured["velocity"]
     assert share > 0.95 and lasts_s > 0.1
@@ -243,7 +249,7 @@ def test_a_fault_from_a_package_is_a_candidate_and_in_the_simulated_log(
     true[list(one.indices)] = *TURN, 1.04, 0.01
     fly_model = jax.jit(rollouts.compiled(space.layout, False, False, "euler")[0])
     with jax.enable_x64(True):
-        starts = [(theta, rollouts.true_starts(model, theta, windows)) for theta in (start, true)]
+        starts = [rollouts.start_estimate(model, windows, theta) for theta in (start, true)]
         off = [np.asarray(fly_model(model.given, *both, windows)[0]) for both in starts]
     for channel in ("position", "attitude", "velocity", "rates"):
         before, after = (np.sqrt((o[..., SLICES[channel]] ** 2).mean()) for o in off)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data.colour import Noise
-from suite.diagnose.data.whitening import Linearisation
+from suite.diagnose.data.noise import Linearisation
 from suite.diagnose.data.windows import CHANNELS, SLICES, STATE
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.evidence.rollouts import true_starts
+from suite.diagnose.evidence.rollouts import start_estimate
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict import actuators, model_error
@@ -79,14 +79,14 @@ def test_rollouts_for_a_picture_start_from_states_that_fit_all_rows(flown, found
     """The noise of a measured start state would hide what the model explains."""
     found, windows = found_drag.search, flown.held
     theta, noise = found.estimate.theta, found.last.evidence.noise
-    measured = true_starts(flown.model, theta, windows)
+    measured = start_estimate(flown.model, windows, theta)
     correction = start_correction(flown.model, theta, windows, noise, flown.limits)
     assert (np.abs(correction[:, :STATE]) <= 3.0 * noise.sigma[:STATE] + 1e-12).all()
     assert not correction[:, STATE:].any()
     position = SLICES["position"]
     rms = [
-        np.sqrt((flown.model.residual(theta, start, windows)[..., position] ** 2).mean())
-        for start in (measured, measured + correction)
+        np.sqrt((flown.model.residual(at, windows)[..., position] ** 2).mean())
+        for at in (measured, measured._replace(free=measured.free + correction))
     ]
     assert rms[1] < 1.1 * noise.sigma[position].max() < 0.5 * rms[0]
     # Windows in which the model diverges keep the measured state.

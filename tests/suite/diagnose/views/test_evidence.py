@@ -177,14 +177,13 @@ def test_a_change_stands_out_of_how_flights_differ_though_the_file_is_wrong(befo
     spread = change.rotor_spread([*before.values(), *after.values()])
     found = {}
     for name, task in after.items():
-        evidence, start = change.change_evidence(before[name], task.flights, spread)
-        known = evidence.relinearise(start)
-        among = view_candidates(CANDIDATES, known[1])
-        found[name] = named(search(evidence, start, among, known=known))
+        begin = change.change_evidence(before[name], task.flights, spread)
+        among = view_candidates(CANDIDATES, begin.block)
+        found[name] = named(search(begin, among))
         if share < 1.0:
             # Only what comes near the best may stand in its place: otherwise a more usual effect
             # replaces the right one.
-            scores = evidence.scores(known[1], known[1].equations, start.theta, [], among, 0)
+            scores = begin.evidence.scores(begin, [], among, 0)
             assert 0 < len(scores) < len(among)
             assert scores[-1].gain >= THRESHOLDS.near_share * scores[0].gain
     assert (found == {"force": [], "torque": []}) == (share == 1.0)

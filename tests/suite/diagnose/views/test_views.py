@@ -10,10 +10,11 @@ import pytest
 from suite.diagnose.data.view import SmoothedFlight, weak_form
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import candidates
+from suite.diagnose.evidence.evidence import Evaluation
 from suite.diagnose.evidence.moments import centred
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.summary import next_steps
-from suite.diagnose.search.evaluation import Evaluation, NamedEffect
+from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.examine import contradicted
 from suite.diagnose.sources.view_source import closed_share, fit_black_box, inputs_of
 from suite.diagnose.verdict.disturbances import Swing, find_swing
