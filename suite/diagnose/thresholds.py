@@ -230,11 +230,6 @@ class Thresholds:
     view_block_s: float = 2.0
     """Length of stretches whose errors count as independent in a view [s]."""
 
-    bootstrap_draws: int = 1000
-    """Number of draws for the 95 % interval of a gap."""
-    bootstrap_block: int = 4
-    """Neighbouring rollouts that a bootstrap draws together, since they overlap; of few rollouts a
-    quarter."""
     gap_stride_s: float = 0.25
     """Time between the starts of the rollouts that measure the gap [s]."""
     refuting_chi2: float = 25.0

@@ -14,7 +14,6 @@ from suite.diagnose.plan import advice
 from suite.diagnose.report.summary import headline, short_name
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.source import Finding
-from suite.diagnose.verdict.actuators import ActuatorMismatch
 from suite.diagnose.verdict.gap import EffectSize, remaining_share
 
 NO_EFFECT = "that no effect of the catalogue explains"
@@ -48,7 +47,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         and {
             "effect": control[0],
             "after": control[1].rms,
-            "after_ci95": control[1].ci95(diagnosis.seed, limits),
+            "after_ci95": control[1].ci95(diagnosis.seed),
         },
         "unexplained": {
             "share": remaining_share(main.before, main.after) if named or diagnosis.tested else 1.0,
@@ -98,7 +97,7 @@ def not_examined(diagnosis: Diagnosis) -> list[str]:
 
 def gap_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the gap of the main finding, and the channels of all findings."""
-    main, seed, limits = diagnosis.main, diagnosis.seed, diagnosis.limits
+    main = diagnosis.main
     return {
         "measure": main.source.measure,
         "of": main.source.subject,
@@ -116,8 +115,8 @@ def gap_json(diagnosis: Diagnosis) -> dict[str, Any]:
             if one.before.offset > 0.0
         },
         "model_error": main.source.model_error(main.search),
-        "before_ci95": main.before.ci95(seed, limits),
-        "after_ci95": main.after.ci95(seed, limits),
+        "before_ci95": main.before.ci95(diagnosis.seed),
+        "after_ci95": main.after.ci95(diagnosis.seed),
         "horizon_s": main.source.horizon_s,
         "channels": {
             group: {
@@ -253,8 +252,3 @@ def parameters_json(
 def _motor_number(space: ParameterSpace, index: int) -> int:
     """Return the number (from 1) of the motor to which the parameter at `index` belongs."""
     return (space.entries[index].component or 0) + 1
-
-
-def actuators_json(mismatches: Sequence[ActuatorMismatch]) -> list[dict[str, Any]]:
-    """Return the entry `actuators`: measured rotor speeds compared with commanded ones."""
-    return [{**one._asdict(), "followed": one.followed} for one in mismatches]

@@ -23,16 +23,13 @@ from suite.diagnose.report.sections import (
     rivals_section,
 )
 from suite.diagnose.report.summary import (
-    cells,
     components,
     figure,
-    grid,
     next_steps,
-    short_name,
     superscripts,
 )
-from suite.diagnose.sources.rollout_source import rollouts_of
-from tracks.common.grid import Cell, Grid
+from suite.diagnose.sources.rollout_source import Rollouts, rollouts_of
+from tracks.common.grid import Cell, Grid, table
 
 TITLES = {
     "no_gap": "no gap",
@@ -65,17 +62,28 @@ CHANNELS = (
 )
 
 
-def page(diagnosis: Diagnosis, result: Mapping[str, Any], toml: str, files: set[str]) -> Report:
+def page(
+    diagnosis: Diagnosis,
+    result: Mapping[str, Any],
+    toml: str,
+    files: set[str],
+    rollouts: Rollouts | None = None,
+) -> Report:
     """Return the report of a diagnosis with the diagnosis.json `result` and vehicle file `toml`.
 
-    `files` are the paths of those of `FILES` that exist.
+    `files` are the paths of those of `FILES` that exist. `rollouts` are those for the chart, if
+    they were simulated before.
     """
-    gap, flown = result["gap"], rollouts_of(diagnosis.main)
+    gap, flown, main = result["gap"], rollouts_of(diagnosis.main), diagnosis.main
+    held = gap["held_out"]
+    # The values of a held-out stretch: measured, and simulated without and with the named effects.
+    series = flown.series(main.search, rollouts) if flown else main.source.series(main.search)
+    chart = [Picture(series_chart(series), series.caption)] if series else []
     after = f" → {figure(gap['after'])}" if result["effects"] else ""
     facts = {
         "gap on held-out flights": superscripts(f"{figure(gap['before'])}{after} {gap['unit']}"),
         "noise floor": f"{gap['noise_floor']:.3g}",
-        "held out": _few(gap["held_out"]),
+        "held out": ", ".join(held[:3]) + (f" and {len(held) - 3} more" if held[3:] else ""),
         "driven by": result["driven_by"],
     }
     if result["not_examined"]:
@@ -98,7 +106,7 @@ def page(diagnosis: Diagnosis, result: Mapping[str, Any], toml: str, files: set[
         facts=facts,
         sections=[
             Section("What to do next", [Steps(next_steps(result))]),
-            *_measured(diagnosis),
+            *([Section("Measured and simulated", chart)] if chart else []),
             *([Section("Warnings", result["warnings"])] if result["warnings"] else []),
             *_findings(result.get("findings", ())),
             *_answer(result),
@@ -106,24 +114,6 @@ def page(diagnosis: Diagnosis, result: Mapping[str, Any], toml: str, files: set[
             *(replace(section, folded=True) for section in details),
         ],
     )
-
-
-def _few(names: list[str]) -> str:
-    """Return up to three names, and the number of the others."""
-    short = [short_name(name) for name in names]
-    return ", ".join(short[:3]) + (f" and {len(short) - 3} more" if len(short) > 3 else "")
-
-
-def _measured(diagnosis: Diagnosis) -> list[Section]:
-    """Return a section with a chart of a held-out stretch, if there is one.
-
-    The chart has the measured values, and those simulated without and with the named effects.
-    """
-    main = diagnosis.main
-    series = main.source.series(main.search)
-    if series is None:
-        return []
-    return [Section("Measured and simulated", [Picture(series_chart(series), series.caption)])]
 
 
 def _findings(findings: Sequence[Mapping[str, Any]]) -> list[Section]:
@@ -135,7 +125,7 @@ def _findings(findings: Sequence[Mapping[str, Any]]) -> list[Section]:
         if finding["status"] in ("corrected", "doubt")
     ]
     headers = ["log", *keys[1:]]
-    return [Section("Findings about the logs", [grid("", headers, rows)])] if rows else []
+    return [Section("Findings about the logs", [table(headers, rows)])] if rows else []
 
 
 def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Grid:
@@ -152,13 +142,13 @@ def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Gr
             unit = f" [{UNITS[channel]}]" if channel in UNITS else ""
             tone = "good" if error["after"] < 1.2 * floor else ""
             # The channel, then errors (green if about as small as the noise), then the shares.
-            row = cells(group, f"{channel}{unit}", f"{error['before']:.4g}")
-            row += [Cell(f"{error['after']:.4g}", tone), *cells(f"{floor:.4g}")]
+            after = Cell(f"{error['after']:.4g}", tone)
+            row = [group, f"{channel}{unit}", f"{error['before']:.4g}", after, f"{floor:.4g}"]
             texts = ["" if error.get(k) is None else format(error[k], optional[k]) for k in shown]
-            rows.append([*row, *cells(*texts)])
+            rows.append([*row, *texts])
     headers = ["", "channel", "as given", "with the named effects", "noise floor"]
     headers += ["black box" if key == "explainable" else key for key in shown]
-    return Grid("", headers, rows, note=CHANNELS)
+    return table(headers, rows, note=CHANNELS)
 
 
 def _answer(result: Mapping[str, Any]) -> list[Section]:
@@ -182,7 +172,7 @@ def _answer(result: Mapping[str, Any]) -> list[Section]:
         "effect", "not distinguishable from", "view", "parameter", "total", "95 %", "of the gap"
     ]  # fmt: skip
     note = TOTALS.format(chance=max(effect["p_value"] for effect in effects))
-    return [Section("The answer in numbers", [*words, grid("", headers, rows, note)])]
+    return [Section("The answer in numbers", [*words, table(headers, rows, note=note)])]
 
 
 def _written(result: Mapping[str, Any], toml: str, files: set[str]) -> Section:
@@ -206,5 +196,5 @@ def _written(result: Mapping[str, Any], toml: str, files: set[str]) -> Section:
             for flight in plan["flights"]
         ]
         headers = ["flight", "kind", "lasts", "speed", "acceleration", "needs"]
-        parts.append(grid("Flights to fly next", headers, rows, " ".join(plan["words"])))
+        parts.append(table(headers, rows, "Flights to fly next", " ".join(plan["words"])))
     return Section("What was written", parts)

@@ -6,14 +6,13 @@ words.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from eval.effects import EFFECTS
 from suite.diagnose.verdict.gap import EffectSize
-from tracks.common.grid import Cell, Grid
 
 VERDICTS = {
     "no_gap": "Simulation and flights agree within the measurement noise.",
@@ -282,16 +281,6 @@ def _components(effect: Mapping[str, Any]) -> Iterator[Component]:
                 axes = motors
             for axis, number, pair in zip(axes, value, span or [None] * len(value), strict=False):
                 yield Component(f"{name} {axis}", unit, number, pair, neutrals.get(name))
-
-
-def cells(*texts: str) -> list[Cell]:
-    """Return a table row of cells without a colour."""
-    return [Cell(text) for text in texts]
-
-
-def grid(title: str, headers: Sequence[str], rows: Iterable[Sequence[str]], note: str = "") -> Grid:
-    """Return a table of plain texts."""
-    return Grid(title, headers, [cells(*row) for row in rows], note=note)
 
 
 def short_name(name: str) -> str:

@@ -70,11 +70,8 @@ class ActuatorMismatch(NamedTuple):
     turn: tuple[tuple[float, float], ...]
     """Mean and standard deviation of measured minus commanded angular acceleration, about body x,
     y and z each [rad/s^2]."""
-
-    @property
-    def followed(self) -> float:
-        """Share of the speeds' variance that the commands and the vehicle file's lag explain."""
-        return 1.0 - (self.rms / max(self.spread, 1e-9)) ** 2
+    followed: float
+    """Share of the speeds' variance that the commands and the vehicle file's lag explain."""
 
 
 Commanded = Callable[[float], np.ndarray]
@@ -99,16 +96,27 @@ def actuator_mismatches(
     Returned is one mismatch for each of the two comparisons that the logs allow. Logs without
     measured rotor speeds are ignored, and so are the effects of `vehicle`.
     """
-    mismatches = (_mismatch(commanded_by, logs, vehicle, limits) for commanded_by in COMMANDED)
+    mismatches = (_mismatch(source, logs, vehicle, limits) for source in (RATE_LOOP, LOGGED))
     return [mismatch for mismatch in mismatches if mismatch is not None]
 
 
-def _rate_loop_speeds(log: FlightLog, step_time_s: np.ndarray, plant: Plant) -> Commanded | None:
-    """Return the rotor speeds commanded by the rate loop of `plant` at the measured body rates.
+RATE_LOOP, LOGGED = "nominal rate loop", "logged motor commands"
+"""What commands rotor speeds: the rate loop at the measured body rates, or the log's commands."""
 
-    `step_time_s` (S,) are the starts of the time steps [s]. None where the log has no commands. The
-    plant is the model of the vehicle: its rotors, delays and rate loop.
+
+def _commanded(
+    commanded_by: str, log: FlightLog, step_time_s: np.ndarray, plant: Plant
+) -> Commanded | None:
+    """Return the commanded rotor speeds of `log`; None where it has no such commands.
+
+    `step_time_s` (S,) are the starts of the time steps [s]. The rate loop is that of `plant`, the
+    model of the vehicle.
     """
+    if commanded_by == LOGGED:
+        logged = log.rotor_speed_cmd
+        if logged is None:
+            return None
+        return lambda delay_s: hold(step_time_s - delay_s, log.time_s, logged)
     if log.thrust_cmd is None or log.rate_cmd_b is None:
         return None
     command = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
@@ -120,20 +128,6 @@ def _rate_loop_speeds(log: FlightLog, step_time_s: np.ndarray, plant: Plant) -> 
         return np.asarray(wanted_speed(plant, Command(delayed[:, 0], delayed[:, 1:]), rate_b))
 
     return commanded
-
-
-def _logged_speeds(log: FlightLog, step_time_s: np.ndarray, plant: Plant) -> Commanded | None:
-    """Return the rotor speeds that the log has as motor commands; None where it has none."""
-    del plant
-    command = log.rotor_speed_cmd
-    if command is None:
-        return None
-    return lambda delay_s: hold(step_time_s - delay_s, log.time_s, command)
-
-
-RATE_LOOP = "nominal rate loop"
-COMMANDED = {RATE_LOOP: _rate_loop_speeds, "logged motor commands": _logged_speeds}
-"""What commands rotor speeds, and the function that computes them."""
 
 
 def _stretches(
@@ -154,7 +148,7 @@ def _stretches(
         if time_s[-1] < 4.0 * limits.lag_settled_s:  # too short next to the time left out below
             continue
         step_time_s = log.time_s[rows[0]] + dt * np.arange(int(time_s[-1] / dt) + 1)
-        commanded = COMMANDED[commanded_by](log, step_time_s, plant)
+        commanded = _commanded(commanded_by, log, step_time_s, plant)
         if commanded is None or not np.isfinite(commanded(0.0)).all():
             continue
         step = np.round(time_s / dt).astype(int)
@@ -211,10 +205,11 @@ def _mismatch(
     fitted = lagged(commanded(delay), time_constant)
     scale = scales(fitted)
     thrust, turn = wrench_difference(measured, nominal, vehicle)
+    rms, spread = _rms(measured - nominal), _rms(measured - measured.mean(axis=0))
     return ActuatorMismatch(
         commanded_by=commanded_by,
-        rms=_rms(measured - nominal),
-        spread=_rms(measured - measured.mean(axis=0)),
+        rms=rms,
+        spread=spread,
         time_constant=time_constant,
         delay=delay,
         scale=tuple(float(s) for s in scale),
@@ -222,6 +217,7 @@ def _mismatch(
         rms_own=float(np.sqrt(nominal_error)),
         thrust=(float(thrust.mean()), float(thrust.std())),
         turn=tuple((float(t.mean()), float(t.std())) for t in turn.T),
+        followed=1.0 - (rms / max(spread, 1e-9)) ** 2,
     )
 
 

@@ -32,9 +32,8 @@ from suite.diagnose.evidence.evidence import flights_agree
 from suite.diagnose.evidence.rollout import Flown
 from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.evidence.views import ViewEvidence
-from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.actuators import TestedEffect
-from suite.diagnose.verdict.residual_structure import DisturbanceEquations
+from suite.diagnose.verdict.residual_structure import DisturbanceEquations, diagonalised
 
 STEP_HZ = 0.01
 """Step between the tested frequencies [Hz]."""
@@ -102,22 +101,11 @@ def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
     """
     if not {0, 1} <= set(task.view.axes):
         return None
-    data = task.residuals(theta)
-    residual_b = [data.residual[data.flight == number] for number in range(len(task.flights))]
-    return find_swing(task.flights, residual_b, task.limits)
-
-
-def find_swing(
-    flights: Sequence[SmoothedFlight],
-    residual_b: Sequence[np.ndarray],
-    limits: Thresholds = THRESHOLDS,
-) -> Swing | None:
-    """Return the oscillation in the residual force of `flights`; None where there is none.
-
-    `residual_b` is that force of each flight, (M, 3) in body axes [m/s^2].
-    """
-    pairs = zip(flights, residual_b, strict=True)
-    spectra = [s for flight, residual in pairs if (s := _spectrum(flight, residual)) is not None]
+    data, limits = task.residuals(theta), task.limits
+    every = (
+        _spectrum(flight, data.residual[data.flight == k]) for k, flight in enumerate(task.flights)
+    )
+    spectra = [spectrum for spectrum in every if spectrum is not None]
     if not spectra:
         return None
     shortest_s, longest_s = limits.swing_periods_s
@@ -148,7 +136,10 @@ def find_swing(
 
 
 def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None:
-    """Return the spectrum of one flight; None where it is too short for one."""
+    """Return the spectrum of one flight; None where it is too short for one.
+
+    `residual_b` (M, 3) is its residual force in body axes [m/s^2].
+    """
     middle_s = flight.form.middle_s
     if len(middle_s) < LEAST_MEANS:
         return None
@@ -244,17 +235,14 @@ def _peak_shares(
 
 
 def find_turbulence(
-    model: RolloutModel,
-    theta: np.ndarray,
-    disturbance: DisturbanceEquations,
-    limits: Thresholds = THRESHOLDS,
+    model: RolloutModel, theta: np.ndarray, disturbance: DisturbanceEquations
 ) -> tuple[TestedEffect, float] | None:
     """Return the random wind that explains the residual of `model` at `theta` (P,), or None.
 
     None also without a drag that transmits it, with a better random force, or by outliers alone.
     With the wind comes the logarithm of the likelihood ratio of this wind to no wind.
     """
-    transmission = _wind_transmission(model, theta, disturbance.knot)
+    transmission, limits = _wind_transmission(model, theta, disturbance.knot), disturbance.limits
     if np.abs(transmission).max() < 1e-6:
         return None
     lengths_m = np.geomspace(*limits.wind_lengths_m)
@@ -326,19 +314,9 @@ def _wind_root(knot: Flown, length_m: float) -> np.ndarray:
     return np.einsum("wkl,ab->wkalb", root, axes).reshape(len(root), KNOTS * 3, KNOTS * 3)
 
 
-def _diagonalised(
-    equations: DisturbanceEquations, root: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return information and gradient (W, J) along the independent directions of root @ normal."""
-    transposed = np.swapaxes(root, 1, 2)
-    information, vectors = np.linalg.eigh(transposed @ equations.hessian @ root)
-    gradient = np.swapaxes(vectors, 1, 2) @ (transposed @ equations.gradient[..., None])
-    return information, gradient[..., 0]
-
-
 def _likelihood(equations: DisturbanceEquations, root: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Return log-likelihood ratios of disturbances size * root @ z (z normal) to none, by size."""
-    information, gradient = _diagonalised(equations, root)
+    information, gradient = diagonalised(equations.hessian, equations.gradient, root)
     information = np.maximum(information, 0.0)
     variance = sizes[:, None, None] ** 2
     terms = variance * gradient**2 / (1.0 + variance * information)
@@ -355,7 +333,7 @@ def _has_outliers(
     mean may exceed 3 by `tail` standard errors. A force that acts only at some places or speeds has
     a higher mean. With fewer than eight directions that contain information the result is False.
     """
-    information, gradient = _diagonalised(equations, root)
+    information, gradient = diagonalised(equations.hessian, equations.gradient, root)
     informed = size**2 * information > 1.0
     if informed.sum() < 8:
         return False

@@ -44,6 +44,8 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 HORIZONS_S = (0.1, 0.5, 1.0)
 """Times after the start at which plain errors of rollouts are reported [s]."""
+DRAWS = 1000
+"""Number of draws of a bootstrap."""
 START_SIGMAS = 3.0
 """Largest correction of a number of a start state, in standard deviations of its noise."""
 
@@ -76,9 +78,9 @@ class Gap(NamedTuple):
     """RMS error that measurement noise alone gives."""
     offset: float = 0.0
     """RMS of the flights' trims, which are no part of `score`; 0 if none are subtracted."""
-    together: int = THRESHOLDS.bootstrap_block
+    together: int = 4
     """Number of neighbouring stretches whose errors are correlated: a bootstrap draws them
-    together."""
+    together. Four rollouts that begin every 0.25 s overlap."""
 
     @property
     def rms(self) -> float:
@@ -90,14 +92,14 @@ class Gap(NamedTuple):
         """RMS error over all stretches, with the flights' trims."""
         return float(np.hypot(self.rms, self.offset))
 
-    def ci95(self, seed: int, limits: Thresholds = THRESHOLDS) -> tuple[float, float]:
+    def ci95(self, seed: int) -> tuple[float, float]:
         """Return the 95 % interval of `rms` by a block bootstrap over stretches."""
-        low, high = np.quantile(np.sqrt(self._means(self.score, seed, limits)), [0.025, 0.975])
+        low, high = np.quantile(np.sqrt(self._means(self.score, seed)), [0.025, 0.975])
         return float(low), float(high)
 
-    def energy_low95(self, seed: int, limits: Thresholds = THRESHOLDS) -> float:
+    def energy_low95(self, seed: int) -> float:
         """Return the lower end of the 95 % interval of the mean `energy`."""
-        return float(np.quantile(self._means(self.energy, seed, limits), 0.025))
+        return float(np.quantile(self._means(self.energy, seed), 0.025))
 
     def exceeds(self, before: Gap, weight: float, limits: Thresholds) -> bool:
         """Return whether the energy is significantly larger than that of `before`.
@@ -107,19 +109,19 @@ class Gap(NamedTuple):
         over stretches, so that rows in overlapping ones count once.
         """
         rise = self.energy - before.energy
-        rise_low = np.quantile(self._means(rise, 0, limits), 0.025)
+        rise_low = np.quantile(self._means(rise, 0), 0.025)
         return bool(rise_low > 0.0 and rise.sum() * weight > limits.refuting_chi2)
 
-    def _means(self, values: np.ndarray, seed: int, limits: Thresholds) -> np.ndarray:
-        """Return the means (D,) of D bootstrap draws of `values` (W,), one of each stretch.
+    def _means(self, values: np.ndarray, seed: int) -> np.ndarray:
+        """Return the means (DRAWS,) of bootstrap draws of `values` (W,), one of each stretch.
 
         The values form a circle, so that each of them is drawn equally often. With few values,
         fewer are drawn together, so that draws differ.
         """
-        rng, count, draws = np.random.default_rng(seed), len(values), limits.bootstrap_draws
+        rng, count = np.random.default_rng(seed), len(values)
         block = max(1, min(self.together, count // 4))
-        block_start = rng.integers(0, count, (draws, -(-count // block), 1))
-        rows = (block_start + np.arange(block)).reshape(draws, -1)[:, :count] % count
+        block_start = rng.integers(0, count, (DRAWS, -(-count // block), 1))
+        rows = (block_start + np.arange(block)).reshape(DRAWS, -1)[:, :count] % count
         return values[rows].mean(axis=1)
 
 
@@ -192,7 +194,7 @@ def gap_of(
             floor = noise_floor(linear.slope[rows][:, :STATE], free_noise)[:, SLICES[name]]
             parts = (error, np.maximum(floor, 1e-12)) if len(stretch) else (np.zeros((1, 3)),) * 2
             channels[f"{horizon_s:g} s"][name] = Channel(*map(rms_length, parts))
-    return Gap(score, slow.sum(axis=1), channels, together=limits.bootstrap_block)
+    return Gap(score, slow.sum(axis=1), channels)
 
 
 def overlap(windows: FlightWindows) -> float:

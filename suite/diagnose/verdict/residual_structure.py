@@ -10,7 +10,7 @@ energy than noise gives (a score test of a smooth random disturbance).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -42,8 +42,12 @@ class DisturbanceEquations(NamedTuple):
     """(W, 6 KNOTS) J'r."""
     knot: Flown
     """(W, KNOTS, ...) simulated state at the knots."""
-    shapes: ShapeLibrary
-    """The shapes that are fitted."""
+    unit: np.ndarray
+    """(W, 6 KNOTS, J) linear [m/s^2] and angular [rad/s^2] acceleration in body axes that each of
+    the J columns of all shapes gives with a coefficient of 1."""
+    groups: Mapping[str, tuple[int, ...]]
+    """Columns of each shape, by its name for people such as "force with the speed"."""
+    limits: Thresholds = THRESHOLDS
 
 
 class ShapeScore(NamedTuple):
@@ -53,7 +57,7 @@ class ShapeScore(NamedTuple):
     gain: float
     p_value: float
     columns: tuple[int, ...]
-    """Numbers of its columns in `ShapeLibrary.unit`."""
+    """Numbers of its columns in `DisturbanceEquations.unit`."""
 
 
 class ResidualStructure(NamedTuple):
@@ -77,40 +81,38 @@ def disturbance_equations(
     columns = range(response.slope.shape[-1])
     disturbed = Linearisation(response.residual, response.slope, estimate.free)
     equations = block_of(whitening, disturbed, columns, windows).equations
-    shapes = shape_library(response.knot, np.asarray(windows.start_s), limits)
-    return DisturbanceEquations(equations.hessian, equations.gradient, response.knot, shapes)
+    shapes = _shapes(response.knot, np.asarray(windows.start_s), limits)
+    terms = (equations.hessian, equations.gradient, response.knot)
+    return DisturbanceEquations(*terms, *shapes, limits)
 
 
 def residual_structure(
-    equations: DisturbanceEquations,
-    fold: np.ndarray,
-    seed: int = 0,
-    limits: Thresholds = THRESHOLDS,
+    equations: DisturbanceEquations, fold: np.ndarray, seed: int = 0
 ) -> ResidualStructure:
     """Test the residual for structure, by both tests.
 
     `fold` (W,) is the cross-validation fold of each window; one fold is left out at a time.
     """
     # From forces and torques at the knots to coefficients of the shapes.
-    groups = equations.shapes.groups
-    hessian, gradient = _along(equations, equations.shapes.unit)
+    groups = equations.groups
+    hessian, gradient = _along(equations, equations.unit)
     size = np.sqrt(np.maximum(np.einsum("wjj->j", hessian), 1e-12))
     gains, p_values, _ = permutation_test(
         hessian / np.outer(size, size),
         gradient / size,
-        [group.columns for group in groups],
+        list(groups.values()),
         (),
         fold,
         seed,
-        limits=limits,
+        limits=equations.limits,
     )
     scores = [
-        ShapeScore(group.label, gain, p_value, group.columns)
-        for group, gain, p_value in zip(groups, gains, p_values, strict=True)
+        ShapeScore(label.rstrip(), gain, p_value, columns)
+        for (label, columns), gain, p_value in zip(groups.items(), gains, p_values, strict=True)
     ]
     return ResidualStructure(
         sorted(scores, key=lambda shape: -shape.gain),
-        {axis: _energy_p_value(equations, i, limits) for i, axis in enumerate(AXES)},
+        {axis: _energy_p_value(equations, i) for i, axis in enumerate(AXES)},
     )
 
 
@@ -119,7 +121,6 @@ def beyond_model_error(
     equations: DisturbanceEquations,
     coarse: DisturbanceEquations,
     share: float,
-    limits: Thresholds = THRESHOLDS,
 ) -> ResidualStructure:
     """Return `structure` without the significant shapes that the model's own error may explain.
 
@@ -128,7 +129,7 @@ def beyond_model_error(
     """
 
     def is_kept(shape: ShapeScore) -> bool:
-        if shape.p_value > limits.shape_p_value:
+        if shape.p_value > equations.limits.shape_p_value:
             return True
         value, width = _fit(equations, shape.columns)
         error = share * np.abs(_fit(coarse, shape.columns)[0] - value)
@@ -139,7 +140,7 @@ def beyond_model_error(
 
 def _fit(equations: DisturbanceEquations, columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Return the coefficients (C,) of columns of the shapes, and half-widths of 95 % intervals."""
-    hessian, gradient = _along(equations, equations.shapes.unit[..., list(columns)])
+    hessian, gradient = _along(equations, equations.unit[..., list(columns)])
     covariance = np.linalg.pinv(hessian.sum(axis=0))
     half_width = Z95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return covariance @ gradient.sum(axis=0), half_width
@@ -152,7 +153,18 @@ def _along(equations: DisturbanceEquations, unit: np.ndarray) -> tuple[np.ndarra
     return transposed @ equations.hessian @ unit, gradient
 
 
-def _energy_p_value(equations: DisturbanceEquations, axis: int, limits: Thresholds) -> float:
+def diagonalised(
+    hessian: np.ndarray, gradient: np.ndarray, root: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return information and gradient (W, J) along the independent directions of root @ normal.
+
+    `hessian` (W, K, K) and `gradient` (W, K) are those of a disturbance; `root` is (..., K, J).
+    """
+    information, vectors = np.linalg.eigh(root.mT @ hessian @ root)
+    return information, (vectors.mT @ (root.mT @ gradient[..., None]))[..., 0]
+
+
+def _energy_p_value(equations: DisturbanceEquations, axis: int) -> float:
     """Return the p-value of a random disturbance along `axis`, over several correlation times.
 
     For one correlation time, the eigenvectors of the information are independent directions of the
@@ -162,16 +174,15 @@ def _energy_p_value(equations: DisturbanceEquations, axis: int, limits: Threshol
     directions count. The weighted sum is approximately gamma distributed (Satterthwaite 1946). The
     smallest p-value is multiplied by the number of tests (Bonferroni).
     """
-    entries = np.arange(KNOTS) * 6 + axis
+    entries, limits = np.arange(KNOTS) * 6 + axis, equations.limits
     hessian = equations.hessian[:, entries][:, :, entries]
-    gradient = equations.gradient[:, entries, None]
+    gradient = equations.gradient[:, entries]
     time = np.linspace(0.0, 1.0, KNOTS)
     p_values = []
     for correlation_s in limits.colours_s:
         root = np.linalg.cholesky(np.exp(-np.abs(time[:, None] - time) / correlation_s))
-        information, vectors = np.linalg.eigh(root.T @ hessian @ root)
+        information, along = diagonalised(hessian, gradient, root)
         informed = information > limits.informed_share * max(float(information.max()), 1e-12)
-        along = (np.swapaxes(vectors, 1, 2) @ (root.T @ gradient))[..., 0]
         information, along = information[informed], along[informed]
         for share in limits.disturbance_quantiles:
             size = 1.0 / np.quantile(information, share)
@@ -180,32 +191,13 @@ def _energy_p_value(equations: DisturbanceEquations, axis: int, limits: Threshol
             variance = 2.0 * float((weight**2).sum()) + (limits.noise_error * mean) ** 2
             energy = float((weight * (along**2 / information)).sum())
             p_values.append(float(gamma.sf(energy, mean**2 / variance, scale=variance / mean)))
-    return min(1.0, len(p_values) * min(p_values)) if p_values else 1.0
+    return min(1.0, len(p_values) * min(p_values))
 
 
-class ShapeGroup(NamedTuple):
-    """One shape along several axes, as columns of `ShapeLibrary.unit`."""
-
-    label: str
-    """Name of the shape for people, such as "force with the speed"."""
-    columns: tuple[int, ...]
-    """Numbers of its columns."""
-
-
-class ShapeLibrary(NamedTuple):
-    """All shapes at the knots of W windows."""
-
-    unit: np.ndarray
-    """(W, KNOTS * 6, J) linear [m/s^2] and angular [rad/s^2] acceleration in body axes that each of
-    J columns gives with a coefficient of 1."""
-    groups: tuple[ShapeGroup, ...]
-    """The shapes, as groups of columns."""
-
-
-def shape_library(
-    knot: Flown, start_s: np.ndarray, limits: Thresholds = THRESHOLDS
-) -> ShapeLibrary:
-    """Return all shapes at the knots (W, KNOTS, ...) of W windows.
+def _shapes(
+    knot: Flown, start_s: np.ndarray, limits: Thresholds
+) -> tuple[np.ndarray, dict[str, tuple[int, ...]]]:
+    """Return `unit` and `groups` of all shapes at the knots, as in `DisturbanceEquations`.
 
     `start_s` (W,) is the start of each window, from the start of its flight [s].
     """
@@ -217,7 +209,7 @@ def shape_library(
     speed = np.sqrt((vel_w**2).sum(axis=-1))
     yaw = np.arctan2(rot_w[..., 1, 0], rot_w[..., 0, 0])
     time = start_s[:, None] + np.linspace(0.0, 1.0, KNOTS)
-    # Keys must differ: two have a trailing space, which their labels below do not.
+    # Keys must differ: two have a trailing space, which the labels of their scores do not.
     scalars = {
         "nothing: it is constant": np.ones_like(speed),
         "the time in flight": time,
@@ -241,19 +233,18 @@ def shape_library(
         "twice the heading": np.cos(2.0 * yaw),
         "twice the heading ": np.sin(2.0 * yaw),
     }
-    columns: list[np.ndarray] = []
-    groups: list[ShapeGroup] = []
+    columns, groups = list[np.ndarray](), dict[str, tuple[int, ...]]()
 
     def add(label: str, shapes: list[np.ndarray]) -> None:
-        groups.append(ShapeGroup(label, tuple(range(len(columns), len(columns) + len(shapes)))))
+        groups[label] = tuple(range(len(columns), len(columns) + len(shapes)))
         columns.extend(shapes)
 
     # Each scalar times a force along each body axis, and times a torque about each body axis.
     unit_axes = np.eye(6)
     for label, scalar in scalars.items():
         along = scalar[..., None, None] * unit_axes
-        add(f"force with {label.rstrip()}", [along[..., i, :] for i in range(3)])
-        add(f"torque with {label.rstrip()}", [along[..., i, :] for i in range(3, 6)])
+        add(f"force with {label}", [along[..., i, :] for i in range(3)])
+        add(f"torque with {label}", [along[..., i, :] for i in range(3, 6)])
     # A drag whose dependence on the speed is free.
     motion = [hat[..., None] * vel_b for hat in _hats(speed, limits.pieces)]
     add("force with the motion, by its speed", [
@@ -274,7 +265,7 @@ def shape_library(
     radial = np.concatenate([from_centre_b, np.zeros_like(from_centre_b)], axis=-1)
     add("force towards a place", [radial])
     stacked = np.stack(columns, axis=-1)
-    return ShapeLibrary(stacked.reshape(len(stacked), KNOTS * 6, -1), tuple(groups))
+    return stacked.reshape(len(stacked), KNOTS * 6, -1), groups
 
 
 def _hats(scalar: np.ndarray, pieces: int) -> list[np.ndarray]:

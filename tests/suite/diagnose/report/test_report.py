@@ -29,7 +29,9 @@ from tracks.common.files import plain
 @pytest.fixture(scope="module")
 def found(drag, flown):
     mismatches = actuator_mismatches(flown.logs, flown.vehicle)
-    return plain({**as_json.diagnosis_json(drag), "actuators": as_json.actuators_json(mismatches)})
+    return plain(
+        {**as_json.diagnosis_json(drag), "actuators": [one._asdict() for one in mismatches]}
+    )
 
 
 def texts(table: Any):

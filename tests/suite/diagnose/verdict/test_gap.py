@@ -115,12 +115,11 @@ def test_a_shape_that_grows_with_the_models_error_is_left_out_and_one_that_stays
     unit = np.zeros((2, 2, 6, 2))
     unit[..., 0, 0], unit[..., 5, 1] = [[1.0, 2.0], [3.0, 1.0]], [[2.0, 1.0], [1.0, 3.0]]
     unit = unit.reshape(2, 12, 2)
-    library = structure.ShapeLibrary(unit, ())
     hessian, names = np.tile(100.0 * np.eye(12), (2, 1, 1)), ("force", "torque")
 
     def of(error, physics):
         gradient = (hessian @ unit @ np.array([error, physics])[..., None])[..., 0]
-        return structure.DisturbanceEquations(hessian, gradient, None, library)
+        return structure.DisturbanceEquations(hessian, gradient, None, unit, {})
 
     fine, coarse = of(0.3, 0.2), of(0.9, 0.21)
     shapes = [structure.ShapeScore(n, 9.0, 5e-4, (k,)) for k, n in enumerate(names)]

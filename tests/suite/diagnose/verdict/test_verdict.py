@@ -125,7 +125,7 @@ def test_a_random_disturbance_has_its_size_or_none_at_the_end_of_the_tried_value
     rng, unit = np.random.default_rng(2), np.broadcast_to(np.eye(6), (200, 6, 6))
     noise = 2.0 * rng.standard_normal((200, 6))
     gradient = 4.0 * 2.0 * rng.standard_normal((200, 6)) + noise
-    equations = structure.DisturbanceEquations(4.0 * unit, gradient, None, None)  # type: ignore[arg-type]
+    equations = structure.DisturbanceEquations(4.0 * unit, gradient, None, unit, {})  # type: ignore[arg-type]
     sizes = np.array([0.5, 1.0, 2.0, 4.0, 8.0])
     assert sizes[_likelihood(equations, unit, sizes).argmax()] == 2.0
     assert _range_of(sizes, (sizes > 0.5) & (sizes < 8.0)) == [1.0, 4.0]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from suite.diagnose.data.view import SmoothedFlight, weak_form
+from suite.diagnose.data.view import FORCE, SmoothedFlight, weak_form
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import candidates
 from suite.diagnose.evidence.moments import centred
@@ -16,7 +16,8 @@ from suite.diagnose.report.summary import next_steps
 from suite.diagnose.search.evaluation import Evaluation, NamedEffect
 from suite.diagnose.sources.examine import contradicted
 from suite.diagnose.sources.view_source import closed_share, fit_black_box, inputs_of
-from suite.diagnose.verdict.disturbances import Swing, find_swing
+from suite.diagnose.thresholds import THRESHOLDS
+from suite.diagnose.verdict.disturbances import Swing, residual_swing
 from tests.support.diagnosis_flights import fly_all
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import with_effects
@@ -211,8 +212,14 @@ def made(period_s, pull, moved, rng, noise=0.1):
     return SmoothedFlight(rows, form, measured), left
 
 
-def swing_of(*flights):
-    return find_swing([flight for flight, _ in flights], [left for _, left in flights])
+def swing_of(*made):
+    flights, left = zip(*made, strict=True)
+    flight = np.repeat(np.arange(len(left)), [len(one) for one in left])
+    data = SimpleNamespace(residual=np.concatenate(left), flight=flight)
+    task: Any = SimpleNamespace(
+        view=FORCE, flights=flights, residuals=lambda _: data, limits=THRESHOLDS
+    )
+    return residual_swing(task, np.zeros(0))
 
 
 def test_a_pull_at_one_period_is_a_swing_and_own_motion_noise_or_other_periods_are_none():
@@ -227,7 +234,9 @@ def test_a_pull_at_one_period_is_a_swing_and_own_motion_noise_or_other_periods_a
         assert swing_of(*(made(1.4, 0.0, 0.0, rng) for _ in range(3))) is None
     assert swing_of(*(made(1.4, 0.3, 3.0, rng) for _ in range(3))) is None
     assert swing_of(*(made(period_s, 0.1, 0.0, rng) for period_s in (0.7, 1.0, 1.5, 2.2))) is None
-    assert find_swing([], []) is None
+    flight, left = made(1.4, 0.3, 0.1, rng)
+    form = flight.form._replace(middle_s=flight.form.middle_s[:7])
+    assert swing_of((flight._replace(form=form), left[:7])) is None, "too short for a spectrum"
 
 
 @pytest.mark.slow
