@@ -110,15 +110,16 @@ def _diagnose(given: DiagnosisInput, makers: Sequence[SourceMaker], seed: int) -
             verdict = verdict._replace(label="partly")
         else:
             verdict = verdict_on(unique, bool(tested), limits)
-    for finding in unique:
-        for named in finding.names:
-            large = implausible(finding.source.space, finding.theta, named.candidate, limits)
-            warnings += [
-                f"implausible: {words}, over three times the usual size" for words in large
-            ]
+    warnings += [
+        f"implausible: {words}, over three times the usual size"
+        for finding in unique
+        for named in finding.names
+        for words in implausible(finding.source.space, finding.theta, named.candidate, limits)
+    ]
     return Diagnosis(
         verdict=verdict,
         findings=unique,
+        tested=tested,
         flights=flights,
         nominal=given.vehicle,
         vehicle=with_names(given.vehicle, unique, tested),
@@ -147,6 +148,8 @@ class Diagnosis:
     verdict: Verdict
     findings: tuple[Finding, ...]
     """One finding for each source, in the order of the sources."""
+    tested: tuple[TestedEffect, ...]
+    """The effects that separate tests named."""
     flights: SourceSet
     """The sources of evidence from these flights."""
     nominal: Vehicle
@@ -162,11 +165,6 @@ class Diagnosis:
     """Seed of all random draws."""
 
     @property
-    def label(self) -> str:
-        """The verdict in a word: no_gap, named, partly or unknown."""
-        return self.verdict.label
-
-    @property
     def main(self) -> Finding:
         """The finding with named effects, or else that with the best explainable error."""
         return main_of(self.findings)
@@ -175,16 +173,6 @@ class Diagnosis:
     def named(self) -> list[tuple[Finding, NamedEffect]]:
         """Every named effect, with its finding."""
         return [(finding, named) for finding in self.findings for named in finding.names]
-
-    @property
-    def tested(self) -> tuple[TestedEffect, ...]:
-        """The effects that separate tests named."""
-        return tested_in(self.findings, self.flights)
-
-    @property
-    def limits(self) -> Thresholds:
-        """Thresholds of all steps."""
-        return self.main.source.limits
 
 
 def main_of(findings: Sequence[Finding]) -> Finding:

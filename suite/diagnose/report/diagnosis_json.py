@@ -23,13 +23,13 @@ NO_EFFECT = "that no effect of the catalogue explains"
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the entries of diagnosis.json on the named effects and the gap."""
     # The control is a wrong effect, for comparison; a swing is an oscillating force.
-    main, control, limits = diagnosis.main, diagnosis.main.control, diagnosis.limits
-    swings = [one.remaining.swing for one in diagnosis.findings if one.remaining.swing]
-    swing = swings[0] if swings else None
+    main, control, limits = diagnosis.main, diagnosis.main.control, diagnosis.main.source.limits
+    swings = (one.remaining.swing for one in diagnosis.findings)
+    swing = next(filter(None, swings), None)
     named = [effect for _, effect in diagnosis.named]
     pairs = [(effect.candidate.name, rival) for effect in named for rival in effect.rivals]
     entries: dict[str, Any] = {
-        "verdict": diagnosis.label,
+        "verdict": diagnosis.verdict.label,
         "effects": effects_json(diagnosis),
         "negligible": [
             {"name": name, "size": size._asdict(), "relevant": False}
@@ -53,7 +53,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "share": remaining_share(main.before, main.after) if named or diagnosis.tested else 1.0,
             "judged": diagnosis.verdict.share_left,
             "where": diagnosis.verdict.where,
-            "above_noise": above_noise(diagnosis),
+            "above_noise": above_noise(diagnosis, limits.above_noise),
             "swing": swing and {"period_s": swing.period_s, "length_m": swing.length_m},
             **main.remaining.details,
         },
@@ -63,8 +63,8 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     return {"headline": headline(entries), **entries}
 
 
-def above_noise(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Return an entry for each source whose remaining error is clearly above the noise floor."""
+def above_noise(diagnosis: Diagnosis, least: float) -> list[dict[str, Any]]:
+    """Return an entry for each source whose error remains above `least` times the noise floor."""
     return [
         {
             "view": one.source.name,
@@ -74,7 +74,7 @@ def above_noise(diagnosis: Diagnosis) -> list[dict[str, Any]]:
             "reason": NO_EFFECT if one.remaining.structured else one.remaining.reason,
         }
         for one in diagnosis.findings
-        if one.after.rms > diagnosis.limits.above_noise * one.after.floor
+        if one.after.rms > least * one.after.floor
     ]
 
 
@@ -178,17 +178,16 @@ def _undecided(finding: Finding, names: Sequence[NamedEffect]) -> list[int]:
 
     The flights then do not decide which motor has the effect.
     """
+    name, space = names[0].candidate.name, finding.source.space
     fitted = {index for named in names for index in named.candidate.indices}
-    space, largest_rise = finding.source.space, finding.source.limits.rival_chi2
-
-    def fits_as_well(index: int) -> bool:
-        label = f"{space.entries[index].effect} {_motor_number(space, index)}"
-        return any(named.worse_by.get(label, np.inf) <= largest_rise for named in names)
-
+    rises = [rise for named in names for rise in named.worse_by.items()]
+    close = {label for label, rise in rises if rise <= finding.source.limits.rival_chi2}
     return [
         index
         for index, entry in enumerate(space.entries)
-        if entry.effect == names[0].candidate.name and index not in fitted and fits_as_well(index)
+        if entry.effect == name
+        and index not in fitted
+        and f"{name} {_motor_number(space, index)}" in close
     ]
 
 
@@ -213,6 +212,7 @@ def parameters_json(
         return value, [max(value - width, entry.low), min(value + width, entry.high)]
 
     entries: dict[str, Any] = {}
+    fitted = {(space.entries[i].parameter, space.entries[i].component): i for i in indices}
     for parameter in EFFECTS[name].parameters:
         # An effect of single motors: the motors' numbers, and a value for each. If only one motor
         # was named, the interval of its number covers the other motors that fit as well.
@@ -229,22 +229,12 @@ def parameters_json(
                 value, ci95 = (column[0] if is_single else list(column) for column in columns)
                 entries[key] = {"value": value, "unit": unit, "ci95": ci95}
             continue
-        by_component = {
-            space.entries[index].component: index
-            for index in indices
-            if space.entries[index].parameter == parameter.name
-        }
-        if not by_component:
-            continue
         # A vector has None for components that were not fitted.
-        if parameter.size:
-            parts = [
-                value_and_interval(by_component[k]) if k in by_component else (None, None)
-                for k in range(parameter.size)
-            ]
-            value, ci95 = map(list, zip(*parts, strict=True))
-        else:
-            value, ci95 = value_and_interval(by_component[None])
+        keys = [(parameter.name, k) for k in range(parameter.size)] or [(parameter.name, None)]
+        if not any(key in fitted for key in keys):
+            continue
+        parts = [value_and_interval(fitted[k]) if k in fitted else (None, None) for k in keys]
+        value, ci95 = map(list, zip(*parts, strict=True)) if parameter.size else parts[0]
         entries[parameter.name] = {"value": value, "unit": parameter.unit, "ci95": ci95}
     return entries
 

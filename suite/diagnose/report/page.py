@@ -29,7 +29,7 @@ from suite.diagnose.report.summary import (
     superscripts,
 )
 from suite.diagnose.sources.rollout_source import Rollouts, rollouts_of
-from tracks.common.grid import Cell, Grid, table
+from tracks.common.grid import Cell, Grid, table, table_of
 
 TITLES = {
     "no_gap": "no gap",
@@ -93,30 +93,27 @@ def page(
     details = [
         Section("Errors on held-out flights", [channels_grid(gap["channels"])]),
         *([logs_section(flown.logs), noise_section(diagnosis)] if flown else []),
-        *actuators_section(result),
+        *([actuators_section(result)] if result.get("actuators") else []),
         candidates_section(diagnosis),
         rivals_section(diagnosis, result),
         residual_section(result),
         evidence_section(diagnosis, result),
         agreement_section(diagnosis),
     ]
-    return Report(
-        title=f"Diagnosis: {TITLES[result['verdict']]}",
-        lead=result["headline"],
-        facts=facts,
-        sections=[
-            Section("What to do next", [Steps(next_steps(result))]),
-            *([Section("Measured and simulated", chart)] if chart else []),
-            *([Section("Warnings", result["warnings"])] if result["warnings"] else []),
-            *_findings(result.get("findings", ())),
-            *_answer(result),
-            _written(result, toml, files),
-            *(replace(section, folded=True) for section in details),
-        ],
-    )
+    sections = [
+        Section("What to do next", [Steps(next_steps(result))]),
+        Section("Measured and simulated", chart),
+        Section("Warnings", result["warnings"]),
+        _findings(result.get("findings", ())),
+        _answer(result),
+        _written(result, toml, files),
+    ]
+    shown = [section for section in sections if section.parts]
+    shown += [replace(section, folded=True) for section in details]
+    return Report(f"Diagnosis: {TITLES[result['verdict']]}", result["headline"], facts, shown)
 
 
-def _findings(findings: Sequence[Mapping[str, Any]]) -> list[Section]:
+def _findings(findings: Sequence[Mapping[str, Any]]) -> Section:
     """Return a section on faults of the logs (such as wrong units), corrected or suspected."""
     keys = ("flight", "signal", "status", "fault", "evidence", "fix")
     rows = [
@@ -125,7 +122,7 @@ def _findings(findings: Sequence[Mapping[str, Any]]) -> list[Section]:
         if finding["status"] in ("corrected", "doubt")
     ]
     headers = ["log", *keys[1:]]
-    return [Section("Findings about the logs", [table(headers, rows)])] if rows else []
+    return Section("Findings about the logs", [table(headers, rows)] if rows else [])
 
 
 def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Grid:
@@ -151,12 +148,11 @@ def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Gr
     return table(headers, rows, note=CHANNELS)
 
 
-def _answer(result: Mapping[str, Any]) -> list[Section]:
+def _answer(result: Mapping[str, Any]) -> Section:
     """Return a section with the named effects, their equations and their parameters, if any."""
-    effects = result["effects"]
+    effects, title, rows = result["effects"], "The answer in numbers", []
     if not effects:
-        return []
-    rows = []
+        return Section(title, [])
     for effect in effects:
         removed = effect["gap_removed"]
         share = "exempt" if removed is None else f"{100 * removed:.0f} %"
@@ -172,7 +168,7 @@ def _answer(result: Mapping[str, Any]) -> list[Section]:
         "effect", "not distinguishable from", "view", "parameter", "total", "95 %", "of the gap"
     ]  # fmt: skip
     note = TOTALS.format(chance=max(effect["p_value"] for effect in effects))
-    return [Section("The answer in numbers", [*words, table(headers, rows, note=note)])]
+    return Section(title, [*words, table(headers, rows, note=note)])
 
 
 def _written(result: Mapping[str, Any], toml: str, files: set[str]) -> Section:
@@ -182,19 +178,17 @@ def _written(result: Mapping[str, Any], toml: str, files: set[str]) -> Section:
         words = "The vehicle file with the named effects, for every other command (--vehicle)."
     links = [(path, words) for path, words in FILES if path in files]
     parts: list[Part] = [words, Details("vehicle.toml", toml), Links(links)]
-    plan = result.get("plan")
-    if plan:
-        rows = [
-            (
-                flight["file"],
-                flight["trajectory"]["kind"],
-                f"{flight['trajectory']['duration_s']:g} s",
-                f"{flight['top_speed']:.1f} m/s",
-                f"{flight['top_acceleration']:.1f} m/s²",
-                " x ".join(f"{size:.1f}" for size in flight["room"]) + " m",
-            )
-            for flight in plan["flights"]
-        ]
-        headers = ["flight", "kind", "lasts", "speed", "acceleration", "needs"]
-        parts.append(table(headers, rows, "Flights to fly next", " ".join(plan["words"])))
+    if plan := result.get("plan"):
+        grid = table_of(
+            plan["flights"],
+            ("flight", lambda flight: flight["file"]),
+            ("kind", lambda flight: flight["trajectory"]["kind"]),
+            ("lasts", lambda flight: f"{flight['trajectory']['duration_s']:g} s"),
+            ("speed", lambda flight: f"{flight['top_speed']:.1f} m/s"),
+            ("acceleration", lambda flight: f"{flight['top_acceleration']:.1f} m/s²"),
+            ("needs", lambda flight: " x ".join(f"{s:.1f}" for s in flight["room"]) + " m"),
+            title="Flights to fly next",
+            note=" ".join(plan["words"]),
+        )
+        parts.append(grid)
     return Section("What was written", parts)

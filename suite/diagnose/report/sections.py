@@ -16,7 +16,7 @@ from suite.diagnose.data.windows import SLICES, UNITS
 from suite.diagnose.diagnose import Diagnosis
 from suite.diagnose.report.summary import remaining_words, short_name, superscripts
 from suite.diagnose.sources.rollout_source import of_rollouts
-from tracks.common.grid import Cell, Grid, table
+from tracks.common.grid import Cell, Grid, table, table_of
 
 SHOWN = 12
 """Largest number of logs in the table of logs."""
@@ -74,27 +74,21 @@ def noise_section(diagnosis: Diagnosis) -> Section:
     return Section("The measurement noise", [words, table(["measured", "noise"], rows)])
 
 
-def actuators_section(result: Mapping[str, Any]) -> list[Section]:
-    """Return a section that compares measured and commanded rotor speeds.
-
-    The list is empty if the logs have no measured speeds.
-    """
-    if not result.get("actuators"):
-        return []
+def actuators_section(result: Mapping[str, Any]) -> Section:
+    """Return a section that compares measured and commanded rotor speeds."""
     words = (
         f"The input of the model is {result['driven_by']}. The flight controller and the motors "
         "cause the difference between commanded and measured rotor speeds, not the air. It shows "
         "integrators and filters that the nominal rate loop lacks."
     )
     grids = [_mismatch(mismatch) for mismatch in result["actuators"]]
-    return [Section("Actuators, apart from the air", [words, *grids])]
+    return Section("Actuators, apart from the air", [words, *grids])
 
 
 def _mismatch(mismatch: Mapping[str, Any]) -> Grid:
     """Return a table that compares measured rotor speeds with one kind of command."""
 
     def spread(pair: Sequence[float]) -> str:
-        """Return a mean and a standard deviation as text."""
         return f"{pair[0]:.2f} ± {pair[1]:.2f}"
 
     explained = f"{100 * max(mismatch['followed'], 0.0):.0f} % of the variance is explained"
@@ -203,17 +197,14 @@ def residual_section(result: Mapping[str, Any]) -> Section:
         words = f"{share:.0f} % of the {of} remains. Unexplained: {where}."
     parts: list[Part] = [words]
     if remaining["above_noise"]:
-        rows = [
-            (
-                one["view"],
-                superscripts(f"{one['error']:.3g} {one['unit']}"),
-                f"{one['noise_floor']:.3g}",
-                f"an error {one['reason']}",
-            )
-            for one in remaining["above_noise"]
-        ]
-        headers = ["view", "remaining error", "noise floor", ""]
-        parts.append(table(headers, rows, "Errors above the noise floor", ABOVE_NOISE))
+        columns = (
+            ("view", lambda one: one["view"]),
+            ("remaining error", lambda one: superscripts(f"{one['error']:.3g} {one['unit']}")),
+            ("noise floor", lambda one: f"{one['noise_floor']:.3g}"),
+            ("", lambda one: f"an error {one['reason']}"),
+        )
+        title = "Errors above the noise floor"
+        parts.append(table_of(remaining["above_noise"], *columns, title=title, note=ABOVE_NOISE))
     if remaining.get("shapes"):
         shapes = remaining["shapes"]
         rows = [(s["label"], f"{s['gain']:.1f}", f"{s['p_value']:.3f}") for s in shapes]

@@ -6,7 +6,7 @@ words.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -122,46 +122,28 @@ def _effect_words(effect: Mapping[str, Any]) -> str:
 
 def next_steps(result: Mapping[str, Any]) -> list[str]:
     """Return advice on what to do after the verdict of a diagnosis.json, most useful first."""
-    use, search_for = USE, _search_for(result["unexplained"])
-    steps = {
-        "no_gap": [
+    verdict, is_change = result["verdict"], bool(result["reference"])
+    search_for = _search_for(result["unexplained"])
+    if verdict == "no_gap":
+        if is_change:
+            return [f"Keep the vehicle file that you use. {UNTESTED}"]
+        return [
             "Use the vehicle file as it is.",
             "If your task is faster than these flights, fly faster or turn harder, and repeat "
             "this.",
-        ],
-        "unknown": [
+        ]
+    if verdict == "unknown":
+        if is_change:
+            return [CHECK, "Look for what was changed on the vehicle.", *search_for]
+        return [
             CHECK,
             "suite identify wrote this vehicle file: repeat it if the vehicle has changed since."
             if result.get("identified")
             else "Run suite identify if the numbers of the vehicle file were never estimated.",
             *search_for,
             "Otherwise add an effect to the catalogue, or fit a correction with suite delta.",
-        ],
-    }
-    if result["reference"]:
-        use = f"{USE} It is your file with this change. {UNTESTED}"
-        steps["no_gap"] = [f"Keep the vehicle file that you use. {UNTESTED}"]
-        steps["unknown"] = [CHECK, "Look for what was changed on the vehicle.", *search_for]
-    separate = _separate(result)
-    return {
-        "named": [
-            use,
-            *separate,
-            "Or remove the cause on the vehicle, fly again and repeat this: expect no_gap.",
-        ],
-        "partly": [
-            f"{use} Its values are approximate; on held-out flights it is closer than your file.",
-            *separate,
-            CHECK,
-            *search_for,
-        ],
-        **steps,
-    }[result["verdict"]]
-
-
-def _separate(result: Mapping[str, Any]) -> list[str]:
-    """Return advice for each named effect that has alternatives."""
-    steps = []
+        ]
+    steps = [f"{USE} It is your file with this change. {UNTESTED}" if is_change else USE]
     for effect in result["effects"]:
         if effect["alternatives"]:
             names = ", ".join([effect["name"], *effect["alternatives"]])
@@ -172,7 +154,11 @@ def _separate(result: Mapping[str, Any]) -> list[str]:
                 f"or fly what separates {'; '.join(flights)}. suite diagnose --plan writes such "
                 "flights."
             )
-    return steps
+    if verdict == "named":
+        last = "Or remove the cause on the vehicle, fly again and repeat this: expect no_gap."
+        return [*steps, last]
+    steps[0] += " Its values are approximate; on held-out flights it is closer than your file."
+    return [*steps, CHECK, *search_for]
 
 
 def _search_for(unexplained: Mapping[str, Any]) -> list[str]:
@@ -258,11 +244,7 @@ def in_digits(number: float, interval: Sequence[float]) -> str:
 
 def components(effect: Mapping[str, Any]) -> list[Component]:
     """Return the components of a named `effect` in diagnosis.json, significant ones first."""
-    return sorted(_components(effect), key=lambda component: not component.is_significant)
-
-
-def _components(effect: Mapping[str, Any]) -> Iterator[Component]:
-    """Yield the components of a named effect in the order of its parameters."""
+    found = list[Component]()
     parameters = EFFECTS[effect["name"]].parameters if effect["name"] in EFFECTS else ()
     neutrals = {p.name: p.neutral for p in parameters if not callable(p.neutral)}
     by_motor = {p.name for p in parameters if p.one_at_a_time}
@@ -272,15 +254,17 @@ def _components(effect: Mapping[str, Any]) -> Iterator[Component]:
         if name == "index" and by_motor:
             # The numbers of the motors. Those of several motors are in the labels below instead.
             if not isinstance(value, list):
-                yield Component(name, "", value, None if span[0] == span[1] else span, None)
+                found.append(Component(name, "", value, None if span[0] == span[1] else span, None))
         elif not isinstance(value, list):
-            yield Component(name, unit, value, span, neutrals.get(name))
+            found.append(Component(name, unit, value, span, neutrals.get(name)))
         else:
             axes = "xyz" if len(value) <= 3 else range(1, len(value) + 1)
             if name in by_motor and isinstance(motors, list):
                 axes = motors
             for axis, number, pair in zip(axes, value, span or [None] * len(value), strict=False):
-                yield Component(f"{name} {axis}", unit, number, pair, neutrals.get(name))
+                label, neutral = f"{name} {axis}", neutrals.get(name)
+                found.append(Component(label, unit, number, pair, neutral))
+    return sorted(found, key=lambda component: not component.is_significant)
 
 
 def short_name(name: str) -> str:

@@ -223,9 +223,9 @@ def _mismatch(
 
 def _best_delay(cost: Callable[[float], float], limits: Thresholds) -> tuple[float, float]:
     """Return the delay of the commands with the smallest `cost` [s], and that cost."""
-    grid = np.linspace(0.0, limits.longest_delay_s, limits.delays_tried)
+    grid = np.linspace(0.0, limits.longest_delay_s, 9)
     best_index = int(np.argmin([cost(delay) for delay in grid]))
-    bounds = (grid[max(best_index - 1, 0)], grid[min(best_index + 1, limits.delays_tried - 1)])
+    bounds = (grid[max(best_index - 1, 0)], grid[min(best_index + 1, len(grid) - 1)])
     options = {"xatol": 2e-4}
     refinement = minimize_scalar(cost, bounds=bounds, method="bounded", options=options)
     lowest, undelayed = float(refinement.fun), cost(0.0)
@@ -359,7 +359,7 @@ def find_rotor_lag(
         for mismatch in by_flight
         if mismatch is not None and mismatch.rms_fitted**2 <= unexplained * mismatch.spread**2
     ]
-    if len(mismatches) < limits.lag_least_flights:
+    if len(mismatches) < limits.least_flights:
         return None
     lags = np.array([mismatch.time_constant for mismatch in mismatches])
     half_step = 0.5 * step_s(vehicle)

@@ -123,7 +123,7 @@ def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
     centre_hz = float(frequency_hz[best])
     force_ratio, share = _peak_shares(spectra, centre_hz, [one[width, best] for one in heights])
     if (
-        p_value > limits.swing_p_value
+        p_value > limits.shape_p_value
         or share < limits.swing_share
         or force_ratio < limits.swing_driven
     ):
@@ -154,13 +154,9 @@ def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None
     time = np.linspace(-1.0, 1.0, len(middle_s))
     # Subtracted first: forces that are constant, drift, or turn with the heading do not oscillate.
     zero, one = np.zeros_like(time), np.ones_like(time)
-    trend = np.stack(
-        [
-            np.stack([one, zero, time, zero, np.cos(yaw), -np.sin(yaw)], axis=1),
-            np.stack([zero, one, zero, time, np.sin(yaw), np.cos(yaw)], axis=1),
-        ],
-        axis=1,
-    )
+    along_x = np.stack([one, zero, time, zero, np.cos(yaw), -np.sin(yaw)], axis=1)
+    along_y = np.stack([zero, one, zero, time, np.sin(yaw), np.cos(yaw)], axis=1)
+    trend = np.stack([along_x, along_y], axis=1)
     trend_columns = trend.reshape(-1, trend.shape[-1])
     window = np.hanning(grid_size)[:, None]
     powers = []
@@ -181,13 +177,8 @@ def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None
 def _peak_gains(spectrum: Spectrum, centre_hz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return gains in log-likelihood by peaks, and their heights, (widths, `centre_hz`) each."""
     frequency = spectrum.frequency_hz
-    background = np.stack(
-        [
-            np.ones_like(frequency),
-            frequency**2,
-            *(1.0 / (1.0 + (frequency / corner) ** 2) ** 2 for corner in CORNERS_HZ),
-        ]
-    )
+    falling = (1.0 / (1.0 + (frequency / corner) ** 2) ** 2 for corner in CORNERS_HZ)
+    background = np.stack([np.ones_like(frequency), frequency**2, *falling])
     without, _ = _fit_spectrum(spectrum.residual, background[None])
     shapes = []
     for width in WIDTHS:
@@ -195,9 +186,8 @@ def _peak_gains(spectrum: Spectrum, centre_hz: np.ndarray) -> tuple[np.ndarray, 
         shapes.append(1.0 / (1.0 + ((frequency - centre_hz[:, None]) / half_hz) ** 2) ** 2)
     peaks = np.concatenate(shapes)[:, None]
     backgrounds = np.broadcast_to(background, (len(peaks), *background.shape))
-    with_peak, weights = _fit_spectrum(
-        spectrum.residual, np.concatenate([backgrounds, peaks], axis=1)
-    )
+    every = np.concatenate([backgrounds, peaks], axis=1)
+    with_peak, weights = _fit_spectrum(spectrum.residual, every)
     shape = (len(WIDTHS), len(centre_hz))
     return (with_peak - without).reshape(shape), weights[:, -1].reshape(shape)
 
@@ -245,8 +235,7 @@ def find_turbulence(
     transmission, limits = _wind_transmission(model, theta, disturbance.knot), disturbance.limits
     if np.abs(transmission).max() < 1e-6:
         return None
-    lengths_m = np.geomspace(*limits.wind_lengths_m)
-    intensities = np.geomspace(*limits.wind_intensities)
+    lengths_m, intensities = np.geomspace(0.5, 40.0, 25), np.geomspace(0.02, 8.0, 121)
     roots = [transmission @ _wind_root(disturbance.knot, length) for length in lengths_m]
     table = np.stack([_likelihood(disturbance, root, intensities) for root in roots])
     i, j = np.unravel_index(int(table.argmax()), table.shape)
@@ -310,8 +299,7 @@ def _wind_root(knot: Flown, length_m: float) -> np.ndarray:
     distance = np.concatenate([np.zeros((len(speed), 1)), np.cumsum(step, axis=1)], axis=1)
     correlation = np.exp(-np.abs(distance[:, :, None] - distance[:, None, :]))
     root = np.linalg.cholesky(correlation + 1e-9 * np.eye(KNOTS))
-    axes = np.diag([1.0, 1.0, VERTICAL])
-    return np.einsum("wkl,ab->wkalb", root, axes).reshape(len(root), KNOTS * 3, KNOTS * 3)
+    return np.kron(root, np.diag([1.0, 1.0, VERTICAL]))
 
 
 def _likelihood(equations: DisturbanceEquations, root: np.ndarray, sizes: np.ndarray) -> np.ndarray:
@@ -353,8 +341,7 @@ def _free_likelihood(equations: DisturbanceEquations) -> float:
     def loss(logs: np.ndarray) -> float:
         sizes, tau_s = np.exp(logs[:6]), np.exp(logs[6])
         correlation = np.exp(-np.abs(time[:, None] - time) / tau_s) + 1e-9 * np.eye(KNOTS)
-        root = np.einsum("kl,ab->kalb", np.linalg.cholesky(correlation), np.diag(sizes))
-        root = root.reshape(1, KNOTS * 6, KNOTS * 6).repeat(len(equations.gradient), axis=0)
+        root = np.kron(np.linalg.cholesky(correlation), np.diag(sizes))
         return -float(_likelihood(equations, root, np.ones(1))[0])
 
     start = np.log([0.05, 0.05, 0.05, 0.01, 0.01, 0.01, 0.5])

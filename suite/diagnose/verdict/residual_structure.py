@@ -27,6 +27,10 @@ from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.model_error import beyond_error
 
+NOISE_ERROR = 0.02
+"""Relative uncertainty of the measured noise power."""
+THRUST_REVERSAL = 10.0
+"""Rate of change of thrust above which only its sign counts [m/s^3]."""
 AXES = ("force x", "force y", "force z", "torque x", "torque y", "torque z")
 
 
@@ -81,7 +85,7 @@ def disturbance_equations(
     columns = range(response.slope.shape[-1])
     disturbed = Linearisation(response.residual, response.slope, estimate.free)
     equations = block_of(whitening, disturbed, columns, windows).equations
-    shapes = _shapes(response.knot, np.asarray(windows.start_s), limits)
+    shapes = _shapes(response.knot, np.asarray(windows.start_s))
     terms = (equations.hessian, equations.gradient, response.knot)
     return DisturbanceEquations(*terms, *shapes, limits)
 
@@ -174,29 +178,27 @@ def _energy_p_value(equations: DisturbanceEquations, axis: int) -> float:
     directions count. The weighted sum is approximately gamma distributed (Satterthwaite 1946). The
     smallest p-value is multiplied by the number of tests (Bonferroni).
     """
-    entries, limits = np.arange(KNOTS) * 6 + axis, equations.limits
+    entries = np.arange(KNOTS) * 6 + axis
     hessian = equations.hessian[:, entries][:, :, entries]
     gradient = equations.gradient[:, entries]
     time = np.linspace(0.0, 1.0, KNOTS)
     p_values = []
-    for correlation_s in limits.colours_s:
+    for correlation_s in (0.3, 0.03):  # as of gusts and of rotors
         root = np.linalg.cholesky(np.exp(-np.abs(time[:, None] - time) / correlation_s))
         information, along = diagonalised(hessian, gradient, root)
-        informed = information > limits.informed_share * max(float(information.max()), 1e-12)
+        informed = information > 1e-9 * max(float(information.max()), 1e-12)
         information, along = information[informed], along[informed]
-        for share in limits.disturbance_quantiles:
+        for share in (0.9, 0.5, 0.1):  # quantiles that set the tested sizes
             size = 1.0 / np.quantile(information, share)
             weight = size * information / (1.0 + size * information)
             mean = float(weight.sum())
-            variance = 2.0 * float((weight**2).sum()) + (limits.noise_error * mean) ** 2
+            variance = 2.0 * float((weight**2).sum()) + (NOISE_ERROR * mean) ** 2
             energy = float((weight * (along**2 / information)).sum())
             p_values.append(float(gamma.sf(energy, mean**2 / variance, scale=variance / mean)))
     return min(1.0, len(p_values) * min(p_values))
 
 
-def _shapes(
-    knot: Flown, start_s: np.ndarray, limits: Thresholds
-) -> tuple[np.ndarray, dict[str, tuple[int, ...]]]:
+def _shapes(knot: Flown, start_s: np.ndarray) -> tuple[np.ndarray, dict[str, tuple[int, ...]]]:
     """Return `unit` and `groups` of all shapes at the knots, as in `DisturbanceEquations`.
 
     `start_s` (W,) is the start of each window, from the start of its flight [s].
@@ -225,7 +227,7 @@ def _shapes(
         "the thrust": thrust,
         "the thrust's square": thrust**2,
         "the thrust's change": change,
-        "the thrust's direction of change": np.tanh(change / limits.thrust_reversal),
+        "the thrust's direction of change": np.tanh(change / THRUST_REVERSAL),
         "thrust times velocity along x": thrust * vel_b[..., 0],
         "thrust times velocity along y": thrust * vel_b[..., 1],
         "the heading": np.cos(yaw),
@@ -246,20 +248,20 @@ def _shapes(
         add(f"force with {label}", [along[..., i, :] for i in range(3)])
         add(f"torque with {label}", [along[..., i, :] for i in range(3, 6)])
     # A drag whose dependence on the speed is free.
-    motion = [hat[..., None] * vel_b for hat in _hats(speed, limits.pieces)]
+    motion = [hat[..., None] * vel_b for hat in _hats(speed)]
     add("force with the motion, by its speed", [
         along_b[..., i, None] * unit_axes[i] for along_b in motion for i in range(3)
     ])  # fmt: skip
     for label, scalar in (("thrust", thrust), ("climb", vel_w[..., 2]), ("height", pos_w[..., 2])):
         add(
             f"force along body z, by the {label}",
-            [h[..., None] * unit_axes[2] for h in _hats(scalar, limits.pieces)],
+            [h[..., None] * unit_axes[2] for h in _hats(scalar)],
         )
     # Forces along world axes, everywhere or near a place.
     world = np.concatenate([axes_b, np.zeros_like(axes_b)], axis=-2)
     add("force along fixed directions", [world[..., i] for i in range(3)])
     add("force with the place", [
-        world[..., i] * bump[..., None] for bump in _bumps(pos_w, limits.cells) for i in range(3)
+        world[..., i] * bump[..., None] for bump in _bumps(pos_w) for i in range(3)
     ])  # fmt: skip
     from_centre_b = np.einsum("wkij,wkj->wki", axes_b, pos_w - pos_w.mean(axis=(0, 1)))
     radial = np.concatenate([from_centre_b, np.zeros_like(from_centre_b)], axis=-1)
@@ -268,23 +270,23 @@ def _shapes(
     return stacked.reshape(len(stacked), KNOTS * 6, -1), groups
 
 
-def _hats(scalar: np.ndarray, pieces: int) -> list[np.ndarray]:
+def _hats(scalar: np.ndarray) -> list[np.ndarray]:
     """Return hat functions (piecewise linear bumps) of `scalar` (W, KNOTS), each (W, KNOTS).
 
-    They stand on quantiles of the scalar.
+    They stand on six quantiles of the scalar.
     """
-    corners = np.unique(np.quantile(scalar, np.linspace(0.0, 1.0, pieces + 1)))
+    corners = np.unique(np.quantile(scalar, np.linspace(0.0, 1.0, 6)))
     if len(corners) < 2:
         return [np.ones_like(scalar)]
     return [np.interp(scalar, corners, heights) for heights in np.eye(len(corners))]
 
 
-def _bumps(pos_w: np.ndarray, cells: int) -> list[np.ndarray]:
-    """Return Gaussian bumps on a grid over the horizontal positions, each (W, KNOTS)."""
+def _bumps(pos_w: np.ndarray) -> list[np.ndarray]:
+    """Return 4 x 4 Gaussian bumps on a grid over the horizontal positions, each (W, KNOTS)."""
     low, high = pos_w[..., :2].min(axis=(0, 1)), pos_w[..., :2].max(axis=(0, 1))
-    width = np.maximum(high - low, 0.5) / (cells - 1)
+    width = np.maximum(high - low, 0.5) / 3
     bumps = []
-    for cell in np.ndindex(cells, cells):
+    for cell in np.ndindex(4, 4):
         distance = (pos_w[..., :2] - low) / width - cell
         bumps.append(np.exp(-0.5 * (distance**2).sum(axis=-1) / 0.5**2))
     return bumps

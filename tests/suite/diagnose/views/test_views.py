@@ -35,7 +35,7 @@ def found_in(logs, vehicle=VEHICLE, view=None):
 
 
 def test_a_drag_is_named_and_closes_what_any_model_could(by_views):
-    assert by_views.label == "named" and by_views.warnings == []
+    assert by_views.verdict.label == "named" and by_views.warnings == []
     assert by_views.vehicle.effects["linear_drag"].coefficient[0] == pytest.approx(0.4, abs=0.05)
     force, left = by_views.findings[0], by_views.findings[0].remaining
     assert left.gap_details["closed"] > 0.8 > 0.3 * left.explainable
@@ -90,7 +90,7 @@ def test_a_battery_that_sags_is_named_with_its_size(rate, duration_s, fall):
         logs = [replace(log, voltage=16.8 - fall * (log.time_s - log.time_s[0])) for log in logs]
     names, found = found_in(logs)
     ((_, name),) = found.named
-    assert set(names) == {"battery_sag"} and (fall == 0.0 or found.label == "named")
+    assert set(names) == {"battery_sag"} and (fall == 0.0 or found.verdict.label == "named")
     sag = found.vehicle.effects["battery_sag"]
     if fall:
         assert sag.per_volt == pytest.approx(rate / fall, rel=0.1)
@@ -149,7 +149,7 @@ def test_flights_that_hardly_move_leave_wind_and_drag_and_a_leaning_frame():
 def test_noise_of_the_rotor_speeds_is_no_inertia_and_no_thrust():
     """Noise in what drives makes every slope smaller, as more inertia would."""
     names, found = found_in(flights(4, 204, 5.0, 1.5))
-    assert (found.label, names) == ("no_gap", {})
+    assert (found.verdict.label, names) == ("no_gap", {})
 
 
 def pushed(extra, seed, duration_s=6.0):
@@ -173,7 +173,7 @@ def hysteresis(motion, t):
 )
 def test_what_is_outside_the_catalogue_is_no_wind_and_no_thrust_alone(extra, seed, duration_s):
     names, found = found_in(pushed(extra, seed, duration_s))
-    assert found.label in ("partly", "unknown") and "constant_wind" not in names
+    assert found.verdict.label in ("partly", "unknown") and "constant_wind" not in names
     assert found.verdict.where is not None
 
 
@@ -184,7 +184,7 @@ def test_a_force_that_nothing_explains_is_not_no_gap():
         return 1.5 * np.array([np.sin(1.5 * motion.pos_w[0]), np.cos(1.5 * motion.pos_w[1]), 0.0])
 
     names, found = found_in(pushed(by_place, 20))
-    assert (found.label, names) == ("unknown", {})
+    assert (found.verdict.label, names) == ("unknown", {})
     assert found.verdict.share_left > 0.9 and "m/s^2 beyond the noise" in found.verdict.where
     shown = found.main.source.series(found.main.search)
     assert shown.label.partition("body ")[2][0] in "xy", "the picture shows where the error is"
@@ -194,7 +194,7 @@ def test_a_force_that_nothing_explains_is_not_no_gap():
 def test_one_effect_is_named_without_a_second_small_one_but_with_what_looks_alike():
     names, found = found_in(flights(4, seed=11, speed=4.0, blade_flapping=(2e-6,)))
     ((name, rivals),) = names.items()
-    assert found.label == "named" and "blade_flapping" in {name, *rivals}
+    assert found.verdict.label == "named" and "blade_flapping" in {name, *rivals}
     names, _ = found_in(flights(4, seed=12, speed=1.0, mass_offset=(0.08,)))
     assert {"mass_offset", "thrust_scale"} <= {*names, *set().union(*names.values())}
 
@@ -244,7 +244,7 @@ def test_a_load_on_a_line_is_said_to_swing_with_its_period():
     logs = flights(4, seed=1, duration_s=10.0, speed=1.0, load=(0.08, 0.5))
     _, found = found_in(logs)
     swing = found.findings[0].remaining.swing
-    assert found.label in ("partly", "unknown") and swing is not None
+    assert found.verdict.label in ("partly", "unknown") and swing is not None
     # A pendulum on a free body of 0.75 kg swings faster than on a wall, by sqrt(1 + 0.08 / 0.75).
     assert swing.period_s == pytest.approx(1.42 / np.sqrt(1.0 + 0.08 / 0.75), rel=0.08)
     entries = diagnosis_json(found)
