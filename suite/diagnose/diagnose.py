@@ -121,7 +121,6 @@ def _diagnose(given: DiagnosisInput, makers: Sequence[SourceMaker], seed: int) -
         findings=unique,
         tested=tested,
         flights=flights,
-        nominal=given.vehicle,
         vehicle=with_names(given.vehicle, unique, tested),
         references=tuple(log.name for log in given.references),
         warnings=warnings,
@@ -152,10 +151,8 @@ class Diagnosis:
     """The effects that separate tests named."""
     flights: SourceSet
     """The sources of evidence from these flights."""
-    nominal: Vehicle
-    """The vehicle that the simulation used."""
     vehicle: Vehicle
-    """The nominal vehicle with the named effects."""
+    """The vehicle that the simulation used, with the named effects."""
     references: tuple[str, ...]
     """Names of the flights before a change, if one was searched for."""
     warnings: list[str]

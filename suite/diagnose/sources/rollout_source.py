@@ -222,15 +222,15 @@ class RolloutSource(Source):
         self, found: SearchResult, seed: int
     ) -> tuple[ResidualStructure, TestedEffect | None]:
         """Return the structure in the remaining error, and the wind that may cause it."""
-        evidence, limits, model = of_rollouts(found.last), self.limits, self.model
-        windows, whitening = evidence.trusted, evidence.whitening
-        equations = disturbance_equations(model, windows, whitening, found.estimate, limits)
+        evidence, limits = of_rollouts(found.last), self.limits
+        windows = evidence.trusted
+        equations = disturbance_equations(evidence, windows, found.estimate)
         fold = folds_of(windows.flight, windows.start_s, limits.folds)
         residual = residual_structure(equations, fold, seed)
         wind = self._wind(found, equations, residual)
         is_significant = any(s.p_value <= limits.shape_p_value for s in residual.shapes)
         if self.coarser is not None and is_significant:
-            coarse = disturbance_equations(model, self.coarser, whitening, found.estimate, limits)
+            coarse = disturbance_equations(evidence, self.coarser, found.estimate)
             residual = beyond_model_error(residual, equations, coarse, self.coarser_share)
         return residual, wind
 

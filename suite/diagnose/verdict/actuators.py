@@ -27,6 +27,7 @@ from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.sampling import follow_lag, hold, interpolate, on_every_row
 from suite.diagnose.data.steps import has_firmware_loop, rotor_mixer, step_s
+from suite.diagnose.evidence.moments import means_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
@@ -322,10 +323,8 @@ def flown_by_other_controller(
         for stretch in _stretches(log, plant, RATE_LOOP, limits):
             commanded = _at_rows(stretch.commanded(delay), stretch.row, dt, lag)
             bin_of_row = (stretch.row * dt / limits.speed_mean_s).astype(int)
-            used_bins, bin_index = np.unique(bin_of_row, return_inverse=True)
-            sums = np.zeros((len(used_bins), 8))
-            np.add.at(sums, bin_index, np.concatenate([stretch.measured, commanded], axis=1))
-            measured, by_loop = np.split(sums / np.bincount(bin_index)[:, None], 2, axis=1)
+            both = np.concatenate([stretch.measured, commanded], axis=1)
+            measured, by_loop = np.split(means_of(both, bin_of_row), 2, axis=1)
             error += float(((measured - by_loop) ** 2).sum())
             variation += float(((measured - measured.mean(axis=0)) ** 2).sum())
             count += measured.size

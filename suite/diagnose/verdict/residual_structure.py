@@ -17,13 +17,13 @@ import numpy as np
 from scipy.stats import gamma
 
 from eval.effects.interface import GRAVITY
-from suite.diagnose.data.whitening import Linearisation, Whitening, block_of
+from suite.diagnose.data.whitening import Linearisation, block_of
 from suite.diagnose.data.windows import KNOTS, FlightWindows
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.gauss_newton import Z95
 from suite.diagnose.estimate.permutation import permutation_test
 from suite.diagnose.evidence.rollout import Flown
-from suite.diagnose.evidence.rollouts import RolloutModel
+from suite.diagnose.evidence.rollouts import RolloutEvidence
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.model_error import beyond_error
 
@@ -74,20 +74,19 @@ class ResidualStructure(NamedTuple):
 
 
 def disturbance_equations(
-    model: RolloutModel,
-    windows: FlightWindows,
-    whitening: Whitening,
-    estimate: Estimate,
-    limits: Thresholds = THRESHOLDS,
+    evidence: RolloutEvidence, windows: FlightWindows, estimate: Estimate
 ) -> DisturbanceEquations:
-    """Return the normal equations of a disturbance that may explain the residual at `estimate`."""
-    response = model.respond(estimate.theta, estimate.free, windows)
+    """Return the normal equations of a disturbance that may explain the residual at `estimate`.
+
+    `windows` are those of the `evidence`, or the same with another input.
+    """
+    response = evidence.model.respond(estimate.theta, estimate.free, windows)
     columns = range(response.slope.shape[-1])
     disturbed = Linearisation(response.residual, response.slope, estimate.free)
-    equations = block_of(whitening, disturbed, columns, windows).equations
+    equations = block_of(evidence.whitening, disturbed, columns, windows).equations
     shapes = _shapes(response.knot, np.asarray(windows.start_s))
     terms = (equations.hessian, equations.gradient, response.knot)
-    return DisturbanceEquations(*terms, *shapes, limits)
+    return DisturbanceEquations(*terms, *shapes, evidence.limits)
 
 
 def residual_structure(
@@ -276,8 +275,6 @@ def _hats(scalar: np.ndarray) -> list[np.ndarray]:
     They stand on six quantiles of the scalar.
     """
     corners = np.unique(np.quantile(scalar, np.linspace(0.0, 1.0, 6)))
-    if len(corners) < 2:
-        return [np.ones_like(scalar)]
     return [np.interp(scalar, corners, heights) for heights in np.eye(len(corners))]
 
 
@@ -285,8 +282,5 @@ def _bumps(pos_w: np.ndarray) -> list[np.ndarray]:
     """Return 4 x 4 Gaussian bumps on a grid over the horizontal positions, each (W, KNOTS)."""
     low, high = pos_w[..., :2].min(axis=(0, 1)), pos_w[..., :2].max(axis=(0, 1))
     width = np.maximum(high - low, 0.5) / 3
-    bumps = []
-    for cell in np.ndindex(4, 4):
-        distance = (pos_w[..., :2] - low) / width - cell
-        bumps.append(np.exp(-0.5 * (distance**2).sum(axis=-1) / 0.5**2))
-    return bumps
+    distances = [(pos_w[..., :2] - low) / width - cell for cell in np.ndindex(4, 4)]
+    return [np.exp(-0.5 * (distance**2).sum(axis=-1) / 0.5**2) for distance in distances]

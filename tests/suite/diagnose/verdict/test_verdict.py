@@ -112,9 +112,9 @@ def test_without_the_name_its_shape_is_left_and_a_drag_is_not_taken_for_wind(fou
     found, details = found_drag.search, found_drag.remaining.details
     evidence, bare = of_rollouts(found.last), found.estimate._replace(theta=flown.start.theta)
     windows = evidence.trusted
-    given = (flown.model, windows, evidence.whitening)
-    both = (structure.disturbance_equations(*given, one) for one in (bare, found.estimate))
-    equations, with_it = both
+    equations, with_it = (
+        structure.disturbance_equations(evidence, windows, one) for one in (bare, found.estimate)
+    )
     with_gap = structure.residual_structure(equations, np.arange(len(windows.flight)) % 5)
     assert with_gap.shapes[0].gain > 10.0 * max(details["shapes"][0]["gain"], 1.0)
     assert min(with_gap.coloured.values()) < 1e-6 <= min(details["coloured"].values())
