@@ -39,17 +39,11 @@ class Thresholds:
     lag_settled_s: float = 0.2
     """Time that is left out of the comparison of rotor speeds after the first row and after each
     hole, until the effect of the unknown initial speeds has decayed [s]."""
-    longest_lag_s: float = 0.15
-    """Longest time constant of the rotors in the fit [s]."""
     lag_followed_share: float = 0.99
     """Least share of the rotor speeds' variance that commands and a lag must explain. If speeds
     change little, noise of the rates in the commanded speeds resembles a lag."""
     lag_closed_share: float = 0.25
     """Least share by which another lag lowers the squared error that the vehicle's own lag has."""
-    longest_delay_s: float = 0.06
-    """Longest delay of commands in the fit [s]."""
-    actuator_flight_s: float = 60.0
-    """Longest flight time for the comparison of rotor speeds [s]."""
     held_out_share: float = 0.2
     """Share of the flights that is held out; at least one flight is."""
     lone_fitted_share: float = 0.7
@@ -212,9 +206,6 @@ class Thresholds:
     """Probability of a false name of a change, over all candidates and views."""
     change_draws: int = 9999
     """Number of draws of the null of a change, for all candidates together."""
-    swing_periods_s: tuple[float, float] = (0.6, 3.5)
-    """Periods at which a swing (an oscillating force, as of a load on a line) is searched for:
-    those of pendulums of 0.1 to 3 m [s]."""
     swing_share: float = 0.15
     """Least share of the force residual's power that oscillates at the period of the peak."""
     swing_driven: float = 0.5
@@ -234,8 +225,8 @@ class Thresholds:
     """Least fall of the held-out squared error by a name, as a share of the residual above the
     noise, if that residual is significant."""
     shape_p_value: float = 0.001
-    """Largest p-value with which a function of the state, or a swing of any period, counts as
-    structure in the residual."""
+    """Largest p-value with which a function of the state, or a swing (an oscillating force) of any
+    period, counts as structure in the residual."""
     colour_p_value: float = 1e-4
     """Largest p-value with which a smooth disturbance along an axis counts as structure."""
     structure: float = 1.15

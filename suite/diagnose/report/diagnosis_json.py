@@ -16,9 +16,6 @@ from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.source import Finding
 from suite.diagnose.verdict.gap import EffectSize, remaining_share
 
-NO_EFFECT = "that no effect of the catalogue explains"
-"""Reason of a remaining error that has structure."""
-
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the entries of diagnosis.json on the named effects and the gap."""
@@ -71,7 +68,9 @@ def above_noise(diagnosis: Diagnosis, least: float) -> list[dict[str, Any]]:
             "error": one.after.rms,
             "noise_floor": one.after.floor,
             "unit": one.source.unit,
-            "reason": NO_EFFECT if one.remaining.structured else one.remaining.reason,
+            "reason": "that no effect of the catalogue explains"
+            if one.remaining.structured
+            else one.remaining.reason,
         }
         for one in diagnosis.findings
         if one.after.rms > least * one.after.floor
@@ -84,12 +83,8 @@ def not_examined(diagnosis: Diagnosis) -> list[str]:
     The rate loop is tested if effects that need commands as the model's input are candidates.
     """
     views = {one.source.name for one in diagnosis.findings}
-    tried = {
-        effect
-        for one in diagnosis.findings
-        for candidate in one.source.candidates
-        for effect in effects_in(candidate.name)
-    }
+    names = [candidate.name for one in diagnosis.findings for candidate in one.source.candidates]
+    tried = {effect for name in names for effect in effects_in(name)}
     parts = [] if "whole" in views else [name for name in ("force", "torque") if name not in views]
     by_command = any("command" in EFFECTS[name].needs for name in tried if name in EFFECTS)
     return [*parts, *([] if by_command else ["rate loop"])]

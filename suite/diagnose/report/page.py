@@ -45,8 +45,6 @@ FILES = (
     ("plan/plan.json", "flights that separate effects which these flights do not"),
 )
 """Files next to the report, and their description."""
-LEAST_FLOOR = 1e-9
-"""Least noise floor, in any unit, of a channel that a log measured."""
 TOTALS = (
     "Values are totals: they replace those of the vehicle file. Of the gap: the share that this "
     "effect removes when it is added last. Chance gives a false name with a probability of at most "
@@ -134,7 +132,7 @@ def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Gr
     for group, values in channels.items():
         for channel, error in values.items():
             floor = error["noise_floor"]
-            if floor < LEAST_FLOOR:
+            if floor < 1e-9:  # in any unit; no log measured this channel
                 continue
             unit = f" [{UNITS[channel]}]" if channel in UNITS else ""
             tone = "good" if error["after"] < 1.2 * floor else ""

@@ -105,11 +105,13 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     coarser = take(windows_of(coarser=windows)[0], is_finite) if has_error else None
     all_windows, windows, linear = windows, take(windows, is_finite), take(linear, is_finite)
     if coarser is not None:
-        limits = with_model_error(model, start.theta, windows, linear, coarser, limits)
+        other = model.residual(start.theta, linear.offset, coarser)
+        limits = with_model_error(windows, linear, other, limits)
     coarser_share = 0.0 if coarser is None or not rotor_input else _coarser_share(logs, vehicle)
     if not rotor_input and commands_are_slow(logs, limits):
         fewer = take(windows_of(fewer_commands=all_windows)[0], is_finite)
-        held = with_held_commands(model, start.theta, windows, linear, fewer, limits)
+        other = model.residual(start.theta, linear.offset, fewer)
+        held = with_held_commands(windows, linear, other, limits)
         if held is not None:
             limits, coarser, coarser_share = held, fewer, 1.0
             warnings.append(LACKING)

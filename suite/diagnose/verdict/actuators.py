@@ -169,7 +169,7 @@ def _mismatch(
     dt, nominal_lag, stretches = step_s(vehicle), vehicle.rotors.time_constant, list[_Stretch]()
     plant = make_plant(vehicle, dt, {})
     for log in logs:
-        if sum(int(np.ptp(one.row)) for one in stretches) * dt < limits.actuator_flight_s:
+        if sum(int(np.ptp(one.row)) for one in stretches) * dt < 60.0:  # more adds little
             stretches += _stretches(log, plant, commanded_by, limits)
     if not stretches:
         return None
@@ -192,16 +192,13 @@ def _mismatch(
     def best_lag(delay: float) -> tuple[float, float]:
         """Return the mean squared error with the best lag, and that lag [s]."""
         cost = partial(squared_error, commanded(delay))
-        bounds, options = (0.0, limits.longest_lag_s), {"xatol": 1e-4}
-        best = minimize_scalar(cost, bounds=bounds, method="bounded", options=options)
+        best = minimize_scalar(cost, bounds=(0.0, 0.15), method="bounded", options={"xatol": 1e-4})
         return min((float(best.fun), float(best.x)), (cost(0.0), 0.0))
 
     # Best delay and lag together, and the best delay for the nominal lag.
-    delay, _ = _best_delay(lambda delay: best_lag(delay)[0], limits)
+    delay, _ = _best_delay(lambda delay: best_lag(delay)[0])
     _, time_constant = best_lag(delay)
-    _, nominal_error = _best_delay(
-        lambda delay: squared_error(commanded(delay), nominal_lag), limits
-    )
+    _, nominal_error = _best_delay(lambda delay: squared_error(commanded(delay), nominal_lag))
     nominal = lagged(commanded(0.0), nominal_lag)
     fitted = lagged(commanded(delay), time_constant)
     scale = scales(fitted)
@@ -222,9 +219,9 @@ def _mismatch(
     )
 
 
-def _best_delay(cost: Callable[[float], float], limits: Thresholds) -> tuple[float, float]:
+def _best_delay(cost: Callable[[float], float]) -> tuple[float, float]:
     """Return the delay of the commands with the smallest `cost` [s], and that cost."""
-    grid = np.linspace(0.0, limits.longest_delay_s, 9)
+    grid = np.linspace(0.0, 0.06, 9)
     best_index = int(np.argmin([cost(delay) for delay in grid]))
     bounds = (grid[max(best_index - 1, 0)], grid[min(best_index + 1, len(grid) - 1)])
     options = {"xatol": 2e-4}
@@ -366,9 +363,8 @@ def find_rotor_lag(
     half_width = float(stats.t.ppf(0.975, len(lags) - 1)) * standard_error + half_step
     difference = float(abs(lags.mean() - known))
     nominal_error = sum(mismatch.rms_own**2 for mismatch in mismatches)
-    closed = 1.0 - sum(mismatch.rms_fitted**2 for mismatch in mismatches) / max(
-        nominal_error, 1e-12
-    )
+    fitted_error = sum(mismatch.rms_fitted**2 for mismatch in mismatches)
+    closed = 1.0 - fitted_error / max(nominal_error, 1e-12)
     t = (difference - half_step) / max(standard_error, 1e-9)
     p_value = float(2.0 * stats.t.sf(t, len(lags) - 1))
     if p_value > limits.name_p_value or closed < limits.lag_closed_share:

@@ -45,14 +45,6 @@ WIDTHS = (0.03, 0.1)
 """Tested half widths of a peak, as shares of its frequency."""
 HANN_BINS = 1.5
 """Width of a spectral line after a Hann window, and of the correlation of bins [frequency bins]."""
-ROUNDS = 60
-"""Number of multiplicative updates in the fit of a spectrum."""
-LEAST_MEANS = 8
-"""Smallest number of mean accelerations in a flight that gives a spectrum."""
-LEAST_FILLED = 0.7
-"""Smallest share of the time grid that must have measurements for a spectrum."""
-LEAST_BINS = 12
-"""Least number of frequencies in a spectrum."""
 
 
 class Swing(NamedTuple):
@@ -108,7 +100,7 @@ def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
     spectra = [spectrum for spectrum in every if spectrum is not None]
     if not spectra:
         return None
-    shortest_s, longest_s = limits.swing_periods_s
+    shortest_s, longest_s = 0.6, 3.5  # periods of pendulums of 0.1 to 3 m
     frequency_hz = np.arange(1.0 / longest_s, 1.0 / shortest_s + STEP_HZ, STEP_HZ)
     gains, heights = zip(*(_peak_gains(s, frequency_hz) for s in spectra), strict=True)
     flight_gain = np.array(gains)  # (F, widths, frequencies)
@@ -136,17 +128,17 @@ def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
 
 
 def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None:
-    """Return the spectrum of one flight; None where it is too short for one.
+    """Return the spectrum of one flight; None where it is too short for one, or has many holes.
 
     `residual_b` (M, 3) is its residual force in body axes [m/s^2].
     """
     middle_s = flight.form.middle_s
-    if len(middle_s) < LEAST_MEANS:
+    if len(middle_s) < 8:
         return None
     step_s = float(np.median(np.diff(middle_s)))
     grid_index = np.round((middle_s - middle_s[0]) / step_s).astype(int)
     grid_size = int(grid_index[-1]) + 1
-    if grid_size * step_s * BAND_HZ[0] < 1.0 or len(middle_s) < LEAST_FILLED * grid_size:
+    if grid_size * step_s * BAND_HZ[0] < 1.0 or len(middle_s) < 0.7 * grid_size:
         return None
     rot_w = np.asarray(flight.rows.rot_w)[flight.form.middle_row]
     residual_w = (rot_w @ residual_b[..., None])[..., 0][:, :2]
@@ -168,7 +160,7 @@ def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None
         powers.append((np.abs(transform) ** 2).sum(axis=1))
     frequency_hz = np.fft.rfftfreq(grid_size, step_s)
     in_band = (frequency_hz >= BAND_HZ[0]) & (frequency_hz <= BAND_HZ[1])
-    if in_band.sum() < LEAST_BINS:
+    if in_band.sum() < 12:
         return None
     residual, measured = (power[in_band] for power in powers)
     return Spectrum(frequency_hz[in_band], residual, measured, HANN_BINS / (grid_size * step_s))
@@ -201,7 +193,7 @@ def _fit_spectrum(power: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np
     scale = shapes.mean(axis=2, keepdims=True)
     unit_shapes = shapes / scale
     weights = np.full(unit_shapes.shape[:2], float(power.mean()) / unit_shapes.shape[1])
-    for _ in range(ROUNDS):
+    for _ in range(60):
         model = np.einsum("ct,ctj->cj", weights, unit_shapes)
         numerator = np.einsum("ctj,cj->ct", unit_shapes, power / model**2)
         weights = weights * np.sqrt(numerator / np.einsum("ctj,cj->ct", unit_shapes, 1.0 / model))

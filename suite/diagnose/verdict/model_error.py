@@ -30,7 +30,6 @@ from suite.diagnose.data.whitening import (
     slow_energy,
 )
 from suite.diagnose.data.windows import SLICES, FlightWindows
-from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.thresholds import Thresholds
 
 FAST = ("rates", "rotor speed")
@@ -38,31 +37,21 @@ FAST = ("rates", "rotor speed")
 
 
 def with_model_error(
-    model: RolloutModel,
-    theta: np.ndarray,
-    windows: FlightWindows,
-    linear: Linearisation,
-    coarser: FlightWindows,
-    limits: Thresholds,
+    windows: FlightWindows, linear: Linearisation, coarser: np.ndarray, limits: Thresholds
 ) -> Thresholds:
     """Return `limits` with the lower limits of the noise raised to the model's error.
 
-    `linear` has slopes along all parameters and start numbers at `theta` (P,). `coarser` are the
-    same W stretches with longer steps and fewer rotor speeds.
+    `linear` has the residuals of W windows, and slopes along all parameters and start numbers.
+    `coarser` (W, N, 19) are the residuals with longer steps and fewer rotor speeds.
     """
     noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)
-    difference = _difference(model, theta, linear, coarser)
+    difference = _difference(linear, coarser)
     return _raised(_rms(difference, linear, noise, whitening, windows), limits)
 
 
 def with_held_commands(
-    model: RolloutModel,
-    theta: np.ndarray,
-    windows: FlightWindows,
-    linear: Linearisation,
-    fewer: FlightWindows,
-    limits: Thresholds,
+    windows: FlightWindows, linear: Linearisation, fewer: np.ndarray, limits: Thresholds
 ) -> Thresholds | None:
     """Return `limits` with the noise raised to the error of held commands; None without the error.
 
@@ -70,11 +59,11 @@ def with_held_commands(
     change with `fewer`, limit the error's share of that change. With a small share, the log has
     every command.
 
-    Args: see `with_model_error`; `fewer` are the same stretches with every second command.
+    Args: see `with_model_error`; `fewer` are the residuals with every second command.
     """
     noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)
-    difference = _difference(model, theta, linear, fewer)
+    difference = _difference(linear, fewer)
     rms, residual = (
         _rms(errors, linear, noise, whitening, windows) for errors in (difference, linear.residual)
     )
@@ -118,11 +107,9 @@ def beyond_error(change: np.ndarray, error: np.ndarray, width: np.ndarray) -> bo
     return bool((distance - error > least).any())
 
 
-def _difference(
-    model: RolloutModel, theta: np.ndarray, linear: Linearisation, other: FlightWindows
-) -> np.ndarray:
-    """Return by how much the residuals (W, N, 19) of `other` differ; NaN where one diverges."""
-    difference = model.residual(theta, linear.offset, other) - linear.residual
+def _difference(linear: Linearisation, other: np.ndarray) -> np.ndarray:
+    """Return by how much the residuals `other` (W, N, 19) differ; NaN where one diverges."""
+    difference = other - linear.residual
     finite = np.isfinite(difference).all(axis=(1, 2), keepdims=True)
     return np.where(finite, difference, np.nan)
 

@@ -27,10 +27,6 @@ from suite.diagnose.evidence.rollouts import RolloutEvidence
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.model_error import beyond_error
 
-NOISE_ERROR = 0.02
-"""Relative uncertainty of the measured noise power."""
-THRUST_REVERSAL = 10.0
-"""Rate of change of thrust above which only its sign counts [m/s^3]."""
 AXES = ("force x", "force y", "force z", "torque x", "torque y", "torque z")
 
 
@@ -191,7 +187,8 @@ def _energy_p_value(equations: DisturbanceEquations, axis: int) -> float:
             size = 1.0 / np.quantile(information, share)
             weight = size * information / (1.0 + size * information)
             mean = float(weight.sum())
-            variance = 2.0 * float((weight**2).sum()) + (NOISE_ERROR * mean) ** 2
+            # The measured noise power has a relative uncertainty of 2 %.
+            variance = 2.0 * float((weight**2).sum()) + (0.02 * mean) ** 2
             energy = float((weight * (along**2 / information)).sum())
             p_values.append(float(gamma.sf(energy, mean**2 / variance, scale=variance / mean)))
     return min(1.0, len(p_values) * min(p_values))
@@ -226,7 +223,7 @@ def _shapes(knot: Flown, start_s: np.ndarray) -> tuple[np.ndarray, dict[str, tup
         "the thrust": thrust,
         "the thrust's square": thrust**2,
         "the thrust's change": change,
-        "the thrust's direction of change": np.tanh(change / THRUST_REVERSAL),
+        "the thrust's direction of change": np.tanh(change / 10.0),  # above 10 m/s^3
         "thrust times velocity along x": thrust * vel_b[..., 0],
         "thrust times velocity along y": thrust * vel_b[..., 1],
         "the heading": np.cos(yaw),
