@@ -45,11 +45,6 @@ FILES = (
     ("plan/plan.json", "flights that separate effects which these flights do not"),
 )
 """Files next to the report, and their description."""
-TOTALS = (
-    "Values are totals: they replace those of the vehicle file. Of the gap: the share that this "
-    "effect removes when it is added last. Chance gives a false name with a probability of at most "
-    "{chance:.1g}."
-)
 CHANNELS = (
     "RMS errors on held-out flights. Noise floor: the error by measurement noise alone (in "
     "rollouts, noise of the start and of the compared row). Errors of force and torque are "
@@ -165,7 +160,11 @@ def _answer(result: Mapping[str, Any]) -> Section:
     headers = [
         "effect", "not distinguishable from", "view", "parameter", "total", "95 %", "of the gap"
     ]  # fmt: skip
-    note = TOTALS.format(chance=max(effect["p_value"] for effect in effects))
+    note = (
+        "Values are totals: they replace those of the vehicle file. Of the gap: the share that "
+        "this effect removes when it is added last. Chance gives a false name with a probability "
+        f"of at most {max(effect['p_value'] for effect in effects):.1g}."
+    )
     return Section(title, [*words, table(headers, rows, note=note)])
 
 

@@ -178,13 +178,6 @@ def rivals_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section:
     return Section("Alternatives to the named effects", parts)
 
 
-ABOVE_NOISE = (
-    "The noise floor of force and torque contains the noise of the measured motion, but no errors "
-    "of rotor speeds or attitude. Such errors may cause what logged signals hardly predict."
-)
-"""Explanation of the table of errors above the noise floor."""
-
-
 def residual_section(result: Mapping[str, Any]) -> Section:
     """Return the error that remains with the named effects, and its structure."""
     remaining = result["unexplained"]
@@ -204,7 +197,12 @@ def residual_section(result: Mapping[str, Any]) -> Section:
             ("", lambda one: f"an error {one['reason']}"),
         )
         title = "Errors above the noise floor"
-        parts.append(table_of(remaining["above_noise"], *columns, title=title, note=ABOVE_NOISE))
+        note = (
+            "The noise floor of force and torque contains the noise of the measured motion, but no "
+            "errors of rotor speeds or attitude. Such errors may cause what logged signals hardly "
+            "predict."
+        )
+        parts.append(table_of(remaining["above_noise"], *columns, title=title, note=note))
     if remaining.get("shapes"):
         shapes = remaining["shapes"]
         rows = [(s["label"], f"{s['gain']:.1f}", f"{s['p_value']:.3f}") for s in shapes]
@@ -251,15 +249,6 @@ def evidence_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section
     return Section("The evidence", [words, table(headers, rows, note=note)])
 
 
-AGREEMENT = (
-    "The fall of the squared error of each flight (of a single flight: of each third) with "
-    "parameters that were fitted to the others, in units of independent noise. If force and torque "
-    "are compared, or if no effect explains the whole error, an effect is named only if all "
-    "flights but one agree."
-)
-"""Explanation of the table of flights."""
-
-
 def agreement_section(diagnosis: Diagnosis) -> Section:
     """Return what each source compares, and how much each flight supports the named effects."""
     parts: list[Part] = [
@@ -267,9 +256,15 @@ def agreement_section(diagnosis: Diagnosis) -> Section:
         f"driven by {diagnosis.flights.driven_by}."
         for finding in diagnosis.findings
     ]
+    note = (
+        "The fall of the squared error of each flight (of a single flight: of each third) with "
+        "parameters that were fitted to the others, in units of independent noise. If force and "
+        "torque are compared, or if no effect explains the whole error, an effect is named only if "
+        "all flights but one agree."
+    )
     for finding, named in diagnosis.named:
         if named.gains:
             rows = [(f"{k + 1}", f"{gain:.1f}") for k, gain in enumerate(named.gains)]
             title = f"{finding.source.name}: {named.candidate.label}"
-            parts.append(table(["fitted flight or third", "gain"], rows, title, AGREEMENT))
+            parts.append(table(["fitted flight or third", "gain"], rows, title, note))
     return Section("Do the flights agree", [*parts, *diagnosis.flights.compares])

@@ -214,8 +214,6 @@ def noise_floor(slope: np.ndarray, noise: np.ndarray) -> np.ndarray:
 FORCE_S, TORQUE_S = 0.5, 0.1
 """Times over which an effect's mean linear and angular accelerations are computed [s]. The time for
 the angular one is short, as the rate loop soon counteracts a rotation."""
-DRIFT_S = 1.0
-"""Time after which an effect's drift, the change of the position, is measured [s]."""
 
 
 class EffectSize(NamedTuple):
@@ -264,7 +262,7 @@ def rollout_size(shift: np.ndarray, windows: FlightWindows) -> EffectSize:
     has_acc = valid[..., SLICES["accelerometer"]].all(axis=-1)
     if has_acc.any():
         force = max(force, rms_length(shift[has_acc][:, SLICES["accelerometer"]]))
-    return EffectSize(force, growth("rates", TORQUE_S, 1), growth("position", DRIFT_S, 2))
+    return EffectSize(force, growth("rates", TORQUE_S, 1), growth("position", 1.0, 2))
 
 
 def view_size(shift: np.ndarray, in_world: bool) -> EffectSize:
