@@ -30,10 +30,8 @@ from tests.support import diagnosis_flights
 from tests.support.broken_logs import BREAKAGES, rows
 from tests.support.diagnosis_flights import fly, fly_all
 from tests.support.real_flights import Pendulum
-from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
+from tests.support.vehicles import LAGGED, PLAIN, REMEMBERING, with_effects, with_lag
 from tracks.common.files import plain, to_json
-
-LAGGED = with_lag(PLAIN, 0.03)
 
 
 def flights(vehicle, seed=0, count=3, duration_s=7.0, **options):

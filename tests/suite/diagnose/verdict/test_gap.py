@@ -17,7 +17,7 @@ from suite.diagnose.verdict import actuators, model_error
 from suite.diagnose.verdict import residual_structure as structure
 from suite.diagnose.verdict.gap import Gap, gap_of, overlap, start_correction
 from tests.support.diagnosis_flights import NOISE, fly, fly_all
-from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
+from tests.support.vehicles import LAGGED, PLAIN, REMEMBERING, with_effects, with_lag
 
 
 def covered(scores, **options):
@@ -128,9 +128,6 @@ def test_a_shape_that_grows_with_the_models_error_is_left_out_and_one_that_stays
         assert [shape.label for shape in left.shapes] == kept
     by_chance = found._replace(shapes=[found.shapes[0]._replace(p_value=0.2)])
     assert structure.beyond_model_error(by_chance, fine, coarse, 0.5) == by_chance
-
-
-LAGGED = with_lag(PLAIN, 0.03)
 
 
 @pytest.fixture(scope="module")
