@@ -24,9 +24,9 @@ from eval.judging.statistics import wilson
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import Motion, Wrench
 from eval.vehicles.vehicle import Vehicle, with_effects
+from suite.blind.build import simulator_for
 from suite.blind.cases import CONTINUOUS, Case
-from suite.blind.outside import Law, Push
-from suite.blind.simulators import simulator_for
+from suite.blind.outside import Law, Outside
 from suite.common.startup import keep_compiled
 from suite.diagnose.data.colour import Noise, measured_noise
 from suite.diagnose.diagnose import diagnose
@@ -102,7 +102,7 @@ def run_case(seed: list[int]) -> Outcome:
     def fly_logs(strength: float) -> tuple[FlightLog, ...]:
         """Return the logs of the flights with a field of this strength; the noise is the same."""
         flight_rng = np.random.default_rng(flight_seed)
-        extra = Push(strength, truth.mass, law)
+        extra = Outside(strength, truth.mass, law)
         return simulator.fly(truth, trajectories, flight_rng, extra)(flight_rng)
 
     # The noise is measured without the field. The error grows with the strength of the field, so

@@ -148,7 +148,7 @@ def sweep(count: int, args: argparse.Namespace) -> None:
     from suite.experiments.study.cache import Workspace
 
     def fly_piece(
-        loaders: judging.Loaders, piece: Sequence[judging.Share]
+        loaders: object, piece: Sequence[judging.Share]
     ) -> Iterator[tuple[int, TrialResult]]:
         for number, _ in piece:
             yield number, some_trial(0)

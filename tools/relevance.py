@@ -32,7 +32,7 @@ from eval.logs.flight_log import FlightLog, read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import Vehicle, with_effects
 from eval.worlds import nearest
-from suite.blind.oracle.information import Column
+from suite.blind.oracle import Column
 from suite.common.console import Silent
 from suite.common.startup import keep_compiled
 from suite.diagnose.diagnose import diagnose

@@ -1,15 +1,15 @@
 """Make one blind case from its description: flights with hidden effects, their logs, the answer.
 
 The answer has the names that a diagnosis must give, and the alternatives: other effects that
-explain the flights as well. The alternatives come from the oracle (`suite/blind/oracle/`), which
-computes how well flights determine each parameter. It expresses a difference as a log-likelihood
-ratio, the squared change of the flights in standard deviations of the noise, divided by two.
+explain the flights as well. They come from the oracle (`oracle.py`), which expresses a
+difference as a log-likelihood ratio: half the squared change of the flights in standard deviations
+of the noise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
 from itertools import permutations
 from typing import Any
 
@@ -17,12 +17,14 @@ import numpy as np
 
 from eval.effects import EFFECTS, all_values
 from eval.flights.follow import FlightFailed
-from eval.flights.simulate import FALL_V_PER_S, SENSORS, Sensors, fly, log_of
+from eval.flights.simulate import FALL_V_PER_S, SENSORS, Extra, Sensors, fly, log_of
 from eval.flights.trajectory import Trajectory, long_flights, ordinary_flights
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle, with_effects
-from suite.blind.cases import Case
-from suite.blind.oracle.information import (
+from suite.blind.cases import CONTINUOUS, ROTORPY, Case
+from suite.blind.continuous.timing import draw_conditions
+from suite.blind.continuous_flight import fly_continuous, logs_of, with_loop_frequency
+from suite.blind.oracle import (
     LONG_S,
     REQUIRED,
     THRESHOLD,
@@ -32,13 +34,20 @@ from suite.blind.oracle.information import (
     information,
     linearised,
     log_ratio,
+    nominal_vehicle,
     remaining_ratio,
 )
 from suite.blind.outside import KINDS, changed_values, draw_change, true_parameters
-from suite.blind.simulators import LogFlights, Simulator, simulator_for
+from suite.blind.rotorpy_flight import fly_rotorpy
 from suite.common.errors import WorkFailed
 from suite.diagnose.plan import SEPARATIONS
 
+Trajectories = Sequence[Trajectory]
+"""Trajectories of a case, one for each flight."""
+Random = np.random.Generator
+"""Short name of the type."""
+LogFlights = Callable[[Random | None], tuple[FlightLog, ...]]
+"""Function (random generator of the noise; None: no noise) -> logs of the flights of a case."""
 TRIES = 6
 """Number of draws of flights and strengths; if none is valid, the case fails."""
 
@@ -105,6 +114,56 @@ def _trajectories(case: Case, rng: np.random.Generator) -> list[Trajectory]:
     if case.kind != "outside" and any(EFFECTS[name].slow for name in case.hidden):
         return long_flights(rng)
     return ordinary_flights(rng)
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """A simulator for one case."""
+
+    nominal: Vehicle
+    """The vehicle file for the diagnosis."""
+    fly: Callable[..., LogFlights]
+    """Function that flies N trajectories and returns a function that makes their logs. Its
+    arguments are the true vehicle, the trajectories, the random generator of gusts, and additional
+    physics (optional)."""
+    conditions: dict[str, Any] = field(default_factory=dict)
+    """Conditions of flights and logs, such as rates, which the answer records; may be empty."""
+
+
+def simulator_for(case: Case, rng: np.random.Generator) -> Simulator:
+    """Return the simulator of `case`.
+
+    For the continuous-time engine `rng` draws the conditions of the flights, such as rates.
+    """
+    nominal, sensors = nominal_vehicle(case.vehicle), SENSORS[case.sensors]
+
+    def fly_in_steps(
+        truth: Vehicle, trajectories: Trajectories, rng: Random, extra: Extra | None = None
+    ) -> LogFlights:
+        """Fly in MuJoCo or RotorPy, which advance in steps of the period of the rate loop."""
+        if case.simulator == ROTORPY:
+            flown = fly_rotorpy(nominal, truth, trajectories, sensors.rate_hz)
+        else:
+            has_voltage = bool(sensors.voltage)
+            flown = fly(nominal, truth, trajectories, sensors.rate_hz, extra, rng, has_voltage)
+        return lambda rng: tuple(
+            log_of(flight, truth, sensors, rng, f"flight_{index + 1}")
+            for index, flight in enumerate(flown)
+        )
+
+    if case.simulator != CONTINUOUS:
+        return Simulator(nominal, fly_in_steps)
+
+    conditions = draw_conditions(rng)
+    nominal_at_rate = with_loop_frequency(nominal, conditions.loop_hz)
+
+    def fly_in_continuous_time(
+        truth: Vehicle, trajectories: Trajectories, rng: Random, extra: Extra | None = None
+    ) -> LogFlights:
+        flown = fly_continuous(nominal_at_rate, truth, trajectories, conditions, rng, extra)
+        return lambda rng: logs_of(flown, trajectories, truth, sensors, conditions, rng)
+
+    return Simulator(nominal_at_rate, fly_in_continuous_time, asdict(conditions))
 
 
 Hidden = tuple[Vehicle, LogFlights, dict[str, Any]]

@@ -14,7 +14,7 @@ import numpy as np
 from eval.effects import EFFECTS, nameable_effects
 from eval.flights.simulate import SENSORS
 from eval.worlds.rotorpy_vehicle import ROTORPY_EFFECTS
-from suite.blind.oracle.strength import vehicle_names
+from suite.blind.oracle import vehicle_names
 from suite.blind.outside import KINDS
 from suite.diagnose.plan import SEPARATIONS
 
@@ -58,7 +58,6 @@ class Case:
     """Index in `SEPARATIONS` (pairs of effects, and flights that separate them) for a blurred or
     separated case; -1 for the other kinds."""
     simulator: str = MUJOCO
-    """Simulator of the flights."""
 
 
 def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:
@@ -76,7 +75,8 @@ def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:
     cases = []
     for index in sorted(rng.permutation(len(singles))[: counts["single"]]):
         name, multiple = singles[index]
-        cases.append(_draw_single(rng, name, multiple, (seed, 10_000 + index)))
+        equipment = _draw_equipment(rng, (name,))
+        cases.append(Case("single", (name,), multiple, *equipment, (seed, 10_000 + index)))
     for number, kind in enumerate(FULL_COUNTS):
         for index in range(counts[kind]):
             case_seed = (seed, 20_000 + 1_000 * number + index)
@@ -127,7 +127,8 @@ def draw_continuous_cases(seed: int, count: int | None = None) -> dict[str, Case
             case_seed = (seed, 70_000 + 1_000 * number + index)
             if kind == "single":
                 multiple = MULTIPLES[index % len(MULTIPLES)]
-                case = _draw_single(rng, str(singles[index]), multiple, case_seed)
+                hidden = (str(singles[index]),)
+                case = Case(kind, hidden, multiple, *_draw_equipment(rng, hidden), case_seed)
             else:
                 case = _draw_case(rng, kind, index, case_seed)
             if kind == "outside":
@@ -145,11 +146,7 @@ DRAWERS: dict[str, Callable[[int, int | None], dict[str, Case]]] = {
 
 
 def _counts(count: int | None, full: Mapping[str, int]) -> dict[str, int]:
-    """Return kind -> number of cases, for about `count` cases of a set with the numbers `full`.
-
-    Raises:
-        ValueError: for a count below 1.
-    """
+    """Return kind -> number of cases, for about `count` cases of a set with the numbers `full`."""
     if count is not None and count < 1:
         raise ValueError(f"count = {count}: must be at least 1")
     share = 1.0 if count is None else min(count / sum(full.values()), 1.0)
@@ -159,13 +156,6 @@ def _counts(count: int | None, full: Mapping[str, int]) -> dict[str, int]:
 def _by_name(cases: Sequence[Case]) -> dict[str, Case]:
     """Return name (`case_001`, ...) -> case, in the given order."""
     return {f"case_{number:03d}": case for number, case in enumerate(cases, 1)}
-
-
-def _draw_single(
-    rng: np.random.Generator, name: str, multiple: float, case_seed: tuple[int, int]
-) -> Case:
-    """Return a case with one effect, on MuJoCo."""
-    return Case("single", (name,), multiple, *_draw_equipment(rng, (name,)), case_seed)
 
 
 def _draw_case(rng: np.random.Generator, kind: str, index: int, case_seed: tuple[int, int]) -> Case:

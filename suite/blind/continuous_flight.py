@@ -1,14 +1,12 @@
 """Fly trajectories of blind cases in continuous time, with an engine of its own.
 
-The engine (`suite/blind/continuous/`) shares no code with the model that the diagnosis fits. The
-tracking controller, which follows the trajectory, is that of the other simulators: it only gives
-commands.
+The tracking controller is that of the other simulators: it only gives commands.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,7 +18,7 @@ from eval.quadrotor.plant import Motion, Wrench
 from eval.vehicles.vehicle import Vehicle
 from suite.blind.continuous.body import POS, QUAT, Battery
 from suite.blind.continuous.engine import Flown, Rows, fly
-from suite.blind.continuous.log import Noise, log_of_flight
+from suite.blind.continuous.log import log_of_flight
 from suite.blind.continuous.quadrotor import quadrotor_of
 from suite.blind.continuous.timing import STEP_S, Conditions, jittered_stamps, schedule
 
@@ -139,10 +137,10 @@ def logs_of(
 
     `truth` is the vehicle that flew. The other arguments are those of `log_of_flight`.
     """
-    noise, about = Noise(*astuple(sensors)[1:]), {"source": "suite blind", "vehicle": truth.name}
+    about = {"source": "suite blind", "vehicle": truth.name}
     return tuple(
         log_of_flight(
-            flown, index, trajectory.duration_s, truth.effects, noise, conditions, rng,
+            flown, index, trajectory.duration_s, truth.effects, sensors, conditions, rng,
             f"flight_{index + 1}", about,
         )
         for index, trajectory in enumerate(trajectories)

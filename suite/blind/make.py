@@ -19,7 +19,7 @@ from eval.quadrotor.vehicle_file import save_vehicle
 from eval.worlds import world_class
 from suite.blind.build import Built, build
 from suite.blind.cases import DRAWERS, MUJOCO, ROTORPY, Case
-from suite.blind.oracle.strength import TABLE
+from suite.blind.oracle import TABLE
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from tracks.common.files import replacing_folder, write_json
@@ -146,11 +146,7 @@ def open_answers(out: Path) -> dict[str, dict[str, Any]]:
 
 
 def _check_files(out: Path, manifest: Manifest, names: Iterable[str]) -> None:
-    """Check that the files of the cases `names` are those of the manifest.
-
-    Raises:
-        ValueError: for a changed file.
-    """
+    """Refuse a set in which a file of the cases `names` is not that of the manifest."""
     for name in names:
         files = {out / "cases" / name / file: sha for file, sha in manifest.cases[name].items()}
         files[out / "answers" / f"{name}.json"] = manifest.answers[name]
@@ -163,16 +159,12 @@ def _check_files(out: Path, manifest: Manifest, names: Iterable[str]) -> None:
 
 
 def _check_options(out: Path, options: dict[str, Any]) -> None:
-    """Write the options of a new set, or check that they are those of the set in `out`.
-
-    Raises:
-        ValueError: if an option differs.
-    """
+    """Write the options of a new set, or refuse others than those of the set in `out`."""
     path = out / "set.json"
-    stored = read_json(path) if path.is_file() else None
-    if stored is None:
+    if not path.is_file():
         write_json(path, {**stamp(SCHEMA, options["seed"]), **options})
         return
+    stored = read_json(path)
     for key, value in options.items():
         if stored.get(key) != value:
             raise ValueError(
@@ -182,5 +174,4 @@ def _check_options(out: Path, options: dict[str, Any]) -> None:
 
 
 def _hash(path: Path) -> str:
-    """Return the SHA-256 of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()

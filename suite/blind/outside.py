@@ -1,8 +1,7 @@
 """The hidden physics of a blind case: values of an effect, or physics that no effect describes.
 
-Effects are the physical causes of mismatch in the catalogue (`eval/effects/`), which a diagnosis
-can name. For physics outside the catalogue the correct verdict is `unknown`. A wrench is a force
-and a torque together. In the shapes, N is the number of flights.
+For physics outside the catalogue of effects the correct verdict is `unknown`. In the shapes, N is
+the number of flights.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from eval.effects import EFFECTS, all_values
 from eval.effects.interface import GRAVITY
 from eval.quadrotor.plant import Command, Motion, Wrench
 from eval.vehicles.vehicle import Vehicle
-from suite.blind.oracle.strength import columns_in_table, detectable_along
+from suite.blind.oracle import columns_in_table, detectable_along
 from tracks.geometry.rotation import to_local
 
 Law = Callable[[float, float, Motion, Wrench, float], np.ndarray]
@@ -27,18 +26,18 @@ Law = Callable[[float, float, Motion, Wrench, float], np.ndarray]
 
 
 class Outside:
-    """Base class of physics outside the catalogue, which changes the command or adds a wrench.
+    """Physics outside the catalogue, which changes the command or adds a wrench.
 
-    An object may have a state, such as the position of a load, so each call of `fly` needs a new
-    one.
+    By itself it is an acceleration that is a function of the present state and time. An object may
+    have a state, such as the position of a load, so each call of `fly` needs a new one.
     """
 
-    def __init__(self, strength: float, mass: float) -> None:
-        """Prepare for flights of a quadrotor of true `mass` [kg].
+    def __init__(self, strength: float, mass: float, law: Law | None = None) -> None:
+        """Prepare for flights of a quadrotor of true `mass` [kg], with the acceleration of `law`.
 
         `strength` is the size of the physics, in the unit that `KINDS` gives.
         """
-        self.strength, self.mass = strength, mass
+        self.strength, self.mass, self._law = strength, mass, law
 
     def command(self, command: Command, time_s: float) -> Command:
         """Return the command that acts instead of `command`."""
@@ -55,7 +54,9 @@ class Outside:
 
     def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
         """Return an additional acceleration (N, 3), world axes [m/s^2]."""
-        return np.zeros_like(motion.pos_w)
+        if self._law is None:
+            return np.zeros_like(motion.pos_w)
+        return self._law(self.strength, self.mass, motion, wrench, time_s)
 
 
 class SlungLoad(Outside):
@@ -120,19 +121,6 @@ class BentThrust(Outside):
         return Command(np.maximum(curved, 0.0), command.rate_b)
 
 
-class Push(Outside):
-    """An acceleration that is a function of the present state and time."""
-
-    def __init__(self, strength: float, mass: float, law: Law) -> None:
-        """Prepare for flights with the acceleration of `law`; see `Outside`."""
-        super().__init__(strength, mass)
-        self._law = law
-
-    def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
-        """Return the acceleration of the law."""
-        return self._law(self.strength, self.mass, motion, wrench, time_s)
-
-
 def _power_drag(s: float, m: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
     """Return a drag that grows with |v|^1.6: -s |v|^0.6 v."""
     speed = np.sqrt((motion.vel_w**2).sum(-1, keepdims=True))
@@ -175,7 +163,6 @@ class Kind:
     make: Callable[..., Outside]
     """Function (strength, true mass [kg]) -> the physics."""
     unit: str
-    """Unit of the strength."""
     usual: float
     """Usual strength; a flight with it shows how detectable this physics is."""
     most: float
@@ -183,14 +170,14 @@ class Kind:
 
 
 KINDS: dict[str, Kind] = {
-    "power_drag": Kind(partial(Push, law=_power_drag), "m^-0.6 s^-0.4", 0.08, 0.4),
+    "power_drag": Kind(partial(Outside, law=_power_drag), "m^-0.6 s^-0.4", 0.08, 0.4),
     "slung_load": Kind(SlungLoad, "kg", 0.03, 0.12),
     "hysteresis": Kind(Hysteresis, "m/s^2", 1.0, 3.0),
-    "heading_force": Kind(partial(Push, law=_heading_force), "m/s^2", 0.5, 2.5),
-    "wake": Kind(partial(Push, law=_wake), "1/m", 0.3, 1.2),
-    "tether": Kind(partial(Push, law=_tether), "1/s^2", 0.1, 0.6),
-    "ripple": Kind(partial(Push, law=_ripple), "1", 0.05, 0.3),
-    "updraft": Kind(partial(Push, law=_updraft), "m/s^2", 1.0, 5.0),
+    "heading_force": Kind(partial(Outside, law=_heading_force), "m/s^2", 0.5, 2.5),
+    "wake": Kind(partial(Outside, law=_wake), "1/m", 0.3, 1.2),
+    "tether": Kind(partial(Outside, law=_tether), "1/s^2", 0.1, 0.6),
+    "ripple": Kind(partial(Outside, law=_ripple), "1", 0.05, 0.3),
+    "updraft": Kind(partial(Outside, law=_updraft), "m/s^2", 1.0, 5.0),
     "bent_thrust": Kind(BentThrust, "1", 0.1, 0.4),
 }
 """Name of each kind of physics outside the catalogue -> its description."""

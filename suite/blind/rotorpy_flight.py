@@ -37,19 +37,6 @@ WITHIN = 1.5
 because the rotor speeds in a flight differ from those in hover."""
 
 
-def check_effects(truth: Vehicle) -> None:
-    """Raise an error for a vehicle with an effect that RotorPy does not have in the same form.
-
-    Raises:
-        ValueError: with the effect and what is allowed.
-    """
-    for name in truth.effects:
-        if name not in ROTORPY_EFFECTS:
-            raise ValueError(
-                f"effects.{name}: RotorPy does not have it; allowed: {', '.join(ROTORPY_EFFECTS)}"
-            )
-
-
 def fly_rotorpy(
     nominal: Vehicle, truth: Vehicle, trajectories: Sequence[Trajectory], rate_hz: float
 ) -> list[Recording]:
@@ -63,9 +50,14 @@ def fly_rotorpy(
 
     Raises:
         FlightFailed: if a flight tips over, touches the ground or leaves its trajectory.
-        ValueError: for an effect that RotorPy does not have, and if it is not installed.
+        ValueError: for an effect that RotorPy does not have in the same form, and if it is not
+            installed.
     """
-    check_effects(truth)
+    for name in truth.effects:
+        if name not in ROTORPY_EFFECTS:
+            raise ValueError(
+                f"effects.{name}: RotorPy does not have it; allowed: {', '.join(ROTORPY_EFFECTS)}"
+            )
     frequency = nominal.controller.frequency
     dt, period = 1.0 / frequency, round(frequency / rate_hz)
     reference = reference_of(trajectories, period, dt)

@@ -1,8 +1,7 @@
 """Score the diagnoses of blind cases: compare named effects and intervals with the answers.
 
-The answer of a case has the true effects. A diagnosis may name an effect with alternatives, other
-effects that explain the flights as well. The gap is the rollout error on held-out flights; its
-noise floor is the error that measurement noise alone gives.
+The gap is the rollout error on held-out flights; its noise floor is the error that measurement
+noise alone gives.
 """
 
 from __future__ import annotations
@@ -39,11 +38,9 @@ class Verdict:
     """The score of one case."""
 
     case: str
-    """Name of the case."""
     kind: str
     """Kind of the case, such as `single`; see `suite.blind.cases.Case`."""
     hidden: tuple[str, ...]
-    """Names of the hidden effects."""
     multiple: float
     """Largest strength of the hidden effects, as a multiple of the just detectable strength."""
     verdict: str
@@ -78,13 +75,10 @@ class Share:
     what: str
     """Description of the counted cases."""
     count: int
-    """Number of counted cases."""
     of: int
     """Number of cases that could have been counted, such as all nulls."""
     low: float
-    """Lower end of the interval, from 0 to 1."""
     high: float
-    """Upper end of the interval, from 0 to 1."""
     wanted: str
     """The goal, as text; "" without a goal."""
 
@@ -100,9 +94,9 @@ def score_case(
 
     Args:
         name: name of the case.
-        answer: contents of the answer of the case.
-        diagnosis: contents of `diagnosis.json`; None if the diagnosis failed.
-        seconds: time of the diagnosis [s]; None if it failed.
+        answer: contents of its answer.
+        diagnosis: contents of `diagnosis.json`, and
+        seconds: time of the diagnosis [s]; both are None if it failed.
         hubs: (3,) angular damping about the body axes that the simulator has by itself, because the
             hubs of the rotors move through the air [1/s]; None if it has none.
     """
@@ -180,12 +174,6 @@ def not_run(out: Path, verdicts: Sequence[Verdict]) -> list[str]:
     return [name for name in load_manifest(out).cases if name not in scored]
 
 
-def commits_of(out: Path, verdicts: Sequence[Verdict]) -> list[str]:
-    """Return the git commits of the code that diagnosed the cases, each one once."""
-    paths = (out / RESULTS / v.case / "diagnosis.json" for v in verdicts if v.seconds is not None)
-    return sorted({(_read_if_valid(path) or {}).get("git_commit") or "unknown" for path in paths})
-
-
 def shares(verdicts: Sequence[Verdict]) -> list[Share]:
     """Return the rows of the table with shares; rows without any case are left out."""
 
@@ -198,14 +186,9 @@ def shares(verdicts: Sequence[Verdict]) -> list[Share]:
     ratios = _gap_ratios(verdicts)
     lines = [
         ("single effects: named, nothing else", "96 %", [v.exact for v in single]),
-        *(
-            (
-                f"  of these at {times:g} times detectable",
-                "",
-                [v.exact for v in single if _nearest(v.multiple, MULTIPLES) == times],
-            )
-            for times in MULTIPLES
-        ),
+        *((f"  of these at {times:g} times detectable", "", [v.exact for v in single
+           if min(MULTIPLES, key=lambda step: abs(step - v.multiple)) == times])
+          for times in MULTIPLES),
         _without_hubs(single),
         ("single effects: named, others perhaps too", "", [v.found for v in single]),
         ("single effects: verdict `named`", "", [v.verdict == "named" for v in single]),
@@ -259,7 +242,10 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
     title = f"{len(unexpected)} of {len(verdicts)} cases are not as expected:"
     missing, failed = not_run(out, verdicts), load_manifest(out).failed
     count = len(missing) + len(verdicts)
-    commits = commits_of(out, verdicts)
+    # The versions of the code that diagnosed the cases.
+    paths = (out / RESULTS / v.case / "diagnosis.json" for v in verdicts if v.seconds is not None)
+    found = ((_read_if_valid(path) or {}).get("git_commit") for path in paths)
+    commits = sorted({commit or "unknown" for commit in found})
     notes = [
         len(commits) > 1
         and f"Diagnosed by {len(commits)} versions of the code: {', '.join(commits)}.",
@@ -358,11 +344,6 @@ def _is_expected(v: Verdict) -> bool:
     if v.kind == "outside":
         return v.verdict in ("unknown", "partly")
     return v.exact
-
-
-def _nearest(value: float, steps: Sequence[float]) -> float:
-    """Return the entry of `steps` that is nearest to `value`."""
-    return min(steps, key=lambda step: abs(step - value))
 
 
 def _read_if_valid(path: Path) -> Any:

@@ -123,7 +123,7 @@ def _show_manifest(manifest: Manifest, config: Config, console: Console) -> dict
 
 def _strengths(console: Console) -> dict[str, Any]:
     """Compute the table of detectable strengths, and return its path for --json."""
-    from suite.blind.oracle.strength import write_table
+    from suite.blind.oracle import write_table
 
     path = write_table(console)
     console.say(f"written: {path}")

@@ -51,27 +51,31 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if out.suffix.lower() != ".toml":
         raise ValueError(f"--out is {str(out)!r}; its ending must be .toml")
     if config.sensors:
-        from suite.diagnose.sensors import identify as of_sensors
+        from suite.diagnose.sensors.identify import identify_sensors, say_held_out
 
         if config.vehicle or config.leave or config.accept:
             raise ValueError("--sensors takes no --vehicle, --leave and --accept: leave them out")
-        result = of_sensors.identify_sensors(config.flights, out, console)
+        result = identify_sensors(config.flights, out, console)
         _show_parameters(result, console)
-        of_sensors.say_held_out(result, console)
-        return _show_end(result, out, console)
-    from suite.diagnose.identify.run import identify_files
+        say_held_out(result, console)
+    else:
+        from suite.diagnose.identify.run import identify_files
 
-    if not config.vehicle:
-        raise ValueError("--vehicle is missing: the vehicle file to start from, or a shipped name")
-    check_no_input(out, [config.vehicle], "--out")
-    result = identify_files(
-        config.flights, config.vehicle, out, config.leave, console, config.accept
-    )
-    console.say(f"driven by {MODEL_INPUTS[result['drive']]}")
-    _show_parameters(result, console)
-    for text in result["not_identified"]:
-        console.say(f"  not identifiable from these flights, {text}")
-    return _show_end(result, out, console)
+        if not config.vehicle:
+            raise ValueError(
+                "--vehicle is missing: the vehicle file to start from, or a shipped name"
+            )
+        check_no_input(out, [config.vehicle], "--out")
+        inputs = (config.flights, config.vehicle, out, config.leave)
+        result = identify_files(*inputs, console, config.accept)
+        console.say(f"driven by {MODEL_INPUTS[result['drive']]}")
+        _show_parameters(result, console)
+        for text in result["not_identified"]:
+            console.say(f"  not identifiable from these flights, {text}")
+    for warning in result["warnings"]:
+        console.say(f"warning: {warning}")
+    console.say(f"written: {out}")
+    return result
 
 
 def _show_parameters(result: dict[str, Any], console: Console) -> None:
@@ -90,14 +94,6 @@ def _show_parameters(result: dict[str, Any], console: Console) -> None:
             for k, (value, interval) in enumerate(zip(values, intervals, strict=True))
         ]
         console.say(f"  {key}: {', '.join(shown)} {entry['unit']}")
-
-
-def _show_end(result: dict[str, Any], out: Path, console: Console) -> dict[str, Any]:
-    """Print the warnings and the path of the written file; return `result`."""
-    for warning in result["warnings"]:
-        console.say(f"warning: {warning}")
-    console.say(f"written: {out}")
-    return result
 
 
 def _out_path(config: Config) -> Path:

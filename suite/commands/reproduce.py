@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import importlib
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, make_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from suite.common.console import Console
+from suite.common.console import Console, duration
 from suite.common.options import Advanced, Command, options
 from suite.common.work import WorkersOption, read_workers_option
 from suite.experiments import EXPERIMENTS, OVER_ALL
@@ -97,12 +98,16 @@ def run(config: Any, console: Console) -> dict[str, Any]:
     if isinstance(experiment, published.All):
         from suite.cli import parse
 
-        def make(name: str, options: Sequence[str]) -> dict[str, Any]:
+        seconds: dict[str, float] = {}
+        for name, words in published.PUBLISHED.items():
+            console.say(f"{len(seconds) + 1} of {len(published.PUBLISHED)}: {name}")
+            started = time.monotonic()
             # The options of a page are parsed as in a command of its own.
-            _, page = parse("reproduce", [name, *options])
-            return _make_page(replace(config, experiment=page.experiment), console)
-
-        return published.make_all(make, console)
+            _, page = parse("reproduce", [name, *words.split()])
+            _make_page(replace(config, experiment=page.experiment), console)
+            seconds[name] = round(time.monotonic() - started, 1)
+            console.say(f"{name}: {duration(seconds[name])}")
+        return {"seconds": seconds}
     return _make_page(config, console)
 
 

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from tracks.common.names import printable
 
@@ -20,12 +20,9 @@ PLAIN_PERIOD_S = 10.0
 """Time between two lines about the progress if standard error is no terminal [s]."""
 
 
-class Update(Protocol):
-    """The function that work calls to report its progress."""
-
-    def __call__(self, done: float, note: str = "") -> None:
-        """Show that `done` of the total is finished, with a short note."""
-        ...
+Update = Callable[..., None]
+"""Function (done, note) that shows that `done` of the total is finished, with a short note (or
+none)."""
 
 
 class Console:
@@ -47,29 +44,23 @@ class Console:
         print(printable(text), file=sys.stderr, flush=True)
 
     @contextmanager
-    def progress(
-        self,
-        label: str,
-        total: float,
-        clock: Callable[[], float] = time.monotonic,
-        begun: float = 0.0,
-    ) -> Iterator[Update]:
+    def progress(self, label: str, total: float, begun: float = 0.0) -> Iterator[Update]:
         """Show the progress of a long piece of work; yields the function that reports it.
 
         The reported `done` is `total` at the end, in any unit, and `begun` at the beginning. What
         was done before, such as by an earlier call, does not count for the estimate of the
-        remaining time. `clock` returns the time [s].
+        remaining time.
         """
         if sys.stderr.isatty():
             with _bar(label, total, begun) as update:
                 yield update
             return
-        started = last = clock()
+        started = last = time.monotonic()
 
         def update(done: float, note: str = "") -> None:
             """Print a line, unless the last one was printed a short time ago."""
             nonlocal last
-            now = clock()
+            now = time.monotonic()
             if now - last < PLAIN_PERIOD_S:
                 return
             last = now
@@ -104,21 +95,19 @@ class Quiet(Console):
 
 
 class Silent(Quiet):
-    """A console that prints nothing."""
+    """A console that prints nothing. In another process it forwards the progress."""
+
+    def __init__(self, forward: Callable[[float, float], None] = lambda done, total: None) -> None:
+        """Make a console that calls `forward` with what is done of a total."""
+        self._forward = forward
 
     def note(self, text: str) -> None:
         """Print nothing."""
 
     @contextmanager
-    def progress(
-        self, label: str, total: float, clock: object = None, begun: float = 0.0
-    ) -> Iterator[Update]:
-        """Show nothing."""
-
-        def update(done: float, note: str = "") -> None:
-            del done, note
-
-        yield update
+    def progress(self, label: str, total: float, begun: float = 0.0) -> Iterator[Update]:
+        """Forward the progress of a long piece of work."""
+        yield lambda done, note="": self._forward(done, total)
 
 
 @contextmanager

@@ -103,7 +103,6 @@ def tensorboard(folder: Path) -> Mirror:
     writers: list[Any] = []
 
     def mirror(rows: list[dict[str, Any]]) -> None:
-        """Write the numbers of the rows, each as a curve of TensorBoard."""
         for row in rows:
             step = int(row["iteration"])
             if not writers:

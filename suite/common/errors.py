@@ -35,12 +35,8 @@ _BUGS = (errno.EBADF, errno.EFAULT, errno.EDOM, errno.ERANGE, errno.ENOTSOCK, er
 """Errors of the operating system that a mistake in the program causes."""
 _NO_SUCH_INPUT = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError)
 """Errors about a file or folder that the user named wrongly."""
-_NUL = "embedded null"
-"""Part of Python's message about a name with a NUL character."""
 _NO_BACKEND = ("Unable to initialize backend", "Unknown backend")
 """Beginnings of JAX's message if JAX_PLATFORMS names a missing backend."""
-_NO_SETTING = "invalid value for environment variable"
-"""Beginning of MuJoCo's message if MUJOCO_GL has a wrong value."""
 
 
 class WorkFailed(RuntimeError):
@@ -60,7 +56,7 @@ def explain(error: BaseException) -> tuple[int, str] | None:
         return FAILED, str(error)
     if isinstance(error, OSError):
         return _explain_os(error)
-    if isinstance(error, ValueError) and _NUL in str(error):
+    if isinstance(error, ValueError) and "embedded null" in str(error):
         return UNUSABLE, "the name of a file or folder has a NUL character; give another name"
     if isinstance(error, ValueError) and _is_message(error):
         return UNUSABLE, str(error)
@@ -71,7 +67,9 @@ def explain(error: BaseException) -> tuple[int, str] | None:
         platforms = os.environ.get("JAX_PLATFORMS", "")
         reason = str(error).splitlines()[0][:SHOWN]
         return UNUSABLE, f"JAX_PLATFORMS is {platforms!r} in the environment: {reason}; unset it"
-    if isinstance(error, RuntimeError) and str(error).startswith(_NO_SETTING):
+    # MuJoCo's message if MUJOCO_GL has a wrong value.
+    no_setting = "invalid value for environment variable"
+    if isinstance(error, RuntimeError) and str(error).startswith(no_setting):
         return UNUSABLE, f"{error}; unset it"
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
         return FAILED, "out of memory: use fewer trials, a smaller batch, or a larger machine"
@@ -94,7 +92,6 @@ def _explain_os(error: OSError) -> tuple[int, str] | None:
 
 
 def _is_suite_module(module: str | None) -> bool:
-    """Return whether a module with this name belongs to the four packages of the suite."""
     return (module or "").split(".")[0] in {Path(room).name for room in _PACKAGES}
 
 

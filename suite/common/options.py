@@ -2,8 +2,7 @@
 
 The text below a field is the description of its option. The parser is the package tyro. Rare
 options are annotated `Advanced[...]` and are at the end of the help. A nested dataclass only groups
-options in the code: its fields are options of the command like all others. `settings` lists the
-settings of a training in the same way.
+options in the code: its fields are options of the command like all others.
 """
 
 from __future__ import annotations
@@ -64,7 +63,6 @@ class Option(NamedTuple):
     about: str
     """Description of the option, the text below the field."""
     advanced: bool
-    """Whether the option is rare."""
 
     @property
     def notes(self) -> tuple[Any, ...]:
@@ -106,7 +104,6 @@ class Option(NamedTuple):
 
 
 def _bare(kind: Any) -> Any:
-    """Return a type without annotations."""
     return _bare(get_args(kind)[0]) if get_origin(kind) is Annotated else kind
 
 
@@ -116,7 +113,7 @@ def options(command: type, default: Any = None, advanced: bool = False) -> Itera
     Inherited options come last. The values of `default` replace those of `command`, a dataclass.
     With `advanced` all options are rare.
     """
-    hints, texts = get_type_hints(command, include_extras=True), all_field_texts(command)
+    hints, texts = get_type_hints(command, include_extras=True), field_texts(command)
     not_inherited = command.__dict__.get("__annotations__", {})
     fields = sorted(dataclasses.fields(command), key=lambda field: field.name not in not_inherited)
     for field in fields:
@@ -254,48 +251,38 @@ class Setting(NamedTuple):
     """Description of the setting, with its unit."""
 
 
-def settings(config: Any) -> Iterator[Setting]:
-    """Yield every setting of a dataclass and of the dataclasses in its fields, in their order."""
+def settings(config: Any, prefix: str = "") -> Iterator[Setting]:
+    """Yield every setting of a dataclass and of the dataclasses in its fields, in their order.
+
+    Their names begin with `prefix`.
+    """
     allowed = {".".join(path): str(limits) for path, _, limits in ranged(config)}
-    yield from _nested_settings(config, "", allowed)
-
-
-def _nested_settings(config: Any, prefix: str, allowed: dict[str, str]) -> Iterator[Setting]:
-    """Yield the settings of `config`, whose names begin with `prefix`; `allowed` has the ranges."""
-    texts = all_field_texts(type(config))
+    texts = field_texts(type(config))
     for field in dataclasses.fields(config):
         path, value = f"{prefix}{field.name}", getattr(config, field.name)
         if dataclasses.is_dataclass(value):
-            yield from _nested_settings(value, f"{path}.", allowed)
+            yield from settings(value, f"{path}.")
         else:
-            yield Setting(path, value, allowed.get(path, ""), texts.get(field.name, ""))
+            yield Setting(path, value, allowed.get(field.name, ""), texts.get(field.name, ""))
 
 
 @functools.cache
-def all_field_texts(cls: type) -> dict[str, str]:
-    """Return the text below each field of a dataclass and its bases, read from the source code."""
-    texts = dict[str, str]()
-    for base in reversed(cls.__mro__):
-        if dataclasses.is_dataclass(base):
-            texts.update(field_texts(base))
-    return texts
-
-
 def field_texts(cls: type) -> dict[str, str]:
-    """Return the text below each field of one class, without its bases, read from the source code.
+    """Return the text below each field of a class and its bases, read from the source code.
 
     Python does not keep these texts, so the source code is parsed.
     """
-    try:
-        source = inspect.getsource(cls)
-    except OSError:
-        return {}  # a class without source, made at run time
-    (definition,) = ast.parse(textwrap.dedent(source)).body
-    assert isinstance(definition, ast.ClassDef)
-    texts = {}
-    for field, statement_below in zip(definition.body, definition.body[1:], strict=False):
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
-            text = statement_below.value if isinstance(statement_below, ast.Expr) else None
-            if isinstance(text, ast.Constant) and isinstance(text.value, str):
-                texts[field.target.id] = " ".join(text.value.split())
+    texts = dict[str, str]()
+    for base in reversed(cls.__mro__):
+        try:
+            source = inspect.getsource(base)
+        except (OSError, TypeError):
+            continue  # a class without source: made at run time, or built into Python
+        (definition,) = ast.parse(textwrap.dedent(source)).body
+        assert isinstance(definition, ast.ClassDef)
+        for field, statement_below in zip(definition.body, definition.body[1:], strict=False):
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+                text = statement_below.value if isinstance(statement_below, ast.Expr) else None
+                if isinstance(text, ast.Constant) and isinstance(text.value, str):
+                    texts[field.target.id] = " ".join(text.value.split())
     return texts

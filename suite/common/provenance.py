@@ -50,7 +50,6 @@ def machine() -> dict[str, Any]:
 
 
 def _processor() -> str:
-    """Return the model name of the processor."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:

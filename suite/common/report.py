@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +10,6 @@ from html import escape
 from pathlib import Path
 from string import Template
 
-from tracks.common.files import write_text
 from tracks.common.grid import Grid, html_table
 
 TEMPLATE = Path(__file__).with_name("report.html")
@@ -25,7 +23,6 @@ class Picture:
     """A picture that is embedded in the page."""
 
     png: bytes
-    """Bytes of the PNG file."""
     caption: str
     """Text below the picture, and its alternative text; may be empty."""
 
@@ -45,7 +42,6 @@ class Details:
     summary: str
     """Line that is always visible; a click on it unfolds the text."""
     text: str
-    """The long text, with its line breaks."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +49,6 @@ class Steps:
     """A numbered list."""
 
     texts: Sequence[str]
-    """Texts of the items."""
 
 
 Part = str | Grid | Picture | Links | Details | Steps
@@ -65,9 +60,7 @@ class Section:
     """A part of a report with a heading."""
 
     title: str
-    """The heading."""
     parts: Sequence[Part]
-    """Items of the section, from top to bottom."""
     folded: bool = False
     """Whether only the heading is shown at first."""
 
@@ -77,23 +70,11 @@ class Report:
     """The contents of a report."""
 
     title: str
-    """The heading."""
     lead: str
     """The result in one or two sentences."""
     facts: Mapping[str, str]
     """Name -> value of the conditions, such as files and versions; shown below the lead."""
     sections: Sequence[Section]
-    """All other contents."""
-
-
-def write_report(path: str | os.PathLike[str], report: Report) -> Path:
-    """Write `report` to `path` and return it as a Path.
-
-    Raises:
-        OSError: if the file cannot be written; then no partial file exists under its name.
-    """
-    write_text(path, html(report))
-    return Path(path)
 
 
 def html(report: Report) -> str:
@@ -109,7 +90,6 @@ def html(report: Report) -> str:
 
 
 def _section(section: Section) -> str:
-    """Return a section as HTML."""
     title, parts = escape(section.title), "\n".join(_part(part) for part in section.parts)
     if section.folded:
         return f'<details class="section"><summary>{title}</summary>\n{parts}\n</details>'
@@ -117,7 +97,6 @@ def _section(section: Section) -> str:
 
 
 def _part(part: Part) -> str:
-    """Return an item of a section as HTML."""
     if isinstance(part, Grid):
         return html_table(part)
     if isinstance(part, Picture):

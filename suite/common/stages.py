@@ -76,7 +76,6 @@ class Stage:
     title: str
     """Description for the console."""
     estimate: Estimate
-    """Time and memory of the work."""
     work: Callable[[Path], Any]
     """Function that does the stage in the given folder. It must continue an interrupted call."""
     show_result: Callable[[Path], None] = lambda folder: None
@@ -140,7 +139,6 @@ class Estimate:
     """Time and memory of a piece of work, within a factor of about two."""
 
     seconds: float
-    """Time [s]."""
     memory_bytes: float
     """Memory at its peak [bytes]."""
 

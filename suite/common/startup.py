@@ -170,7 +170,12 @@ def keep_compiled(environment: MutableMapping[str, str] | None = None) -> None:
         folder = user_cache(values) / "jax" / (platform.node() or "here")
         values["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     if values["JAX_COMPILATION_CACHE_DIR"]:
-        remove_empty_entries(Path(values["JAX_COMPILATION_CACHE_DIR"]))
+        # A killed process leaves empty files. JAX does not replace them, so the programs would be
+        # compiled again in every run.
+        for entry in Path(values["JAX_COMPILATION_CACHE_DIR"]).glob("*-cache"):
+            with contextlib.suppress(OSError):
+                if not entry.stat().st_size:
+                    entry.unlink()
     # XLA warns about its own tuning hints at every program that it loads; real errors are raised
     # as exceptions.
     values.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
@@ -194,14 +199,3 @@ def use_device(device: str | None) -> None:
             f"--device {device}: JAX finds none; leave --device out, or install JAX for your GPU: "
             "pip install 'jax[cuda12]'"
         ) from None
-
-
-def remove_empty_entries(folder: Path) -> None:
-    """Remove empty files from the cache `folder`, which a killed process leaves.
-
-    JAX does not replace them, so the programs would be compiled again in every run.
-    """
-    for entry in folder.glob("*-cache"):
-        with contextlib.suppress(OSError):
-            if not entry.stat().st_size:
-                entry.unlink()

@@ -1,8 +1,4 @@
-"""The help texts of `suite` and its commands, and what happens to arguments before parsing.
-
-`with_lists` converts lists with commas or spaces to the form that an option reads. `renamed`
-replaces options of earlier versions.
-"""
+"""The help texts of `suite` and its commands, and what happens to arguments before parsing."""
 
 from __future__ import annotations
 
@@ -191,7 +187,6 @@ def with_lists(
 
 
 def _simulator(value: str) -> list[str]:
-    """Return the option that replaces `--world`, whose value was a simulator."""
     return ["--simulator", value]
 
 

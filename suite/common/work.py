@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import partial
 from queue import SimpleQueue
 from typing import Annotated, Any, NamedTuple, TypeVar
 
 import tyro
 
-from suite.common.console import Console, Silent, Update
+from suite.common.console import Console, Silent
 from suite.common.errors import WorkFailed
 from suite.common.options import Advanced
 from suite.common.running.remote import Job, do_remotely, parcels, replace_content
@@ -29,25 +28,6 @@ WorkersOption = Advanced[
     Annotated[str | None, tyro.conf.arg(metavar="N|HOST:PORT", help_behavior_hint="")]
 ]
 """Type of the option `--workers`; `read_workers_option` reads it."""
-
-
-class Forwarding(Silent):
-    """A console for a job in another process: it prints nothing, and forwards the progress."""
-
-    def __init__(self, forward: Callable[[float], None]) -> None:
-        """Make a console that calls `forward` with the finished share of the job, from 0 to 1."""
-        self._forward = forward
-
-    @contextmanager
-    def progress(
-        self, label: str, total: float, clock: object = None, begun: float = 0.0
-    ) -> Iterator[Update]:
-        """Forward the progress of a long piece of work."""
-
-        def update(done: float, note: str = "") -> None:
-            self._forward(done / total)
-
-        yield update
 
 
 def read_workers_option(text: str | None, whole_cores: bool = False) -> Workers | None:
@@ -146,7 +126,8 @@ def _do_with_progress(do: Callable[[Job, Console], Result], job: Job) -> Iterato
     share_threads()
     messages: SimpleQueue[_Share | None] = SimpleQueue()
     with ThreadPoolExecutor(1) as thread:
-        result = thread.submit(do, job, Forwarding(lambda share: messages.put(_Share(share))))
+        console = Silent(lambda done, total: messages.put(_Share(done / total)))
+        result = thread.submit(do, job, console)
         result.add_done_callback(lambda _: messages.put(None))
         yield from iter(messages.get, None)
         yield result.result()

@@ -1,12 +1,9 @@
 """Fit a Delta Action Model by gradients through the dynamics that it corrects.
 
-The model is a network that adds a correction to the action, so that simulated flights match
-measured ones. A fit replays windows (short parts of measured flights) in simulation and makes the
-difference small. No fit uses the held-out flights, on which the errors are measured.
-
-The model is compared with the trainer's point mass, and with a point mass whose parameters are
-fitted to the same flights. These are its lag (rate at which the acceleration follows the command),
-drag and delay. A network is only useful if it is better than this plain system identification.
+A fit replays windows (short parts of measured flights) in simulation and makes the difference
+small. The model is compared with the trainer's point mass, and with a point mass whose lag (rate at
+which the acceleration follows the command), drag and delay are fitted to the same flights. A
+network is only useful if it is better than this plain system identification.
 """
 
 from __future__ import annotations

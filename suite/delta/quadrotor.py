@@ -1,10 +1,9 @@
 """Replay recorded actions in the trainer's quadrotor, with or without a Delta Action Model.
 
-The model is a network that corrects the actions. A window is a short part of a measured flight. Its
-replay starts from the measured state; this includes the rotor speeds and the commands that are
-delayed and still to act. Each row of the log is one step of the attitude loop. The commanded yaw
-rate is the recorded one, because an action does not set the heading. The plant is the model of
-mixer, rotors and effects of the vehicle, for steps of a given length.
+The replay of a window starts from the measured state; this includes the rotor speeds and the
+commands that are delayed and still to act. Each row of the log is one step of the attitude loop.
+The commanded yaw rate is the recorded one, because an action does not set the heading. The plant is
+the model of mixer, rotors and effects of the vehicle, for steps of a given length.
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ from suite.delta.windows import (
     burn_in_before,
     decision_period,
     log_decisions,
-    refuse_no_windows,
     stack_windows,
     state_after,
 )
@@ -68,13 +66,6 @@ class QuadrotorWindows(NamedTuple):
     yaw_rate: np.ndarray
     """(N, T) commanded rate about body z [rad/s]."""
     burn_in: BurnIn
-    """Inputs of the network before each window."""
-
-
-def row_substeps(config: QuadrotorConfig, row_s: float) -> Substeps:
-    """Return the physics steps of one row, which is one step of the attitude loop."""
-    physics = whole_steps(row_s * max(config.physics_hz, LEAST_PHYSICS_HZ))
-    return Substeps(1, physics, row_s / physics)
 
 
 def row_period(logs: Sequence[FlightLog]) -> float:
@@ -106,7 +97,9 @@ def cut_quadrotor_windows(
                 "to fit the Delta Action Model of a quadrotor; record flights with suite collect"
             )
     row_s = row_period(logs) if row_s is None else row_s
-    substeps = row_substeps(config, row_s)
+    # A row is one step of the attitude loop.
+    physics = whole_steps(row_s * max(config.physics_hz, LEAST_PHYSICS_HZ))
+    substeps = Substeps(1, physics, row_s / physics)
     plant = plant_of(config, {}, substeps.dt, varies=False)
     delay_steps = plant.delay_weight.shape[-1]
     windows = [
@@ -114,8 +107,7 @@ def cut_quadrotor_windows(
         for log in logs
         for window in _flight_windows(log, substeps, delay_steps, row_s, duration_s, stride_s)
     ]
-    refuse_no_windows(windows, logs, duration_s)
-    return stack_windows(windows), substeps
+    return stack_windows(windows, logs, duration_s), substeps
 
 
 def _flight_windows(

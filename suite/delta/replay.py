@@ -1,8 +1,7 @@
 """Replay recorded actions in the trainer's point mass, with or without a Delta Action Model.
 
-The model is a network that corrects the actions. It is valid only for the dynamics that it was
-fitted to. Its checkpoint describes them (key `plant`), and `check_corrects` compares this
-description with the dynamics of a training.
+Such a model is valid only for the dynamics that it was fitted to. Its checkpoint describes them
+(key `plant`), and `check_corrects` compares this description with the dynamics of a training.
 """
 
 from __future__ import annotations

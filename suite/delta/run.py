@@ -1,8 +1,4 @@
-"""Fit a Delta Action Model to flight logs, and write its checkpoint and tables (`suite delta`).
-
-The model is a network that corrects the actions, so that simulated flights match measured ones. It
-is compared with the uncorrected dynamics on held-out flights, which the fit does not use.
-"""
+"""Fit a Delta Action Model to flight logs, and write its checkpoint and tables (`suite delta`)."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Cut recorded flights into windows that start at a policy's decision, for replay in simulation.
 
-A window is a short part of a flight. A Delta Action Model, a recurrent network that corrects
-actions, is fitted to windows. In fine-tuning it runs for seconds, so its memory is not empty in
-most steps. Therefore it first runs over the measurements before a window, up to a few seconds
+A window is a short part of a flight. In fine-tuning a Delta Action Model runs for seconds, so its
+memory is not empty in most steps. Therefore it first runs over the measurements before a window
 (burn-in). Some windows start without memory, like the trainer's flights that start between two
 gates.
 """
@@ -48,7 +47,6 @@ class PointMassWindows(NamedTuple):
     time_step: np.ndarray
     """(N, T) time between a decision and the next one [s]."""
     burn_in: BurnIn
-    """Inputs of the network before each window."""
 
 
 def _heading(rot_w: np.ndarray) -> np.ndarray:
@@ -75,15 +73,17 @@ def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -
         ValueError: if a log has no actions, or all flights are shorter than a window.
     """
     windows = [window for log in logs for window in _flight_windows(log, duration_s, stride_s)]
-    refuse_no_windows(windows, logs, duration_s)
-    return stack_windows(windows)
+    return stack_windows(windows, logs, duration_s)
 
 
-def refuse_no_windows(windows: Sequence[Any], logs: Sequence[FlightLog], duration_s: float) -> None:
-    """Refuse flights that give no window.
+def stack_windows(windows: Sequence[T], logs: Sequence[FlightLog], duration_s: float) -> T:
+    """Return the windows of `logs` along a new first axis, as 32-bit numbers.
+
+    They are truncated to the number of decisions that all have, and so are their burn-ins, since
+    flights with slightly shorter periods have more decisions in the same time.
 
     Raises:
-        ValueError: naming some of the flights, and what to do.
+        ValueError: if there are none, since all flights are shorter than `duration_s` [s].
     """
     if not windows:
         names = ", ".join(log.name for log in logs[:3])
@@ -92,13 +92,6 @@ def refuse_no_windows(windows: Sequence[Any], logs: Sequence[FlightLog], duratio
             "flights with suite collect"
         )
 
-
-def stack_windows(windows: Sequence[T]) -> T:
-    """Return windows along a new first axis, as 32-bit numbers.
-
-    They are truncated to the number of decisions that all have, and so are their burn-ins, since
-    flights with slightly shorter periods have more decisions in the same time.
-    """
     items: Sequence[Any] = windows
     count = min(len(item.burn_in.seen) for item in items)
     items = [
@@ -185,7 +178,6 @@ def are_consecutive(gaps_s: np.ndarray, period_s: float, row_s: float) -> np.nda
 
 
 def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[PointMassWindows]:
-    """Return the windows of one flight."""
     action, decides = log_decisions(log)
     # Rows with a decision, with all values, and with a next row for the acceleration.
     rows = np.flatnonzero(decides & log.whole)

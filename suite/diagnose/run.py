@@ -10,7 +10,7 @@ from eval.logs.flight_log import FlightLog, flight_files, read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console
 from suite.common.provenance import refuse_other_run, write_run_record
-from suite.common.report import write_report
+from suite.common.report import html
 from suite.diagnose.config import Config
 from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.diagnose import diagnose
@@ -23,7 +23,7 @@ from suite.diagnose.report.page import page
 from suite.diagnose.sources.rollout_source import rollouts_of
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict.actuators import actuator_mismatches
-from tracks.common.files import check_no_input, plain, write_json
+from tracks.common.files import check_no_input, plain, write_json, write_text
 from tracks.common.provenance import stamp
 
 SCHEMA = 1
@@ -93,7 +93,7 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     header = f"{vehicle.name} with the effects that suite diagnose named: {names}"
     save_vehicle(diagnosis.vehicle, out / "vehicle.toml", header)
     toml = (out / "vehicle.toml").read_text(encoding="utf-8")
-    write_report(out / "report.html", page(diagnosis, result, toml, files, rollouts))
+    write_text(out / "report.html", html(page(diagnosis, result, toml, files, rollouts)))
     for warning in result["warnings"][shown_count:]:
         console.note(f"warning: {warning}")
     # Remove what only an earlier diagnosis in this folder has written.

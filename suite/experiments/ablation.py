@@ -1,8 +1,6 @@
-"""The page `ablation`: trainings with the Attractive Vector Field and without it.
+"""The page `ablation`: trainings with the Attractive Vector Field (Su et al. 2026) and without it.
 
-The field u_A is a term that guides the drone through gates (Su et al. 2026). Each setting is
-trained from several seeds at several weights of the progress term, and flies tracks that no
-training uses.
+Each setting is trained from several seeds, and flies tracks that no training uses.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ from suite.experiments.pages import paper
 from suite.experiments.pages.document import PageContents
 from suite.experiments.study import options, training
 from suite.experiments.study.cache import Workspace
-from suite.experiments.study.summary import Summary, summaries
+from suite.experiments.study.training import Summary
 from suite.train.overrides import check_owned, in_every_phase
 from tracks.common.grid import Grid, table
 
@@ -61,9 +59,8 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     # The first argument is 0: only the finished policies are measured.
     compared = settings(config)
     unseen = training.UnseenWorlds(0, config.trials, config.seed, config.seconds)
-    study = training.Study(compared, config.training_seeds, unseen)
-    runs = training.train_all(study, workspace, console)
-    rows, recipe = summaries(compared, runs), compared[0].recipe
+    runs = training.train_all(compared, config.training_seeds, unseen, workspace, console)
+    rows, recipe = training.summaries(compared, runs), compared[0].recipe
     at_end = {row.key: row.at[-1] for row in rows if row.at}
     steps = config.iterations * recipe.episode.batch * recipe.episode.steps
     median_time = duration(float(np.median([run.seconds for run in runs])))

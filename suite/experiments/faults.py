@@ -1,8 +1,8 @@
 """The page `faults`: how many injected faults are named in simulated and real logs.
 
-A fault is an error of an interface or a log: a wrong unit, sign, scale, order, delay or rate. Each
-case takes a correct log, puts one fault into it, and imports and checks the result. `suite check`
-and `suite import` should report the fault by name, and report nothing in logs without a fault.
+Each case takes a correct log, puts one fault of its interface into it, and imports and checks the
+result. `suite check` and `suite import` should report the fault by name, and report nothing in logs
+without a fault.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ import numpy as np
 from eval.importers import import_log
 from eval.importers.options import ImportOptions
 from eval.logs.faults.check import CheckContext, check_files, check_log, rows_of
-from eval.logs.faults.finding import Finding
 from eval.logs.flight_log import FlightLog, read_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import Vehicle, with_effects
@@ -274,28 +273,19 @@ def _check(case: Case, vehicle_name: str, seed: int) -> Iterator[Answer]:
     policy_hz = POLICY_HZ if case.format != "real" else None
     context = CheckContext(vehicle, policy_hz, (fov[0], fov[1]))
     try:
-        findings = _findings(case, faulty, vehicle, context)
+        if case.format in WRITERS:
+            # The format of another program is written to a file; the import gives findings, too.
+            with tempfile.TemporaryDirectory() as folder:
+                written = WRITERS[case.format](Path(folder), faulty)
+                options = replace(written.options, vehicle=vehicle)
+                log, findings = import_log(written.path, case.format, options)
+        else:
+            log, findings = as_log(faulty, case.path.name), []
+        findings = [*findings, *check_log(log, context)[0], *check_files(context)]
     except ValueError as error:
         yield str(error).splitlines()[0]
         return
     yield [f._asdict() for f in findings if f.fault and f.status != "ok"]
-
-
-def _findings(
-    case: Case, signals: dict[str, np.ndarray], vehicle: Vehicle, context: CheckContext
-) -> list[Finding]:
-    """Return the findings in a log with `signals`.
-
-    A case in the format of another program is written to a file and imported, which also gives
-    findings. Other cases become a flight log without a file.
-    """
-    if case.format in WRITERS:
-        with tempfile.TemporaryDirectory() as folder:
-            written = WRITERS[case.format](Path(folder), signals)
-            options = replace(written.options, vehicle=vehicle)
-            log, findings = import_log(written.path, case.format, options)
-        return [*findings, *check_log(log, context)[0], *check_files(context)]
-    return [*check_log(as_log(signals, case.path.name), context)[0], *check_files(context)]
 
 
 def _import_real(path: Path) -> tuple[FlightLog, Vehicle]:

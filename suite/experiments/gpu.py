@@ -1,8 +1,4 @@
-"""The page `gpu`: speed of training and judging on an accelerator, and a check against the CPU.
-
-A world is one simulated scene and drone of a batch. The judge is the simulator that scores
-policies; `mjx` is its version for accelerators.
-"""
+"""The page `gpu`: speed of training and judging on an accelerator, and a check against the CPU."""
 
 from __future__ import annotations
 
@@ -18,6 +14,7 @@ import numpy as np
 
 from eval.judging.judge import JudgeOptions, fly
 from eval.judging.statistics import paired_success, wilson
+from eval.judging.tables import percent
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import Rules, TrialResult, TrialSpec
@@ -27,13 +24,6 @@ from suite.common.console import Console
 from suite.common.curve import read
 from suite.common.report import Picture
 from suite.experiments.pages.document import PageContents
-from suite.experiments.pages.gpu_tables import (
-    MODELS,
-    judge_grid,
-    pairs_grid,
-    trainer_grid,
-    training_grid,
-)
 from suite.experiments.study import judging
 from suite.experiments.study.cache import Workspace
 from suite.experiments.study.speed import best_time, count_operations, multiplying_rate, peak_memory
@@ -45,7 +35,7 @@ from suite.train.recipes import named_recipe, with_iterations
 from suite.train.run import train
 from suite.train.update import make_update, start_state
 from suite.train.worlds import Worlds, sample_worlds
-from tracks.common.grid import Grid
+from tracks.common.grid import Grid, table_of
 from tracks.common.work.processes import worker_pool
 from tracks.families import JUDGED
 from tracks.input.ranges import Range, Seed, Trials
@@ -56,6 +46,10 @@ CPU."""
 SAMPLED, COUNTED = 128, 8
 """Number of different worlds in a measurement of the speed, in which further worlds are copies of
 these; and number of worlds in the program whose operations are counted."""
+MODELS = {"quadrotor": "quadrotors", "point": "point masses"}
+"""Dynamics of the training: key -> name in tables."""
+Numbers = Mapping[str, Any]
+"""Measured values of one row of a table, by name."""
 CPU_MOST = 256
 """Largest number of worlds that may be measured on a CPU: more take hours."""
 
@@ -226,7 +220,6 @@ def trainer_speeds(
 
 
 def _operations_per_world(config: Config, model: str) -> float:
-    """Return the floating-point operations of the gradient for one world."""
     phase = last_phase(config, model, COUNTED)
     gradient = make_gradient(phase)
     arguments = (start_state(phase).params, repeated_worlds(phase), jax.random.key(0))
@@ -326,3 +319,66 @@ def short_training(
         "v_max": float(np.median(speeds)) if speeds else None,
         "curve": [{key: row[key] for key in ("iteration", *DRAWN, "loss")} for row in curve],
     }
+
+
+def trainer_grid(rows: Sequence[Numbers], steps: int, best: float) -> Grid:
+    """Return a table of the speed of training, a row per model and number of worlds.
+
+    A row has model, worlds, seconds and operations of a gradient step, which is `steps` decisions
+    of a world. `best` is the device's best speed in a matrix product [operations/s].
+    """
+    return table_of(
+        rows,
+        ("trains", lambda row: MODELS[row["model"]]),
+        ("worlds", lambda row: f"{row['worlds']}"),
+        ("decisions/s", lambda row: f"{row['worlds'] * steps / row['seconds']:,.0f}"),
+        ("a gradient step [ms]", lambda row: f"{1e3 * row['seconds']:,.0f}"),
+        ("TFLOP/s", lambda row: f"{row['operations'] / row['seconds'] / 1e12:.2f}"),
+        (
+            "share of the largest matrix-product speed",
+            lambda row: f"{row['operations'] / row['seconds'] / best:.1%}",
+        ),
+    )
+
+
+def judge_grid(rows: Sequence[Numbers]) -> Grid:
+    """Return a table of the speed of the judge, a row per number of trials at once."""
+    return table_of(
+        rows,
+        ("trials at once", lambda row: f"{row['worlds']}"),
+        ("decisions/s", lambda row: f"{row['decisions_per_s']:,.0f}"),
+        ("simulated seconds per second", lambda row: f"{row['flown_s_per_s']:,.0f}"),
+        ("all of them [s]", lambda row: f"{row['seconds']:.1f}"),
+    )
+
+
+def pairs_grid(pairs: Mapping[str, Numbers]) -> Grid:
+    """Return a table of the trials with the same result on CPU and accelerator.
+
+    It has a row per simulator on the CPU.
+    """
+
+    def difference(row: Numbers) -> str:
+        return "{:+.1f} ({:+.1f} to {:+.1f})".format(*(100 * x for x in row["difference"]))
+
+    return table_of(
+        [{"name": name, **numbers} for name, numbers in pairs.items()],
+        ("compared with", lambda row: row["name"]),
+        ("trials", lambda row: f"{row['trials']}"),
+        ("the same success", lambda row: f"{row['same_success']}"),
+        ("the same ending", lambda row: f"{row['same_ending']}"),
+        ("success, GPU minus CPU [points, 95 %]", difference),
+    )
+
+
+def training_grid(short: Numbers) -> Grid:
+    """Return a table of one row with the results of the short training."""
+    return table_of(
+        [short],
+        ("worlds", lambda row: f"{row['worlds']}"),
+        ("gradient steps", lambda row: f"{row['iterations']}"),
+        ("time with compiling [s]", lambda row: f"{row['seconds']:.0f}"),
+        ("decisions/s", lambda row: f"{row['decisions_per_s']:,.0f}"),
+        ("success (95 %)", lambda row: percent(row["success"])),
+        ("v_max, median [m/s]", lambda row: f"{row['v_max']:.1f}" if row["v_max"] else ""),
+    )

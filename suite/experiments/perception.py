@@ -1,8 +1,7 @@
 """The page `perception`: success rate and speed of policies that get the data of sensor models.
 
-A sensor model simulates one kind of error in what a policy sees. A preset is a shipped sensors file
-with several models, such as `vio`. A magnitude multiplies the errors: 0 is a perfect sensor, 1 the
-usual size. All policies fly the same trials (a track, a level of difficulty, a seed).
+A preset is a shipped sensors file with several models, such as `vio`. A magnitude multiplies the
+errors: 0 is a perfect sensor, 1 the usual size.
 """
 
 from __future__ import annotations
@@ -12,9 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
 
-import numpy as np
-
-from eval.judging.statistics import paired_success, wilson
+from eval.judging.statistics import wilson
 from eval.judging.tables import percent
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors import SENSORS
@@ -25,15 +22,18 @@ from eval.sensors.sensors_file import (
     scale_sensors,
     shipped_sensors,
 )
-from eval.vehicles.vehicle import Vehicle
 from suite.common.console import Console
 from suite.common.report import Picture
 from suite.experiments.pages.document import PageContents
-from suite.experiments.study import disturbed, judging, options
+from suite.experiments.study import conditions, judging, options
 from suite.experiments.study.cache import Workspace
-from suite.experiments.study.conditions import Condition, Sweep, sweep_conditions
-from suite.experiments.study.disturbed import ConditionResult
-from suite.loop.tables import difference_cell
+from suite.experiments.study.conditions import (
+    Condition,
+    ConditionResult,
+    Sweep,
+    sweep_conditions,
+)
+from suite.loop.compare import difference_cell
 from tracks.common.grid import Cell, Grid, table
 from tracks.input.ranges import Trials
 
@@ -74,7 +74,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     preset_conditions = [
         Condition(name, 1.0, "", vehicle, sensors) for name, sensors in presets.items()
     ]
-    results = disturbed.fly_conditions(
+    results = conditions.fly_conditions(
         [base, *preset_conditions], policies, trials, workspace, console
     )
 
@@ -84,13 +84,17 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
 
     def fly_sweeps(
         sets: Mapping[str, SensorSet], magnitudes: Sequence[float], policies: Mapping[str, str]
-    ) -> disturbed.SweepResults:
+    ) -> conditions.SweepResults:
         """Return the results of each of `sets` at each of `magnitudes`."""
-        sweeps = magnitude_sweeps(sets, magnitudes)
-        conditions = {sweep: sweep_conditions(vehicle, sweep) for sweep in sweeps}
-        flown = [point for points in conditions.values() for point in points]
-        results = disturbed.fly_conditions(flown, policies, sweep_trials, workspace, console)
-        return disturbed.by_sweep(results, conditions)
+        axis = "magnitude, times the usual"
+        sweeps = [
+            Sweep(name, axis, magnitudes, partial(scale_sensors, sensors))
+            for name, sensors in sets.items()
+        ]
+        points = {sweep: sweep_conditions(vehicle, sweep) for sweep in sweeps}
+        flown = [point for listed in points.values() for point in listed]
+        results = conditions.fly_conditions(flown, policies, sweep_trials, workspace, console)
+        return conditions.by_sweep(results, points)
 
     first_policy = dict([next(iter(policies.items()))])
     preset_sweeps = fly_sweeps(presets, PRESET_MAGNITUDES, policies)
@@ -114,7 +118,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
             chart = Picture(sweeps_chart(points), "Success against the magnitude of each")
             parts[title] = [chart, magnitude_grid(points)]
     numbers = [
-        disturbed.tested_numbers(entry, entries[0])
+        conditions.tested_numbers(entry, entries[0])
         for entries in (results, *preset_sweeps.values(), *model_sweeps.values())
         for entry in entries
     ]
@@ -143,23 +147,6 @@ def select_sensor_sets(only: Sequence[str]) -> tuple[dict[str, SensorSet], dict[
     )
 
 
-def magnitude_sweeps(sets: Mapping[str, SensorSet], magnitudes: Sequence[float]) -> list[Sweep]:
-    """Return a sweep over `magnitudes` of each of `sets`."""
-
-    def make(sensors: SensorSet, vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorSet]:
-        return vehicle, scale_sensors(sensors, size)
-
-    return [
-        Sweep(name, "magnitude, times the usual", magnitudes, partial(make, sensors))
-        for name, sensors in sets.items()
-    ]
-
-
-def _median_speed(entry: ConditionResult, policy: str) -> float:
-    """Return the median, over the trials of a policy, of the mean speed [m/s]."""
-    return float(np.median([row.v_mean for row in entry.results[policy]]))
-
-
 def preset_grid(results: Sequence[ConditionResult]) -> Grid:
     """Return a table with a row for each preset and policy.
 
@@ -174,8 +161,8 @@ def preset_grid(results: Sequence[ConditionResult]) -> Grid:
             for level in levels:
                 success = [trial.success for trial in trials if trial.difficulty == level]
                 row.append(percent(wilson(sum(success), len(success))))
-            change = paired_success(entry.won(name), base.won(name))
-            speed, base_speed = _median_speed(entry, name), _median_speed(base, name)
+            change = entry.minus(base, name)
+            speed, base_speed = entry.median(name, "v_mean"), base.median(name, "v_mean")
             is_perfect = entry.condition.sensors == PERFECT
             row += [percent(entry.success(name)), "" if is_perfect else difference_cell(change)]
             row.append(f"{speed:.2f} ({speed / base_speed - 1:+.1%})")
@@ -194,8 +181,8 @@ def gain_grids(results: Sequence[ConditionResult]) -> list[Grid]:
     for entry in results:
         cells = []
         for name in others:
-            change = difference_cell(paired_success(entry.won(name), entry.won(first)))
-            speed_change = _median_speed(entry, name) / _median_speed(entry, first) - 1
+            change = difference_cell(entry.minus(entry, name, first))
+            speed_change = entry.median(name, "v_mean") / entry.median(first, "v_mean") - 1
             cells.append(Cell(f"{change.text}, {speed_change:+.1%}", change.tone))
         rows.append([entry.condition.name, *cells])
     title = f"Success in points and median v_mean against {first}, on the same trials"
@@ -211,7 +198,7 @@ def magnitude_grid(sweeps: Mapping[Sweep, Sequence[ConditionResult]]) -> Grid:
     for sweep, points in sweeps.items():
         for name in points[0].results:
             cells = (
-                f"{percent(p.success(name))}, {_median_speed(p, name):.2f} m/s" for p in points
+                f"{percent(p.success(name))}, {p.median(name, 'v_mean'):.2f} m/s" for p in points
             )
             rows.append([sweep.name, name, *cells])
     magnitudes = next(iter(sweeps)).sizes

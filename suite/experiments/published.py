@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from policies import shipped
-from suite.common.console import Console, duration
 from suite.experiments.study.cache import page_code
 from suite.judging.content import policy_digest
 from tracks.common.grid import Grid, table
@@ -41,22 +38,6 @@ class Status:
     """List the published pages in --out, and which policy or code is newer than a page."""
 
 
-def make_all(make: Callable[[str, list[str]], Any], console: Console) -> dict[str, Any]:
-    """Make each published page by make(name, options), and print how long each took.
-
-    Returns:
-        `seconds`: page -> time that it took [s].
-    """
-    seconds: dict[str, float] = {}
-    for name, options in PUBLISHED.items():
-        console.say(f"{len(seconds) + 1} of {len(PUBLISHED)}: {name}")
-        started = time.monotonic()
-        make(name, options.split())
-        seconds[name] = round(time.monotonic() - started, 1)
-        console.say(f"{name}: {duration(seconds[name])}")
-    return {"seconds": seconds}
-
-
 def page_states(folder: Path) -> dict[str, dict[str, Any]]:
     """Return the state of every published page in `folder`, by name.
 
@@ -64,22 +45,20 @@ def page_states(folder: Path) -> dict[str, dict[str, Any]]:
     "policy" if a shipped policy now has other weights, and "code" if the code that flies or that
     the page measures is different, docstrings and comments apart. `newer` is None without a page.
     """
-    return {name: _page_state(folder / f"{name}.json") for name in PUBLISHED}
-
-
-def _page_state(path: Path) -> dict[str, Any]:
-    """Return the state of one page from its JSON file."""
-    if not path.is_file():
-        return {"commit": "", "newer": None}
-    page = json.loads(path.read_text(encoding="utf-8"))
-    policies = re.findall(r"([\w-]+), SHA-256 ([0-9a-f]{16})", json.dumps(page["made_by"]))
-    # Other policies than the shipped ones stand for themselves: nothing can be newer.
-    weights_differ = (
-        policy_digest(name)[:16] != digest for name, digest in policies if name in shipped.names()
-    )
-    newer = ["policy"] if any(weights_differ) else []
-    newer += ["code"] if page.get("code_sha256") != page_code(path.stem) else []
-    return {"commit": page["git_commit"] or "", "newer": newer}
+    states: dict[str, dict[str, Any]] = {}
+    for name in PUBLISHED:
+        path = folder / f"{name}.json"
+        if not path.is_file():
+            states[name] = {"commit": "", "newer": None}
+            continue
+        page = json.loads(path.read_text(encoding="utf-8"))
+        flown = re.findall(r"([\w-]+), SHA-256 ([0-9a-f]{16})", json.dumps(page["made_by"]))
+        # Other policies than the shipped ones stand for themselves: nothing can be newer.
+        digests = [(policy, digest) for policy, digest in flown if policy in shipped.names()]
+        newer = ["policy"] if any(policy_digest(p)[:16] != digest for p, digest in digests) else []
+        newer += ["code"] if page.get("code_sha256") != page_code(name) else []
+        states[name] = {"commit": page["git_commit"] or "", "newer": newer}
+    return states
 
 
 def status_grid(states: dict[str, dict[str, Any]]) -> Grid:

@@ -1,7 +1,5 @@
 """The page `robustness`: success of policies under physical effects and growing disturbances.
 
-An effect is one physical cause of a mismatch, such as drag or wind. A condition is a vehicle with
-an effect, or with other sensors. A sweep is a series of conditions in which one disturbance grows.
 All policies fly the same trials under every condition.
 """
 
@@ -10,17 +8,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from eval.judging.statistics import paired_success
 from eval.judging.tables import percent
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.common.console import Console
 from suite.common.report import Picture
 from suite.experiments.pages.document import PageContents
-from suite.experiments.study import disturbed, judging, options
+from suite.experiments.study import conditions, judging, options
 from suite.experiments.study.cache import Workspace
-from suite.experiments.study.conditions import Condition
-from suite.experiments.study.disturbed import ConditionResult
-from suite.loop.tables import difference_cell
+from suite.experiments.study.conditions import Condition, ConditionResult
+from suite.loop.compare import difference_cell
 from tracks.common.grid import Cell, Grid, table
 
 
@@ -41,12 +37,12 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     from suite.experiments.pages.charts import effects_chart, sweeps_chart
 
     vehicle, policies = load_vehicle(config.vehicle), judging.named_policies(config.policy)
-    singles, sweeps = disturbed.select_conditions(vehicle, config.only)
+    singles, sweeps = conditions.select_conditions(vehicle, config.only)
     base, trials = Condition("undisturbed", 0.0, "", vehicle), judging.judged_trials(config)
     flown = [base, *singles, *(point for points in sweeps.values() for point in points)]
-    results = disturbed.fly_conditions(flown, policies, trials, workspace, console)
+    results = conditions.fly_conditions(flown, policies, trials, workspace, console)
     effects = results[: 1 + len(singles)]
-    sweep_results = disturbed.by_sweep(results[len(effects) :], sweeps)
+    sweep_results = conditions.by_sweep(results[len(effects) :], sweeps)
     facts = {
         **judging.policy_facts(policies),
         "trials": f"three tracks, level {config.difficulty}, seeds "
@@ -67,7 +63,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
                 for s, points in sweep_results.items()
             ),
         ]
-    numbers = [disturbed.tested_numbers(entry, effects[0]) for entry in results]
+    numbers = [conditions.tested_numbers(entry, effects[0]) for entry in results]
     return PageContents(facts, parts, {"conditions": numbers})
 
 
@@ -94,9 +90,8 @@ def condition_grid(
             condition.vehicle is undisturbed.vehicle and condition.sensors == undisturbed.sensors
         )
         for name in names:
-            change = paired_success(entry.won(name), base.won(name))
+            change = entry.minus(base, name)
             row += [percent(entry.success(name)), "" if is_base else difference_cell(change)]
-        reference = entry.won(names[0])
-        row += [difference_cell(paired_success(entry.won(name), reference)) for name in names[1:]]
+        row += [difference_cell(entry.minus(entry, name, names[0])) for name in names[1:]]
         rows.append(row)
     return table(headers, rows, title)

@@ -1,8 +1,7 @@
 """The page `schemes`: the paper's comparison of three schemes (ways of training a policy).
 
-They are PPO, our method, and our method without the field (the Attractive Vector Field, which
-guides the drone through gates). All are trained in the same dynamics. During the training they are
-measured on tracks that no training uses.
+They are PPO, our method, and our method without the Attractive Vector Field ("the field"). During
+the training they are measured on tracks that no training uses.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from suite.common.report import Picture
 from suite.experiments.pages.document import PageContents
 from suite.experiments.study import options, training
 from suite.experiments.study.cache import Workspace
-from suite.experiments.study.summary import Summary, summaries
+from suite.experiments.study.training import Summary
 from suite.train.overrides import check_owned, in_every_phase
 from suite.train.ppo.config import ppo_like
 from tracks.common.grid import Grid, table
@@ -62,9 +61,10 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
 
     compared = schemes(config)
     unseen = training.UnseenWorlds(config.measurements, config.trials, config.seed, config.seconds)
-    study = training.Study(compared, config.training_seeds, unseen, by_seed=True)
-    runs = training.train_all(study, workspace, console)
-    rows, episode = summaries(compared, runs), compared[0].recipe.episode
+    runs = training.train_all(
+        compared, config.training_seeds, unseen, workspace, console, by_seed=True
+    )
+    rows, episode = training.summaries(compared, runs), compared[0].recipe.episode
     compile_s = {
         row.key: float(np.mean([run.compile_s for run in runs if run.setting == row.key]))
         for row in rows

@@ -1,7 +1,7 @@
 """The page `simulators`: policies on the same trials in every simulator, and why results differ.
 
-A trial is one judged flight. Where a simulator has other aerodynamics than MuJoCo, a control flies
-MuJoCo with these aerodynamics, which separates their effect from other differences.
+Where a simulator has other aerodynamics than MuJoCo, a control flies MuJoCo with these
+aerodynamics, which separates their effect from other differences.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import tyro
 
-from eval.judging.statistics import paired_success
 from eval.judging.tables import percent
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds import REFERENCE, WORLDS, differences, nearest
@@ -22,9 +21,8 @@ from suite.common.console import Console
 from suite.experiments.pages.document import PageContents
 from suite.experiments.study import judging, options
 from suite.experiments.study.cache import Workspace
-from suite.experiments.study.conditions import Condition
-from suite.experiments.study.disturbed import ConditionResult, fly_conditions
-from suite.loop.tables import difference_cell
+from suite.experiments.study.conditions import Condition, ConditionResult, fly_conditions
+from suite.loop.compare import difference_cell
 from tracks.common.grid import Grid, table
 from tracks.input.ranges import Trials
 
@@ -137,7 +135,7 @@ def _numbers(entry: ConditionResult, base: ConditionResult, policy: str) -> dict
 
     return {
         "success": entry.success(policy),
-        "minus_mujoco": paired_success(entry.won(policy), base.won(policy)),
+        "minus_mujoco": entry.minus(base, policy),
         "ends_alike": sum(a.ended_by == b.ended_by for a, b in pairs),
         "trials": len(rows),
         "lap_apart_s": median_difference("time_s"),

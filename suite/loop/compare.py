@@ -1,9 +1,7 @@
-"""Compare the policies that a loop judged on the same trials: rates, speeds and differences.
+"""Compare the policies that a loop judged on the same trials: numbers, tables and sentences.
 
-A trial is one judged flight: a track, its level (difficulty 0 to 9) and a seed. The trials of one
-track and level are a cell.
-
-A p-value is that of the exact two-sided McNemar test, which compares the successes on equal trials.
+The trials of one track and level are a cell. A p-value is that of the exact two-sided McNemar test,
+which compares the successes on equal trials.
 """
 
 from __future__ import annotations
@@ -16,15 +14,23 @@ import numpy as np
 
 from eval.judging.statistics import (
     Interval,
+    PairedDifference,
     bootstrap_mean,
     bootstrap_median,
     paired_success,
     wilson,
 )
-from eval.worlds.trial import TrialResult, TrialSpec
+from eval.worlds.trial import TrialResult
+from tracks.common.grid import Cell, Grid, table
 
 BEFORE = "before"
 """Name of the policy before fine-tuning, which every loop has."""
+CAVEAT = (
+    "Intervals are 95 % over trials, for these policies: another training seed gives other "
+    "policies. Differences are paired by trial. The intervals of single rows are not corrected for "
+    "multiple comparisons."
+)
+"""Note on the intervals, for the text below the tables."""
 
 
 class Difference(NamedTuple):
@@ -33,9 +39,7 @@ class Difference(NamedTuple):
     against: str
     """Name of the policy whose rate is subtracted."""
     success: Interval
-    """The difference with Newcombe's paired interval."""
     p_value: float
-    """p-value of the difference."""
 
 
 class PolicyResult(NamedTuple):
@@ -65,17 +69,21 @@ def policy_results(
     Raises:
         ValueError: if the trials differ.
     """
-    cells = _cells(same_trials(results))
+    first, *others = results
+    trials = [row.trial for row in results[first]]
+    for name in others:
+        if [row.trial for row in results[name]] != trials:
+            raise ValueError(f"{name!r} and {first!r} were not flown on the same trials")
+    # Cell (track, level) -> indices of its trials.
+    cells: dict[tuple[str, int], list[int]] = {}
+    for index, trial in enumerate(trials):
+        cells.setdefault((trial.track, trial.difficulty), []).append(index)
     successes = {name: np.array([row.success for row in rows]) for name, rows in results.items()}
     summaries = []
     for name, rows in results.items():
         # The seed of the bootstrap: the same numbers on every machine.
         seed, success = zlib.crc32(name.encode()), successes[name]
-        pairs = {
-            reference: paired_success(success, successes[reference])
-            for reference in references
-            if reference != name
-        }
+        pairs = [(r, paired_success(success, successes[r])) for r in references if r != name]
         summaries.append(
             PolicyResult(
                 name=name,
@@ -88,25 +96,11 @@ def policy_results(
                 v_mean=bootstrap_median(np.array([row.v_mean for row in rows]), seed),
                 differences=[
                     Difference(reference, Interval(*pair[:3]), pair.p_value)
-                    for reference, pair in pairs.items()
+                    for reference, pair in pairs
                 ],
             )
         )
     return summaries
-
-
-def same_trials(results: Mapping[str, Sequence[TrialResult]]) -> list[TrialSpec]:
-    """Return the common trials of all policies, in order.
-
-    Raises:
-        ValueError: if the trials differ.
-    """
-    first, *others = results
-    trials = [row.trial for row in results[first]]
-    for name in others:
-        if [row.trial for row in results[name]] != trials:
-            raise ValueError(f"{name!r} and {first!r} were not flown on the same trials")
-    return trials
 
 
 def success_rate(success: np.ndarray) -> Interval:
@@ -114,9 +108,72 @@ def success_rate(success: np.ndarray) -> Interval:
     return wilson(int(success.sum()), len(success))
 
 
-def _cells(trials: Sequence[TrialSpec]) -> dict[tuple[str, int], list[int]]:
-    """Return the indices of the trials in each cell, by track and level."""
-    cells: dict[tuple[str, int], list[int]] = {}
-    for index, trial in enumerate(trials):
-        cells.setdefault((trial.track, trial.difficulty), []).append(index)
-    return cells
+def overall_grid(
+    results: Sequence[PolicyResult],
+    references: Sequence[str],
+    labels: Mapping[str, str],
+    trials: int,
+) -> Grid:
+    """Return the table over all trials, a row per policy: success, differences, gates and speed.
+
+    Each of the `references` has two columns, in which the others are compared with it.
+    """
+    headers = ["policy", "success [%]"]
+    for reference in references:
+        headers += [f"minus {labels[reference]}", "p"]
+    rows = []
+    for result in results:
+        row: list[str | Cell] = [labels[result.name], value_text(result.success, 100, 0)]
+        differences = {difference.against: difference for difference in result.differences}
+        for reference in references:
+            difference = differences.get(reference)
+            if difference:
+                row += [difference_cell(difference.success), f"{difference.p_value:.2g}"]
+            else:
+                row += ["", ""]
+        rows.append([*row, *(value_text(value, 1, 2) for value in (result.gates, result.v_mean))])
+    headers += ["gates passed, mean", "mean speed, median [m/s]"]
+    return table(headers, rows, f"Over {trials} trials of each policy")
+
+
+def cell_grid(results: Sequence[PolicyResult], labels: Mapping[str, str]) -> Grid:
+    """Return the table of success rates, with a row per track and level and a column per policy."""
+    headers = ["track and level", *(labels[result.name] for result in results)]
+    rows = [
+        [cell, *(value_text(result.by_cell[cell], 100, 0) for result in results)]
+        for cell in results[0].by_cell
+    ]
+    return table(headers, rows, "Success by track and level [%]")
+
+
+def value_text(interval: Interval, scale: float, digits: int) -> str:
+    """Return a number with its interval for a table; both are multiplied by `scale`."""
+    value, low, high = (f"{scale * x:.{digits}f}" for x in interval)
+    return f"{value} [{low}, {high}]"
+
+
+def difference_cell(interval: Interval | PairedDifference) -> Cell:
+    """Return a difference of rates with its sign and interval, in percentage points.
+
+    It is coloured if the interval excludes zero.
+    """
+    # Adding zero turns a rounded -0 into +0.
+    value, low, high = (f"{round(100 * x, 0) + 0.0:+.0f}" for x in interval[:3])
+    tone = "good" if interval.low > 0 else "bad" if interval.high < 0 else ""
+    return Cell(f"{value} [{low}, {high}]", tone)
+
+
+def significance(difference: Interval, above: str = "more than", below: str = "fewer than") -> str:
+    """Return how a sentence names a difference, by its interval.
+
+    It is `above` or `below` if the interval excludes zero, else "not significantly different from".
+    """
+    if difference.low > 0:
+        return above
+    return below if difference.high < 0 else "not significantly different from"
+
+
+def points(difference: Interval) -> str:
+    """Return a difference of success rates with its interval, in percentage points."""
+    value, interval = difference_cell(difference).text.split(" ", 1)
+    return f"{value} points {interval}"

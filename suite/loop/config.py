@@ -1,9 +1,7 @@
 """The settings of a loop, computed from a recipe (named settings of a training) and the options.
 
-A loop flies a policy, corrects the simulation from these flights, fine-tunes the policy in it and
-judges both. The true vehicle produces the flights. In a loop with a hidden vehicle it differs from
-the vehicle file of the simulation; else it is the same. A digest is the SHA-256 of a file's
-content.
+The true vehicle produces the flights. In a loop with a hidden vehicle it differs from the vehicle
+file of the simulation; else it is the same.
 """
 
 from __future__ import annotations
@@ -159,8 +157,10 @@ def resolve(
     Raises:
         ValueError: for an invalid option, with what is allowed.
     """
+    from eval.judging.judge import check_records
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.sensors.sensors_file import load_sensors, sensors_table
+    from eval.worlds import world_class
     from policies.formats.policy_file import load_policy_checkpoint
     from suite.diagnose.estimate.parameters import refuse_own_motion
     from suite.judging.content import policy_digest
@@ -201,7 +201,8 @@ def resolve(
     true_vehicle = vehicle if hidden_vehicle is None else hidden_vehicle
     if hidden:
         refuse_own_motion(simulated)
-        check_simulator(simulator)
+        world_class(simulator)
+        check_records(simulator)
         true = load_vehicle(true_vehicle)
         if simulated == replace(true, name=simulated.name) and simulator in EXACT_SIMULATORS:
             raise ValueError(
@@ -251,11 +252,7 @@ def resolve(
 def _check_changes(
     changes: Sequence[str], policy: str | None, iterations: int | None, hidden: bool
 ) -> None:
-    """Refuse options of a first training if there is none, and settings that the loop itself sets.
-
-    Raises:
-        ValueError: with the option and what to do instead.
-    """
+    """Refuse options of a first training if there is none, and settings that the loop sets."""
     owned = {"seed": "give --seed"}
     if hidden:
         owned["quadrotor.vehicle"] = "give --vehicle"
@@ -273,26 +270,8 @@ def _check_changes(
     check_owned(changes, owned)
 
 
-def check_simulator(name: str) -> None:
-    """Refuse a simulator that cannot fly a true vehicle.
-
-    Raises:
-        ValueError: for an unknown simulator, a missing package, or a simulator that does not record
-            flights.
-    """
-    from eval.judging.judge import check_records
-    from eval.worlds import world_class
-
-    world_class(name)
-    check_records(name)
-
-
 def _check_seeds(config: LoopConfig) -> None:
-    """Refuse track files, on which recorded flights would equal judged trials, and too few flights.
-
-    Raises:
-        ValueError: with the option and what is allowed.
-    """
+    """Refuse track files, on which recorded flights would equal trials, and too few flights."""
     files = [name for name in parse_tracks(config.track) if is_track_file(name)]
     if files:
         raise ValueError(

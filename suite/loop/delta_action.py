@@ -1,8 +1,7 @@
 """The loop that shows the effect of a Delta Action Model ("delta") on the fine-tuning of a policy.
 
-The model is a network that corrects actions so that simulated flights match measured ones. One
-policy is fine-tuned with it. Another one, the control, is fine-tuned without it for the same number
-of steps, and shows the effect of more training alone.
+One policy is fine-tuned with it. Another one, the control, is fine-tuned without it for the same
+number of steps, and shows the effect of more training alone.
 """
 
 from __future__ import annotations
@@ -10,16 +9,17 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
 
 from suite.common import curve
-from suite.common.charts import curves_chart
+from suite.common.charts import curves_chart, legend, png, titled
 from suite.common.report import Picture, Section
-from suite.delta.run import errors_grid
-from suite.loop.charts import COLOURS, delta_chart
-from suite.loop.compare import BEFORE, PolicyResult
+from suite.delta.run import errors_by_name, errors_grid
+from suite.loop.compare import BEFORE, PolicyResult, points, significance
 from suite.loop.config import LoopConfig
-from suite.loop.tables import points, significance
-from suite.loop.variants import DeltaModel, Findings, Loop, ShownPolicy, Variant
+from suite.loop.variants import COLOURS, DeltaModel, Findings, Loop, ShownPolicy, Variant
 
 WITHOUT, WITH = "without", "with"
 LABELS = {BEFORE: "before", WITHOUT: "tuned without delta", WITH: "tuned with delta"}
@@ -71,6 +71,33 @@ def _delta_section(fitted: Mapping) -> Section:
             Picture(delta_chart(fitted), f"Mean distance from the record after {horizon:g} s."),
         ],
     )
+
+
+def delta_chart(fitted: Mapping[str, Any]) -> bytes:
+    """Return the chart of the Delta Action Model's error during its fit, and of simpler models.
+
+    The simpler models have one error each, a horizontal line. `fitted` are the contents of
+    delta.json.
+    """
+    figure = Figure(figsize=(7.2, 3.4), layout="constrained")
+    axes = figure.subplots()
+    iterations = [row["iteration"] for row in fitted["curve"]]
+    for key, label, style in (
+        ("held_out_m", "with Delta Action Model, held-out flights", "-"),
+        ("fit_m", "with Delta Action Model, fitted flights", ":"),
+    ):
+        errors = [row[key] for row in fitted["curve"]]
+        axes.plot(iterations, errors, style, color=COLOURS[4], lw=1.8, label=label)
+    # The last error is that of the Delta Action Model after the fit, the end of its curve.
+    *simpler, _ = errors_by_name(fitted).items()
+    for (name, error), colour in zip(simpler, COLOURS, strict=False):
+        label = f"{name}, held-out flights"
+        axes.axhline(error["position_m"], color=colour, lw=1.8, label=label)
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("iteration of the fit", fontsize=9)
+    titled(axes, f"Position error after {fitted['horizon_s']:g} s [m]")
+    legend(figure, axes, 2, 8)
+    return png(figure)
 
 
 def _training_section(out: Path, config: LoopConfig) -> Section:

@@ -1,14 +1,10 @@
 """The loop with a hidden vehicle: its effect is diagnosed, and policies are fine-tuned for it.
 
-The hidden vehicle has a physical effect (such as drag) that the simulation's vehicle file lacks.
-Only the judge, the simulator that scores policies, reads the file of the hidden vehicle. The
-simulation is corrected from measured flights only. A Delta Action Model is a network that corrects
-actions so that simulated flights match measured ones.
-
-Six policies are compared. `NOMINAL` and `BEFORE` are the first policy, with the vehicle of the
-simulation and with the hidden one. The others are fine-tuned and fly the hidden vehicle: `CONTROL`
-in the uncorrected simulation, `DELTA` with a Delta Action Model, `NAMED` with the effect that the
-diagnosis names, `BOTH` with that effect and a Delta Action Model.
+Only the judge reads the file of the hidden vehicle; the simulation is corrected from measured
+flights only. Six policies are compared. `NOMINAL` and `BEFORE` are the first policy, with the
+vehicle of the simulation and with the hidden one. The others are fine-tuned and fly the hidden
+vehicle: `CONTROL` in the uncorrected simulation, `DELTA` with a Delta Action Model, `NAMED` with
+the effect that the diagnosis names, `BOTH` with that effect and a Delta Action Model.
 """
 
 from __future__ import annotations
@@ -28,11 +24,9 @@ from suite.common.charts import curves_chart
 from suite.common.report import Links, Picture, Section
 from suite.delta.run import errors_grid
 from suite.diagnose.report.summary import components
-from suite.loop.charts import COLOURS
-from suite.loop.compare import BEFORE, PolicyResult
+from suite.loop.compare import BEFORE, PolicyResult, points, significance
 from suite.loop.config import EXACT_SIMULATORS, LoopConfig
-from suite.loop.tables import points, significance
-from suite.loop.variants import DeltaModel, Findings, Loop, ShownPolicy, Variant
+from suite.loop.variants import COLOURS, DeltaModel, Findings, Loop, ShownPolicy, Variant
 from suite.loop.work import named_effects, read_diagnosis
 from tracks.common.files import to_json
 from tracks.common.grid import Grid, markdown, table
@@ -177,7 +171,6 @@ def hidden_effects(simulated: Vehicle, true: Vehicle) -> str:
 
 
 def _errors_grids(out: Path) -> list[Grid]:
-    """Return a table of the errors of each Delta Action Model."""
     return [
         errors_grid(
             json.loads((out / f"delta-{name}" / "delta.json").read_text(encoding="utf-8")),

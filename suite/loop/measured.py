@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,22 +24,9 @@ SHORTEST_S = 1.5
 """Shortest flight that is used [s]."""
 LEAST_FILES = 5
 """Smallest number of flights for a diagnosis: its statistics take whole flights as independent."""
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Standard deviations of white measurement noise."""
-
-    pos: float = 0.005
-    """Noise of the position on each axis [m]."""
-    attitude: float = 0.004
-    """Noise of the attitude, as a rotation about each body axis [rad]."""
-    vel: float = 0.03
-    """Noise of the velocity on each axis [m/s]."""
-    gyro: float = 0.02
-    """Noise of the body rates on each axis [rad/s]."""
-    rotor: float = 5.0
-    """Noise of the speed of each rotor [rad/s]."""
+NOISE = {"pos": 0.005, "attitude": 0.004, "vel": 0.03, "gyro": 0.02, "rotor": 5.0}
+"""Standard deviations of the white noise of position [m], attitude [rad], velocity [m/s] and body
+rates [rad/s], on each axis, and of the speed of each rotor [rad/s]."""
 
 
 def add_measurement_noise(flights: Path, out: Path, seed: int) -> list[Path]:
@@ -61,7 +48,7 @@ def add_measurement_noise(flights: Path, out: Path, seed: int) -> list[Path]:
             continue
         log = read_flights([flights / row["file"]])[0][0]
         has_contact = row["ended_by"] not in ("finished", "timeout")
-        log = noisy(cut_end(log, CONTACT_MARGIN_S if has_contact else 0.0), Noise(), rng)
+        log = noisy(cut_end(log, CONTACT_MARGIN_S if has_contact else 0.0), rng)
         if log.duration_s < SHORTEST_S:
             continue
         write_flight(out / row["file"], log)
@@ -70,7 +57,7 @@ def add_measurement_noise(flights: Path, out: Path, seed: int) -> list[Path]:
     files = [cell[k] for k in range(most) for cell in cells.values() if k < len(cell)]
     if not files:
         raise ValueError(f"no flight in {flights} is {SHORTEST_S:g} s long")
-    write_json(out / "measured.json", {"noise": Noise(), "files": [file.name for file in files]})
+    write_json(out / "measured.json", {"noise": NOISE, "files": [file.name for file in files]})
     return files
 
 
@@ -87,22 +74,22 @@ def cut_end(log: FlightLog, margin_s: float) -> FlightLog:
     return replace(log, **arrays, extra=extra)
 
 
-def noisy(log: FlightLog, noise: Noise, rng: np.random.Generator) -> FlightLog:
+def noisy(log: FlightLog, rng: np.random.Generator) -> FlightLog:
     """Return a log with white noise on all measurements, and with exact commands and actions."""
 
     def with_noise(values: np.ndarray, sigma: float) -> np.ndarray:
         return values + sigma * rng.standard_normal(values.shape)
 
-    turn_b = noise.attitude * rng.standard_normal((len(log.time_s), 3))
+    turn_b = NOISE["attitude"] * rng.standard_normal((len(log.time_s), 3))
     rotors = log.rotor_speed
     return replace(
         log,
-        pos_w=with_noise(log.pos_w, noise.pos),
+        pos_w=with_noise(log.pos_w, NOISE["pos"]),
         quat_wxyz=rot_to_quat(log.rot_w @ exp_rot(turn_b)),
-        vel_w=with_noise(log.vel_w, noise.vel),
-        rate_b=with_noise(log.rate_b, noise.gyro),
+        vel_w=with_noise(log.vel_w, NOISE["vel"]),
+        rate_b=with_noise(log.rate_b, NOISE["gyro"]),
         # A rotor speed is never negative.
-        rotor_speed=None if rotors is None else np.maximum(with_noise(rotors, noise.rotor), 0.0),
+        rotor_speed=None if rotors is None else np.maximum(with_noise(rotors, NOISE["rotor"]), 0.0),
     )
 
 

@@ -1,30 +1,31 @@
 """Run a loop stage by stage, each in its own folder, and report the result (`suite loop`).
 
-A loop flies a policy, corrects the simulation from these flights, fine-tunes the policy in it and
-compares the policies. An interrupted stage continues where it stopped; a finished one is not
-repeated.
+An interrupted stage continues where it stopped; a finished one is not repeated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib.figure import Figure
+
 from eval.judging.results import read_trials
-from suite.common.console import Console
-from suite.common.report import Picture
+from suite.common.charts import dots, legend, png, titled
+from suite.common.console import Console, duration
+from suite.common.report import Details, Links, Picture, Report, Section, html
 from suite.common.stages import claim, run_stages
+from suite.judging.trials import parse_tracks
 from suite.loop import delta_action, hidden_effect
-from suite.loop.charts import success_chart
-from suite.loop.compare import policy_results
+from suite.loop.compare import CAVEAT, PolicyResult, cell_grid, overall_grid, policy_results
 from suite.loop.config import LoopConfig, loop_by_content
-from suite.loop.report import write_loop_report
-from suite.loop.tables import CAVEAT, cell_grid, overall_grid
+from suite.loop.variants import COLOURS, Findings
 from suite.loop.work import LoopRun, plan
-from tracks.common.files import plain, write_json, write_text
-from tracks.common.grid import markdown, rich_table
-from tracks.common.provenance import stamp
+from tracks.common.files import plain, to_json, write_json, write_text
+from tracks.common.grid import Grid, markdown, rich_table, table
+from tracks.common.provenance import VERSION, git_commit, stamp
 from tracks.common.work import Workers
 
 FILES = ("table.md", "report.html", "recording.rrd")
@@ -91,7 +92,7 @@ def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any
         "files": {name: name for name in FILES},
     }
     write_json(out / "loop.json", answer)
-    write_loop_report(out, loop, config, findings, [chart, *grids], seconds)
+    write_text(out / "report.html", html(_report(run, findings, [chart, *grids], seconds)))
     # Print the same tables, the verdict and where the files are.
     for grid in grids:
         console.show(rich_table(grid))
@@ -115,3 +116,76 @@ def seeds(run: LoopRun) -> dict[str, Any]:
         "judged": [config.seed, config.seed + config.trials - 1],
         "recorded": [config.recorded_from, config.recorded_from + config.flights - 1],
     }
+
+
+def _report(
+    run: LoopRun,
+    findings: Findings,
+    results: Sequence[Grid | Picture],
+    seconds: Mapping[str, float],
+) -> Report:
+    """Return the report: chart and tables of the policies, findings, pictures of flights, files.
+
+    The chart and the tables are `results`; `seconds` are the times of the stages [s].
+    """
+    loop, config, out = run.loop, run.config, run.out
+    vehicle = ", with the hidden vehicle" if loop.hidden else ""
+    texts = (
+        "The first seed of every track at the easiest and the hardest level, from above"
+        f"{vehicle}. Passed gates are green; a star is the end of a finished trial, a cross that "
+        "of any other.",
+        "The same trials.",
+    )
+    flights = [
+        Section(s.heading, [text, Picture((out / "replays" / f"{s.variant}.png").read_bytes(), "")])
+        for s, text in zip(loop.shown, texts, strict=True)
+    ]
+    links = [(path, text) for path, text in loop.files if (out / path).is_file()]
+    times_s = {**seconds, "all": sum(seconds.values())}
+    rows = [(name, duration(value)) for name, value in times_s.items()]
+    files = [
+        Links(links),
+        table(["stage", "took"], rows, "Time", strong_last=True),
+        Details("Configuration", to_json(config, indent=2)),
+    ]
+    return Report(
+        title=loop.title,
+        lead=findings.verdict,
+        facts={
+            "trials": f"{config.trials * config.cells} of each policy",
+            "tracks": ", ".join(parse_tracks(config.track)),
+            "levels": config.difficulty,
+            **findings.facts,
+            "started from": config.policy or "training",
+            "seed": str(config.seed),
+            "version": f"{VERSION}, {(git_commit() or 'no commit')[:10]}",
+        },
+        sections=[
+            Section("On the same seeds", [loop.reading, *results, CAVEAT]),
+            *findings.sections,
+            *flights,
+            Section("Files and configuration", files),
+        ],
+    )
+
+
+def success_chart(results: Sequence[PolicyResult], labels: Mapping[str, str]) -> bytes:
+    """Return the chart of success rates of any policies, by cell and over all trials.
+
+    `labels` are by the policies' names.
+    """
+    figure = Figure(figsize=(10.4, 4.2), layout="constrained")
+    axes = figure.subplots()
+    cells = [cell.replace(" ", "\nlevel ") for cell in (*results[0].by_cell, "all")]
+    for number, (result, colour) in enumerate(zip(results, COLOURS, strict=False)):
+        # Dots of neighbouring policies are 0.13 widths of a cell apart.
+        x = np.arange(len(cells)) + 0.13 * (number - 0.5 * (len(results) - 1))
+        intervals = [*result.by_cell.values(), result.success]
+        dots(axes, x, intervals, 100, color=colour, label=labels[result.name], ms=5, lw=1.6)
+    titled(axes, "Success [%]")
+    axes.set_xticks(range(len(cells)), cells, fontsize=8)
+    # A line separates the last cell, that of all trials.
+    axes.axvline(len(cells) - 1.5, color="#b8bec8", lw=0.8)
+    axes.set_ylim(-3, 103)
+    legend(figure, axes)
+    return png(figure)

@@ -1,10 +1,7 @@
 """Describe a loop as data: its policies, and the dynamics in which they are fine-tuned and judged.
 
-A loop flies a policy, corrects the simulation from these flights, fine-tunes the policy in it and
-judges both. The judge is the simulator that scores policies. There is one fine-tuned policy for
-each way to correct the simulation; all policies are called variants.
-
-The folder of a loop has, in the order of the stages:
+There is one fine-tuned policy for each way to correct the simulation; all policies are called
+variants. The folder of a loop has, in the order of the stages:
 - train/ or given/: the first policy, trained or copied; eval-X/: its trials, X is its name
 - flights/: the recorded flights; with a hidden vehicle also measured/ (with noise) and diagnosis/
 - a folder for each Delta Action Model
@@ -23,6 +20,9 @@ from typing import Any, NamedTuple
 from suite.common.report import Section
 from suite.loop.compare import PolicyResult
 from suite.loop.config import LoopConfig
+
+COLOURS = ("#8b93a1", "#c0504d", "#e0892b", "#7a5fb5", "#2463c9", "#2e9e6b")
+"""Colours of up to six policies."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,6 @@ class DeltaModel:
     """A fit of a Delta Action Model, a network that corrects actions to match measured flights."""
 
     folder: str
-    """Name of the model's folder."""
     title: str
     """Description of the fit, for the progress display."""
     diagnosed: bool = False
@@ -60,7 +59,6 @@ class ShownPolicy(NamedTuple):
     """A policy whose flights are in the recording and the pictures."""
 
     variant: str
-    """Name of the policy."""
     label: str
     """Label of its flights in the recording."""
     heading: str
@@ -72,7 +70,6 @@ class Findings:
     """The results of a loop."""
 
     verdict: str
-    """The result in a few sentences."""
     errors: Sequence[str]
     """Tables of the Delta Action Models' errors, as Markdown."""
     numbers: Mapping[str, Any]
@@ -88,7 +85,6 @@ class Loop:
     """A kind of loop."""
 
     title: str
-    """Title of the report."""
     hidden: bool
     """Whether the loop has a hidden vehicle. Then its flights get measurement noise and are
     diagnosed before a fit."""

@@ -1,8 +1,6 @@
 """The stages of a loop: train, judge, record, diagnose, fit, fine-tune, judge again, replay.
 
-The loop (`suite loop`) flies a policy, corrects the simulation from these flights, fine-tunes the
-policy in it and compares the policies, which are called variants. `plan` lists the stages of a kind
-of loop. Each function below returns one `Stage`, whose work runs in its own folder.
+Each function below `plan` returns one `Stage`, whose work runs in its own folder.
 """
 
 from __future__ import annotations
@@ -62,13 +60,9 @@ class LoopRun:
     """A loop in its folder."""
 
     loop: Loop
-    """The kind of loop."""
     config: LoopConfig
-    """The settings."""
     out: Path
-    """The folder."""
     console: Console
-    """Shows progress."""
     workers: Workers | None = None
     """Number of processes (or a cluster) that fly and fine-tune. None: as many processes as shorten
     the flights, and one fine-tuning after the other."""
@@ -109,7 +103,6 @@ def plan(run: LoopRun) -> list[Stage]:
 
 
 def _first_policy_stage(run: LoopRun) -> Stage:
-    """Return the stage that trains the first policy, or copies the given one."""
     config, policy = run.config, run.config.policy
     if policy is None:
 
@@ -132,7 +125,6 @@ def _estimate_flights(run: LoopRun, trials: int, simulator: str) -> Estimate:
 
 
 def _evaluation(run: LoopRun, variant: Variant) -> Evaluation:
-    """Return the settings of the trials of a variant's policy."""
     config = run.config
     return Evaluation(
         policies=(str(run.policy(variant)),),
@@ -147,8 +139,6 @@ def _evaluation(run: LoopRun, variant: Variant) -> Evaluation:
 
 
 def _judging_stage(run: LoopRun, variant: Variant) -> Stage:
-    """Return the stage that flies a variant's trials."""
-
     def work(folder: Path) -> None:
         evaluate(_evaluation(run, variant), folder, Quiet(), run.workers)
 
@@ -166,7 +156,6 @@ def _judging_stage(run: LoopRun, variant: Variant) -> Stage:
 
 
 def _recording_stage(run: LoopRun) -> Stage:
-    """Return the stage that records flights of the first policy with the true vehicle."""
     config = run.config
     first = next(variant for variant in run.loop.variants if variant.name == BEFORE)
     collection = Collection(
@@ -188,8 +177,6 @@ def _recording_stage(run: LoopRun) -> Stage:
 
 
 def _measuring_stage(run: LoopRun) -> Stage:
-    """Return the stage that adds measurement noise and selects the flights of the diagnosis."""
-
     def work(folder: Path) -> None:
         try:
             files = add_measurement_noise(run.out / "flights", folder, run.config.seed)
@@ -206,8 +193,6 @@ def _measuring_stage(run: LoopRun) -> Stage:
 
 
 def _diagnosis_stage(run: LoopRun) -> Stage:
-    """Return the stage that names the effects that the simulation's vehicle file lacks."""
-
     def work(folder: Path) -> None:
         from suite.diagnose.config import Config
         from suite.diagnose.run import diagnose_files
@@ -256,7 +241,6 @@ def named_effects(diagnosis: Mapping[str, Any]) -> str:
 
 
 def _fit_stage(run: LoopRun, model: DeltaModel) -> Stage:
-    """Return the stage that fits a Delta Action Model to the flights."""
     fit = run.config.fit
 
     def work(folder: Path) -> None:

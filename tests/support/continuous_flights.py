@@ -5,16 +5,17 @@ So the diagnosis is tested against the equations and not against its own code.
 
 import numpy as np
 
+from eval.flights.simulate import Sensors
 from eval.quadrotor.plant import Motion
 from suite.blind.continuous.body import POS, QUAT, VEL, Battery
 from suite.blind.continuous.engine import fly
-from suite.blind.continuous.log import Noise, log_of_flight
+from suite.blind.continuous.log import log_of_flight
 from suite.blind.continuous.quadrotor import quadrotor_of
 from suite.blind.continuous.timing import Conditions, schedule
 from tests.support.diagnosis_flights import curve, on_curves, track
 from tests.support.vehicles import with_effects, with_lag
 
-CHANNELS = Noise(100.0, 1.0, 1.0, 1.0, 1.0, 1.0, rotor=0.0, voltage=0.0, lost=0.0)
+CHANNELS = Sensors("", 100.0, pos=1.0, attitude=1.0, gyro=1.0, vel=1.0, acc=1.0)
 """A log of all but rotor speeds and voltage; it is without noise."""
 
 

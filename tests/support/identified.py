@@ -10,6 +10,7 @@ from eval.effects import EFFECTS
 from eval.flights.simulate import Sensors
 from eval.flights.trajectory import Trajectory
 from eval.vehicles.vehicle import MotorMap
+from suite.diagnose.identify.fit import Fitted, Unknown
 from suite.diagnose.identify.identify import identify
 from tests.support import fleets
 from tests.support.fleets import Fleet, logs_of, recordings_of
@@ -61,13 +62,21 @@ def recordings(ways):
     return recordings_of(Fleet(truth(), ways))
 
 
-def logs(drive, seed, ways=WAYS):
+def logs(drive, seed, ways=WAYS, scale=1.0, sensors=SENSORS):
     """Return logs of the flights with noise, with the inputs that `drive` needs and no others."""
-    fleet = Fleet(truth(), ways)
-    return logs_of(fleet, recordings(ways), drive, np.random.default_rng(seed), sensors=SENSORS)
+    fleet = Fleet(truth(), ways, scale)
+    return logs_of(fleet, recordings(ways), drive, np.random.default_rng(seed), sensors=sensors)
 
 
 @cache
 def found(drive):
     """Return what is identified from seed 0: from the eight and the chirp, for rates from all."""
     return identify(logs(drive, 0)[:: 1 if drive == "rates" else 3], start())
+
+
+def fitted(names, covariance=None, value=None, left=()):
+    """Return a fit of these numbers that did not identify those that are `left`."""
+    none = np.zeros(len(names))
+    unknowns = tuple(Unknown(name, 0.0, -1.0, 1.0, 1.0, 1e-3) for name in names)
+    covariance = np.diag(none) if covariance is None else np.asarray(covariance)
+    return Fitted(unknowns, none if value is None else value, covariance, tuple(left))

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from eval.effects import EFFECTS
 from eval.flights.simulate import fly
 from eval.flights.trajectory import Trajectory
-from suite.blind.oracle.strength import nominal_vehicle
+from suite.blind.oracle import nominal_vehicle
 
 EIGHT = Trajectory("figure_eight", duration_s=2.5, speed=4.0, size=2.0, turn="wobble")
 CIRCLE = Trajectory("circle", duration_s=2.5, speed=3.0, size=3.0)

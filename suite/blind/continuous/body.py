@@ -1,8 +1,4 @@
-"""Forces and torques on a flying body, and the derivative of its state.
-
-This is a part of the continuous-time engine, which shares no code with the model of the diagnosis.
-In the shapes, N is the number of flights, which are computed together.
-"""
+"""Forces and torques on the N flying bodies of the continuous-time engine, and their motion."""
 
 from __future__ import annotations
 
@@ -35,13 +31,9 @@ class Body:
     def __init__(
         self, quadrotor: Quadrotor, wind: Wind, battery: Battery, hover_power: np.ndarray
     ) -> None:
-        """Prepare for N flights.
+        """Prepare for N flights of the vehicle `quadrotor`.
 
-        Args:
-            quadrotor: constants of the vehicle that flies.
-            wind: the moving air.
-            battery: constants of the battery.
-            hover_power: (N, 1) sum of the squared rotor speeds in hover [rad^2/s^2].
+        `hover_power` is the sum of the squared rotor speeds in hover, (N, 1) [rad^2/s^2].
         """
         self.quadrotor, self.wind, self._battery = quadrotor, wind, battery
         self._hover_power = hover_power

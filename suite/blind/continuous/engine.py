@@ -23,7 +23,6 @@ class Rows(NamedTuple):
     """The states of N flights at one row of the log."""
 
     number: int
-    """Index of the row."""
     time_s: np.ndarray
     """(N,) time [s]."""
     pos_w: np.ndarray

@@ -7,7 +7,7 @@ In the shapes, T is the number of rows of a log.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,35 +21,12 @@ LOST_ROWS = 3
 """Number of consecutive rows without a pose when a pose is lost."""
 
 
-class Noise(NamedTuple):
-    """Standard deviations of the noise in rows at `rate_hz`; with 0 the log lacks the channel."""
-
-    rate_hz: float
-    """Rate of the rows to which the deviations refer [Hz]."""
-    pos: float
-    """Noise of the position along each axis [m]."""
-    attitude: float
-    """Noise of the attitude about each body axis [rad]."""
-    gyro: float
-    """Noise of the body rate about each axis [rad/s]."""
-    vel: float
-    """Noise of the velocity along each axis [m/s]."""
-    acc: float
-    """Noise of the accelerometer along each axis [m/s^2]."""
-    rotor: float
-    """Noise of each rotor speed [rad/s]."""
-    voltage: float
-    """Noise of the voltage [V]."""
-    lost: float
-    """Share of the rows without a pose."""
-
-
 def log_of_flight(
     flown: Flown,
     index: int,
     duration_s: float,
     faults: Mapping[str, Any],
-    noise: Noise,
+    noise: Any,
     conditions: Conditions,
     rng: np.random.Generator | None,
     name: str,
@@ -62,8 +39,9 @@ def log_of_flight(
         index: index of the flight.
         duration_s: duration of the log [s].
         faults: effect -> its values. Only effects on the log are used, such as a gyro bias.
-        noise: standard deviations at a given rate. Rows at another rate have the same noise
-            density, so the deviations are multiplied by the square root of the ratio of the rates.
+        noise: standard deviations at a given rate, as `eval.flights.simulate.Sensors`. Rows at
+            another rate have the same noise density, so the deviations are multiplied by the square
+            root of the ratio of the rates.
         conditions: rates, jitter, lost rows and colour of the noise.
         rng: random generator of noise, time stamps and lost rows; None: no errors.
         name: name of the log.
@@ -85,7 +63,7 @@ def log_of_flight(
     # 2. Noise, lost poses, lost rows and errors of the time stamps.
     kept = np.ones(len(rows), bool)
     if rng is not None:
-        draws = _NoiseDraws(rng, time_s, noise, conditions)
+        draws = _NoiseDraws(rng, time_s, noise.rate_hz, conditions)
         pos_w = pos_w + draws.estimator_noise(noise.pos)
         vel_w = vel_w + draws.estimator_noise(noise.vel)
         rate_b += draws.white_noise(noise.gyro, 3)
@@ -148,13 +126,11 @@ def rotate_attitude(quat_wxyz: np.ndarray, angle_b: np.ndarray) -> np.ndarray:
 
 
 class _NoiseDraws:
-    """Random noise for the rows of one flight."""
-
     def __init__(
-        self, rng: np.random.Generator, time_s: np.ndarray, noise: Noise, conditions: Conditions
+        self, rng: np.random.Generator, time_s: np.ndarray, rate_hz: float, conditions: Conditions
     ) -> None:
         self._rng, self._time_s = rng, time_s
-        self._rate_hz, self._conditions = noise.rate_hz, conditions
+        self._rate_hz, self._conditions = rate_hz, conditions
 
     def white_noise(self, sigma: float, size: int, share: float = 1.0) -> np.ndarray:
         """Return white noise (T, size), whose density is a `share` of that with `sigma`."""

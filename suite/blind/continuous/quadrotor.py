@@ -1,9 +1,8 @@
 """The true constants of a vehicle with its effects, and its controller with nominal constants.
 
 The continuous-time engine shares only definitions with the rest of the suite: the documented model
-of the nominal quadrotor, and the equations of the catalogue of effects. It calls no function of the
-catalogue. The controller is the rate loop (body rates to torque) and the mixer (torque to rotor
-speeds). It knows the nominal constants only, as on a real drone.
+of the nominal quadrotor, and the equations of the catalogue of effects. Its controller, rate loop
+and mixer, knows the nominal constants only, as on a real drone.
 """
 
 from __future__ import annotations

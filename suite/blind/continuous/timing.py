@@ -1,9 +1,8 @@
 """Timing in the continuous-time engine: random rates and jitter, and the schedule of the steps.
 
-Events are rows of the log, ticks of the rate loop (the times at which it computes), and delayed
-commands that begin to act. A step ends at every event, so that nothing jumps within a step. N
-flights are computed together, so they have the same number of steps between two rows. A flight that
-needs fewer gets steps of zero length before the next row.
+A step ends at every event (see `engine`), so that nothing jumps within a step. N flights are
+computed together, so they have the same number of steps between two rows. A flight that needs fewer
+gets steps of zero length before the next row.
 """
 
 from __future__ import annotations

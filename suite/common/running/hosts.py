@@ -50,7 +50,6 @@ class Member(NamedTuple):
     number: int
     """Number of this process, from 0."""
     processes: int
-    """Number of processes."""
     coordinator: str | None
     """HOST:PORT of the first process; None: JAX finds it in the scheduler's environment."""
 

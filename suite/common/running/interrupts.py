@@ -51,7 +51,6 @@ def ends_in_seconds() -> Iterator[None]:
     old_hook = sys.unraisablehook
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
-        """Handle a signal in the main thread."""
         handled.set()
         raise KeyboardInterrupt
 

@@ -61,7 +61,10 @@ def one_writer(folder: Path) -> Iterator[None]:
                 raise
         try:
             sweep_parts(folder)
-            write_json(folder / HOLDER, _this_command())
+            command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+            since = datetime.now(UTC).isoformat(timespec="seconds")
+            holder = {"command": command[:500], "pid": os.getpid(), "host": os.uname().nodename}
+            write_json(folder / HOLDER, {**holder, "since": since})
             yield
         finally:
             # Removed before the release: a waiting command then makes a new file. In the other
@@ -91,14 +94,6 @@ def one_writer_each(folders: list[Path]) -> Iterator[None]:
         for folder in dict.fromkeys(Path(os.path.realpath(path)) for path in folders):
             stack.enter_context(one_writer(folder))
         yield
-
-
-def _this_command() -> dict[str, object]:
-    """Return the command line, process, host and time, to describe the holder of a lock."""
-    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
-    since = datetime.now(UTC).isoformat(timespec="seconds")
-    return {"command": command[:500], "pid": os.getpid(), "host": os.uname().nodename,
-            "since": since}  # fmt: skip
 
 
 def _holder(folder: Path) -> str:

@@ -41,7 +41,6 @@ class Parcel(NamedTuple):
     """A job that can be sent to another machine: it has the content of its folders."""
 
     task: Any
-    """Data that describe the work."""
     name: str
     """Name of the folder of the product."""
     folder: Content

@@ -1,27 +1,34 @@
 """Fits thrust and drag to the body's translation, and inertia, lag and delay to its rotation.
 
-The lag is the time constant with which the rotors follow their commands. The fitted parameters are
-called numbers here; they have names such as `thrust` and `drag_x`.
-
 Force fit: the model is compared with the measured acceleration, given the measured attitude. If no
 flight has an attitude, the thrust is assumed to point along the path's acceleration minus gravity,
 and only its size is compared (differential flatness; Mellinger and Kumar 2011).
 
 Torque fit: the model is compared with changes of the measured body rates, given the signals that
-drive the rotors. `identify.py` calls both fits.
+drive the rotors.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from suite.diagnose.data.view import FlightRows, WeakForm
 from suite.diagnose.estimate.gauss_newton import TINY
-from suite.diagnose.identify.drive import DRIVES, DrivenVehicle, TrialVehicle
-from suite.diagnose.identify.fit import Z95, Fitted, KnownNumbers, Rows, Unknown, fit, unexplained
+from suite.diagnose.identify.drive import DRIVES, Accelerations, DrivenVehicle
+from suite.diagnose.identify.fit import (
+    NONE_KNOWN,
+    Z95,
+    Fitted,
+    KnownNumbers,
+    Residuals,
+    Rows,
+    Unknown,
+    fit,
+    unexplained,
+)
 from suite.diagnose.identify.grid import (
     IMU_ACC,
     LEANING,
@@ -61,16 +68,17 @@ def force_unknowns(
     if driven.drive == "pwm":
         unknowns.append(Unknown("curve", driven.curve, -0.1, 1.0, 0.35, 1e-2, 0.02))
         if voltage:
-            unknowns.append(Unknown("battery", driven.battery, 0.0, 4.0, 0.6, 1e-2, 0.02))
-    for axis, start in list(zip("xyz", driven.drag({}), strict=True))[2 if leaning else 0 :]:
+            exponent = driven.motors.voltage_exponent
+            unknowns.append(Unknown("battery", exponent, 0.0, 4.0, 0.6, 1e-2, 0.02))
+    for axis, start in list(zip("xyz", driven.drag, strict=True))[2 if leaning else 0 :]:
         unknowns.append(Unknown(f"drag_{axis}", start, -2.0, 5.0, 0.25, 1e-2, 0.004))
     return unknowns
 
 
 def fit_force(
+    unknowns: Sequence[Unknown],
     flights: Sequence[FlightGrid],
     driven: DrivenVehicle,
-    unknowns: Sequence[Unknown],
     fixed: Mapping[str, float],
 ) -> Fitted:
     """Fit the numbers of thrust and drag.
@@ -82,24 +90,22 @@ def fit_force(
         NoWholeWindow: if no window has all signals.
     """
     windows = [_force_windows(flight, driven.drive) for flight in flights]
-    states = [flight.rows(attitude_of_path=True) for flight in flights]
 
     def residuals(numbers: Mapping[str, float]) -> list[Rows]:
-        vehicle = driven.at(numbers)
-        return [
-            one.residuals(vehicle.accelerations(one.flight, state)[0])
-            for one, state in zip(windows, states, strict=True)
-        ]
+        vehicle = driven.accelerations(numbers)
+        return [one.residuals(vehicle(one.flight, one.rows)[0]) for one in windows]
 
     held = _without_motion(windows)
     held = [unknown.name for unknown in unknowns if unknown.name in held]
-    return fit(by_value(residuals, unknowns, fixed), unknowns, held)
+    return fit(residuals, unknowns, held, fixed=fixed)
 
 
 class Windows(NamedTuple):
     """M windows of one flight, over which C measured values are averaged."""
 
     flight: FlightGrid
+    rows: FlightRows
+    """The flight as rows of a view, with the attitude that the fit uses."""
     form: WeakForm
     """Weights of the windows: `form.mean @ values` are means of `values` over the windows."""
     measured: np.ndarray
@@ -124,35 +130,22 @@ class Windows(NamedTuple):
         return np.reshape(self.form.mean @ values, (len(self.form.middle_s), 3, -1))
 
 
-def by_value(
-    residuals: Callable[[dict[str, float]], list[Rows]],
-    unknowns: Sequence[Unknown],
-    fixed: Mapping[str, float],
-) -> Callable[[np.ndarray], list[Rows]]:
-    """Return the `residuals` of numbers by name as a function of the values of `unknowns`.
-
-    `fixed` are the values of the other numbers.
-    """
-    names = [unknown.name for unknown in unknowns]
-    return lambda value: residuals({**fixed, **dict(zip(names, value.tolist(), strict=True))})
-
-
 def _force_windows(flight: FlightGrid, drive: str) -> Windows:
     """Return the windows of `flight` for its acceleration, where all signals are present."""
     # The measured acceleration is that of the accelerometer, or follows from the velocity.
     motion = IMU_ACC if flight.has(IMU_ACC) else "vel_w"
     attitude = "rot_w" if flight.has("rot_w") else LEANING
     needs = (motion, DRIVES[drive][0], attitude)
-    form = flight.form(FORCE_WIDTH_S, needs)
+    rows, form = flight.rows(attitude_of_path=True), flight.form(FORCE_WIDTH_S, needs)
     axes = slice(0, 3)
     if attitude == LEANING:  # only along the thrust, and only slow flight
-        speed = np.linalg.norm(flight.rows(attitude_of_path=True).vel_w, axis=1)
+        speed = np.linalg.norm(rows.vel_w, axis=1)
         slow, axes = form.mean @ speed < SLOW_M_S, slice(2, 3)
         form = form.take(slow)
     to_acceleration = form.mean if motion == IMU_ACC else form.change
     measured_w = to_acceleration @ np.nan_to_num(flight.signals[motion])
     to_body = np.swapaxes(flight.signals[attitude][form.middle_row], 1, 2)[:, axes]
-    windows = Windows(flight, form, measured_w, FORCE_OFFSETS[axes], to_body)
+    windows = Windows(flight, rows, form, measured_w, FORCE_OFFSETS[axes], to_body)
     if not flight.has(POSE_SLOPE):
         return windows
     return windows._replace(nuisance=windows.means(flight.signals[POSE_SLOPE])[:, axes])
@@ -169,8 +162,7 @@ def _without_motion(flights: Sequence[Windows]) -> list[str]:
     for one in flights:
         if one.nuisance is None:
             continue
-        vel_b = one.flight.rows(attitude_of_path=True).vel_b
-        signals = (vel_b, one.flight.signals[VELOCITY_NOISE])
+        signals = (one.rows.vel_b, one.flight.signals[VELOCITY_NOISE])
         values = np.concatenate([one.means(signal) for signal in signals], axis=2)
         values, slopes = ((v - v.mean(axis=0))[:, :2] for v in (values, one.nuisance))
         values = unexplained(slopes, values, np.full(values.shape[:2], FORCE_ERROR**-2))
@@ -210,23 +202,21 @@ def torque_unknowns(drive: str, lag_s: float, late_s: float) -> list[Unknown]:
     of the other two, and keeps this ratio if it is not identifiable. `yaw` is the yaw torque over
     the inertia about z. It is missing if torques are commanded.
     """
-    lags = lag_unknowns(lag_s, late_s)
-    inertia = [Unknown(f"inertia_{a}", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015) for a in "xy"]
+    unknowns = [Unknown(f"inertia_{a}", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015) for a in "xy"]
     widest_z = 0.5 if drive == "torques" else 0.25
-    inertia.append(Unknown("inertia_z", 0.0, -1.0, 1.0, widest_z, 1e-2, 0.015))
-    if drive == "torques":
-        return [*inertia, *lags]
-    yaw = Unknown("yaw", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015)
-    return [*inertia, yaw] if drive == "rotors" else [*inertia, yaw, *lags]
+    unknowns.append(Unknown("inertia_z", 0.0, -1.0, 1.0, widest_z, 1e-2, 0.015))
+    if drive != "torques":
+        unknowns.append(Unknown("yaw", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015))
+    return unknowns if drive == "rotors" else [*unknowns, *lag_unknowns(lag_s, late_s)]
 
 
 def fit_torque(
+    unknowns: Sequence[Unknown],
     flights: Sequence[FlightGrid],
     driven: DrivenVehicle,
-    unknowns: Sequence[Unknown],
     fixed: Mapping[str, float],
+    known: KnownNumbers = NONE_KNOWN,
     held: Sequence[str] = (),
-    known: KnownNumbers | None = None,
 ) -> Fitted:
     """Fit inertia, lag and delay by `dw/dt = J^-1 (tau - w x J w)`.
 
@@ -244,40 +234,32 @@ def fit_torque(
         NoWholeWindow: if no window has all signals.
     """
     # The known numbers join the unknowns, so that their uncertainty widens the intervals.
-    known, steps = known or KnownNumbers(), {"thrust": 1e-3}
-    unknowns = [
-        *unknowns,
-        *(Unknown(n, fixed[n], -9.0, 9.0, 1.0, steps.get(n, 1e-2)) for n in known.names),
-    ]
+    steps = {"thrust": 1e-3, "curve": 1e-2, "battery": 1e-2}
+    known_unknowns = (Unknown(n, fixed[n], -9.0, 9.0, 1.0, steps[n]) for n in known.names)
+    unknowns = [*unknowns, *known_unknowns]
     held = list(held)
     windows = [_torque_windows(flight, driven.drive) for flight in flights]
-    states = [flight.rows(attitude_of_path=False) for flight in flights]
     # Correct the bias by noise of the rotor speeds.
-    start = driven.at({**fixed, **{unknown.name: unknown.start for unknown in unknowns}})
+    starts = {**fixed, **{unknown.name: unknown.start for unknown in unknowns}}
     reliability = np.ones(3)
     if driven.drive == "rotors":
-        reliability = _reliability(windows, states, start)
+        reliability = _reliability(windows, driven.accelerations(starts))
     correction: dict[str, float] = dict(zip(NOISE_BIASED, -0.5 * np.log(reliability), strict=True))
-    unknowns = [
-        u._replace(method_error=float(np.hypot(u.method_error, Z95 * correction.get(u.name, 0.0))))
-        for u in unknowns
-    ]
+    for k, u in enumerate(unknowns):
+        of_noise = Z95 * correction.get(u.name, 0.0)
+        unknowns[k] = u._replace(method_error=float(np.hypot(u.method_error, of_noise)))
 
     def residuals(numbers: Mapping[str, float]) -> list[Rows]:
-        vehicle = driven.at(numbers)
-        return [
-            one.residuals(TO_RATE_S * _turning(vehicle, one.flight, state, reliability))
-            for one, state in zip(windows, states, strict=True)
-        ]
+        vehicle = driven.accelerations(numbers)
+        return [one.residuals(TO_RATE_S * _turning(vehicle, one, reliability)) for one in windows]
 
-    compared = by_value(residuals, unknowns, fixed)
     # The fit is linearised, so it needs a start near the right delay.
     if any(unknown.name == "late" for unknown in unknowns):
         measured = [one.measured for one in windows]
-        late_s = _best_correlated_delay(unknowns, compared, measured)
+        late_s = _best_correlated_delay(residuals, starts, measured)
         unknowns = [u._replace(start=late_s) if u.name == "late" else u for u in unknowns]
     while True:
-        fitted = fit(compared, unknowns, held, known)
+        fitted = fit(residuals, unknowns, held, known, fixed=fixed)
         at_limit = [
             u.name
             for u, value in zip(unknowns, fitted.value, strict=True)
@@ -292,56 +274,54 @@ def _torque_windows(flight: FlightGrid, drive: str) -> Windows:
     """Return the windows of `flight` for changes of its rates, where all signals are present."""
     form = flight.form(TORQUE_WIDTH_S, ("rate_b", DRIVES[drive][-1]), slope=True)
     measured = np.asarray(TO_RATE_S * (form.change @ np.nan_to_num(flight.signals["rate_b"])))
-    return Windows(flight, form, measured, np.zeros(3, bool))  # without free constants
+    no_offset = np.zeros(3, bool)
+    return Windows(flight, flight.rows(False), form, measured, no_offset)
 
 
-def _turning(
-    vehicle: TrialVehicle, flight: FlightGrid, state: FlightRows, reliability: np.ndarray
-) -> np.ndarray:
+def _turning(vehicle: Accelerations, windows: Windows, reliability: np.ndarray) -> np.ndarray:
     """Return the modelled angular acceleration (G, 3), corrected by `_reliability` (3,)."""
-    _, turn_b = vehicle.accelerations(flight, state)
+    flight = windows.flight
+    _, turn_b = vehicle(flight, windows.rows)
     if (reliability == 1.0).all():
         return turn_b
     # Only the part that the rotors cause is noisy.
-    _, unpowered_b = vehicle.accelerations(flight, state, powered=False)
+    still = np.zeros_like(flight.signals["rotor_speed"])
+    _, unpowered_b = vehicle(_with_rotor_speed(flight, still), windows.rows)
     return unpowered_b + reliability * (turn_b - unpowered_b)
 
 
-def _reliability(
-    windows: Sequence[Windows], states: Sequence[FlightRows], vehicle: TrialVehicle
-) -> np.ndarray:
+def _with_rotor_speed(flight: FlightGrid, rotor_speed: np.ndarray) -> FlightGrid:
+    """Return `flight` with other rotor speeds (G, 4)."""
+    return flight._replace(signals={**flight.signals, "rotor_speed": rotor_speed})
+
+
+def _reliability(windows: Sequence[Windows], vehicle: Accelerations) -> np.ndarray:
     """Return the share (3,) of the modelled torque's variance that is not rotor-speed noise.
 
     Further noise of the same size is added to the rotor speeds, to see how much it changes.
     """
     noise_power, power = np.zeros(3), np.zeros(3)
-    for (flight, form, *_), state in zip(windows, states, strict=True):
-        noisier = flight.signals["rotor_speed"] + flight.signals[ROTOR_NOISE]
-        noisy_flight = flight._replace(signals={**flight.signals, "rotor_speed": noisier})
-        turn_b, noisy_turn_b = (
-            form.mean @ vehicle.accelerations(one, state)[1] for one in (flight, noisy_flight)
-        )
+    for flight, rows, form, *_ in windows:
+        speed = flight.signals["rotor_speed"]
+        noisy = _with_rotor_speed(flight, speed + flight.signals[ROTOR_NOISE])
+        turn_b, noisy_turn_b = (form.mean @ vehicle(one, rows)[1] for one in (flight, noisy))
         noise_power += ((noisy_turn_b - turn_b) ** 2).sum(axis=0)
         power += (turn_b**2).sum(axis=0)
     return np.maximum(1.0 - noise_power / np.maximum(power, TINY), TINY)
 
 
 def _best_correlated_delay(
-    unknowns: Sequence[Unknown],
-    residuals: Callable[[np.ndarray], list[Rows]],
-    measured: Sequence[np.ndarray],
+    residuals: Residuals, numbers: Mapping[str, float], measured: Sequence[np.ndarray]
 ) -> float:
     """Return the delay `late` [s] at which modelled and measured roll and pitch correlate best.
 
     `measured` are the changes of each flight's body rates, (M, 3).
     """
-    value = np.array([unknown.start for unknown in unknowns])
-    late = [unknown.name for unknown in unknowns].index("late")
-    trials = np.array([value[late], *np.arange(0.0, LATEST_S, LATE_STEP_S)])
+    trials = np.array([numbers["late"], *np.arange(0.0, LATEST_S, LATE_STEP_S)])
     scores = np.zeros(len(trials))
-    for k, trial in enumerate(trials):
-        value[late] = max(trial, 0.0)
-        for rows, turned in zip(residuals(value), measured, strict=True):
+    for k, trial in enumerate(trials.tolist()):
+        tried = residuals({**numbers, "late": max(trial, 0.0)})
+        for rows, turned in zip(tried, measured, strict=True):
             if len(turned):
                 # Measured minus residual is the modelled change.
                 model, data = (v - np.median(v, axis=0) for v in (turned - rows.value, turned))

@@ -1,21 +1,21 @@
 """Models the accelerations of a vehicle from the signals that drive its flights.
 
 The drive is what determines the rotors' thrust: measured rotor speeds, motor commands, or commanded
-torques, rates and thrust. The equations are those of the simulated vehicle in `eval/`. The fits of
-`suite identify` change the vehicle's numbers (parameters, by name) and compare the accelerations
-with the measured ones. G is the number of times on the grid of a flight (`grid.py`).
+torques, rates and thrust. The equations are those of the simulated vehicle in `eval/`. G is the
+number of times on the grid of a flight (`grid.py`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from eval.effects import EFFECTS
-from eval.quadrotor.plant import Plant, Wrench, accelerations, make_plant
+from eval.quadrotor.plant import Wrench, accelerations, make_plant
 from eval.vehicles.vehicle import MotorMap, Vehicle, motor_speed
 from eval.vehicles.vehicle_check import check_vehicle
 from suite.diagnose.data.sampling import follow_lag, hold
@@ -56,46 +56,18 @@ def common_drive(flights: Sequence[FlightGrid]) -> str:
     )
 
 
-def with_known_thrust(flights: Sequence[FlightGrid], drive: str) -> list[FlightGrid]:
-    """Return the flights in which the motors' thrust is known best.
-
-    The thrust of a motor command depends on the battery. For this drive, flights without a voltage
-    are therefore left out if other flights have one.
-    """
-    with_voltage = [flight for flight in flights if flight.has("voltage")]
-    return with_voltage if with_voltage and drive == "pwm" else list(flights)
-
-
-def with_motor_map(flights: Sequence[FlightGrid], vehicle: Vehicle) -> Vehicle:
-    """Return the vehicle with a table `[motors]`, the map from motor command to thrust.
-
-    A new table gives full speed at full command. Its voltage exponent is 0 for flights without a
-    voltage. An exponent of 0 makes the nominal voltage meaningless, so it becomes the flights'
-    median.
-    """
-    motors = vehicle.motors
-    if motors is None:
-        exponent = 1.0 if any(flight.has("voltage") for flight in flights) else 0.0
-        motors = MotorMap((0.0, vehicle.rotors.thrust_max), 1.0, exponent)
-    elif motors.voltage_exponent:
-        return vehicle
-    return replace(vehicle, motors=replace(motors, voltage=_median_volts(flights, motors.voltage)))
-
-
-def _median_volts(flights: Sequence[FlightGrid], default: float) -> float:
-    """Return the median voltage of the flights [V], or `default` where none has a voltage."""
-    volts = [f.signals["voltage"] for f in flights if f.has("voltage")]
-    return float(np.nanmedian(np.concatenate(volts))) if volts else default
+Accelerations = Callable[[FlightGrid, FlightRows], tuple[np.ndarray, np.ndarray]]
+"""Function that returns dv/dt in world axes and dw/dt in body axes on each row, (G, 3) each."""
 
 
 @dataclass(frozen=True)
 class DrivenVehicle:
     """The start of a fit (the vehicle before it), and the drive of its flights.
 
-    Methods take `numbers`, the values of fitted numbers by name. A number that is missing keeps its
-    value in the start. `thrust` is the logarithm of the ratio of the thrust to the start's. With
-    motor commands, this is the thrust at the usual command and voltage, and `curve` is the share of
-    the quadratic term in it.
+    Methods take `numbers`, the values of fitted numbers by name. A missing number keeps its value
+    in the start. `thrust` is the logarithm of the ratio of the thrust to the start's. With motor
+    commands, this is the thrust at the usual command and voltage, and `curve` is the share of the
+    quadratic term in it.
     """
 
     start: Vehicle
@@ -115,7 +87,8 @@ class DrivenVehicle:
     def usual_thrust(self) -> tuple[float, float]:
         """Linear and quadratic term of the start's thrust at the usual command and voltage [N]."""
         first, second = self.motors.thrust
-        applied = self.usual_command * (self.usual_volts / self.motors.voltage) ** self.battery
+        volts_ratio = self.usual_volts / self.motors.voltage
+        applied = self.usual_command * volts_ratio**self.motors.voltage_exponent
         return first * applied, second * applied**2
 
     @property
@@ -124,120 +97,107 @@ class DrivenVehicle:
         return self.usual_thrust[1] / sum(self.usual_thrust)
 
     @property
-    def battery(self) -> float:
-        """The start's voltage exponent."""
-        return self.motors.voltage_exponent
+    def drag(self) -> tuple[float, ...]:
+        """The start's linear drag along body axes [1/s]."""
+        effect = self.start.effects.get("linear_drag")
+        return (0.0, 0.0, 0.0) if effect is None else effect.coefficient
+
+    def vehicle(self, numbers: Mapping[str, float]) -> Vehicle:
+        """Return the vehicle with these `numbers`.
+
+        It keeps those effects of the start that only depend on the state (`by_state`). Only
+        measured rotor speeds identify the thrust coefficient. The number `yaw` is the logarithm of
+        yaw torque over inertia about z, relative to the start.
+        """
+        log_thrust, log_inertia = numbers.get("thrust", 0.0), log_inertia_ratio(numbers)
+        start, rotors, scale = self.start, self.start.rotors, float(np.exp(log_thrust))
+        effects = {n: v for n, v in start.effects.items() if EFFECTS[n].by_state}
+        drag = (float(numbers.get(f"drag_{a}", d)) for a, d in zip("xyz", self.drag, strict=True))
+        effects["linear_drag"] = EFFECTS["linear_drag"].values(tuple(drag))
+        if self.drive not in KNOWN_MOTORS:
+            effects["thrust_scale"] = EFFECTS["thrust_scale"].values(scale)
+        log_twist = numbers.get("yaw", 0.0) + log_inertia[2]
+        if self.drive == "rotors":
+            rotors = replace(rotors, thrust_coefficient=rotors.thrust_coefficient * scale)
+            log_twist += log_thrust
+        twist = rotors.torque_coefficient * float(np.exp(log_twist))
+        return replace(
+            start,
+            rotors=replace(rotors, torque_coefficient=twist),
+            motors=self.motor_map(numbers) if self.drive == "pwm" else start.motors,
+            inertia=_triple(np.asarray(start.inertia) * np.exp(log_inertia)),
+            effects=effects,
+        )
 
     def motor_map(self, numbers: Mapping[str, float]) -> MotorMap:
         """Return the table `[motors]` of a vehicle file with these `numbers`."""
-        curve, battery = numbers.get("curve", self.curve), numbers.get("battery", self.battery)
+        curve = numbers.get("curve", self.curve)
+        battery = numbers.get("battery", self.motors.voltage_exponent)
         thrust = sum(self.usual_thrust) * float(np.exp(numbers.get("thrust", 0.0)))
         per_applied = (self.motors.voltage / self.usual_volts) ** battery / self.usual_command
         first, second = thrust * (1.0 - curve) * per_applied, thrust * curve * per_applied**2
         return MotorMap((float(first), float(second)), self.motors.voltage, float(battery))
 
-    def thrust_coefficient(self, numbers: Mapping[str, float]) -> float:
-        """Return the rotors' thrust coefficient.
+    def accelerations(self, numbers: Mapping[str, float]) -> Accelerations:
+        """Return the equations of the vehicle with these `numbers`.
 
-        Only measured rotor speeds identify it; with other drives it is the start's.
+        Where the rotors' speed is unknown, it is 0.
         """
-        scale = float(np.exp(numbers.get("thrust", 0.0))) if self.drive == "rotors" else 1.0
-        return self.start.rotors.thrust_coefficient * scale
+        vehicle = self.vehicle(numbers)
+        plant = make_plant(vehicle, LONGEST_S)
 
-    def torque_coefficient(self, numbers: Mapping[str, float]) -> float:
-        """Return the rotors' torque coefficient.
+        def accelerations_of(flight: FlightGrid, rows: FlightRows) -> tuple[np.ndarray, np.ndarray]:
+            speed = self._rotor_speed(flight, vehicle, numbers)
+            rows = rows._replace(rotor_speed=np.nan_to_num(speed))
+            acc_w, turn_b = accelerations_on(plant, rows, flight.has("voltage"))
+            if self.drive == "torques":
+                commanded = after_delay_and_lag(flight.signals["torque_cmd_b"], numbers)
+                torque_b = np.nan_to_num(commanded)
+                wrench = Wrench(np.zeros_like(torque_b), torque_b)
+                _, turn_b = accelerations(plant, motion_of(plant, rows), wrench)
+            return acc_w, turn_b
 
-        The number `yaw` is the logarithm of yaw torque over inertia about z, relative to the start.
-        """
-        thrust = numbers.get("thrust", 0.0) if self.drive == "rotors" else 0.0
-        log_ratio = numbers.get("yaw", 0.0) + log_inertia_ratio(numbers)[2] + thrust
-        return self.start.rotors.torque_coefficient * float(np.exp(log_ratio))
+        return accelerations_of
 
-    def drag(self, numbers: Mapping[str, float]) -> tuple[float, ...]:
-        """Return the linear drag along body axes [1/s]."""
-        effect = self.start.effects.get("linear_drag")
-        start = (0.0, 0.0, 0.0) if effect is None else effect.coefficient
-        return tuple(float(numbers.get(f"drag_{a}", d)) for a, d in zip("xyz", start, strict=True))
-
-    def at(self, numbers: Mapping[str, float]) -> TrialVehicle:
-        """Return the vehicle with these `numbers`.
-
-        It keeps those effects of the start that only depend on the state (`by_state`).
-        """
-        effects = {n: v for n, v in self.start.effects.items() if EFFECTS[n].by_state}
-        effects["linear_drag"] = EFFECTS["linear_drag"].values(self.drag(numbers))
-        if self.drive not in KNOWN_MOTORS:
-            scale = float(np.exp(numbers.get("thrust", 0.0)))
-            effects["thrust_scale"] = EFFECTS["thrust_scale"].values(scale)
-        rotors = replace(
-            self.start.rotors,
-            thrust_coefficient=self.thrust_coefficient(numbers),
-            torque_coefficient=self.torque_coefficient(numbers),
-        )
-        inertia = np.asarray(self.start.inertia) * np.exp(log_inertia_ratio(numbers))
-        vehicle = replace(self.start, rotors=rotors, inertia=_triple(inertia), effects=effects)
-        return TrialVehicle(self, numbers, make_plant(vehicle, LONGEST_S))
-
-    def rotor_speed(self, flight: FlightGrid, numbers: Mapping[str, float]) -> np.ndarray:
-        """Return the rotor speeds (G, 4) of a flight [rad/s]: measured, or from their commands.
-
-        Commands act after a delay and a first-order lag, see `after_delay_and_lag`.
-        """
+    def _rotor_speed(
+        self, flight: FlightGrid, vehicle: Vehicle, numbers: Mapping[str, float]
+    ) -> np.ndarray:
+        """Return the rotor speeds (G, 4) of a flight [rad/s]: measured, or from their commands."""
         signals = flight.signals
         if self.drive == "rotors":
             return signals["rotor_speed"]
         if self.drive == "pwm":
-            vehicle = replace(self.start, motors=self.motor_map(numbers))
             volts = np.full(len(flight.time_s), self.usual_volts)
             if flight.has("voltage"):
                 volts = np.maximum(signals["voltage"], LEAST_VOLTS)
             commanded = motor_speed(vehicle, signals["pwm"], volts)
         else:
-            thrust = 0.25 * self.start.mass * np.maximum(signals["thrust_cmd"], 0.0)
-            speed = np.sqrt(thrust / self.start.rotors.thrust_coefficient)
+            thrust = 0.25 * vehicle.mass * np.maximum(signals["thrust_cmd"], 0.0)
+            speed = np.sqrt(thrust / vehicle.rotors.thrust_coefficient)
             commanded = speed[:, None] * np.ones(4)  # a thrust command is equal for all rotors
         return after_delay_and_lag(commanded, numbers)
 
 
-@dataclass(frozen=True)
-class TrialVehicle:
-    """A vehicle with trial values of the numbers; its equations are set up once for all flights."""
+def driven_vehicle(
+    flights: Sequence[FlightGrid], vehicle: Vehicle, drive: str, keep_motors: bool = False
+) -> DrivenVehicle:
+    """Return `vehicle` under `drive`, with the usual command and voltage of `flights`.
 
-    driven: DrivenVehicle
-    numbers: Mapping[str, float]
-    plant: Plant
-    """The vehicle with its effects, prepared for the equations of motion."""
-
-    def accelerations(
-        self, flight: FlightGrid, rows: FlightRows, powered: bool = True
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the linear and the angular acceleration of the vehicle on each row.
-
-        If they are not `powered`, and where it is unknown, the rotors' speed is 0.
-
-        Returns:
-            dv/dt in world axes and dw/dt in body axes, (G, 3) each.
-        """
-        if powered:
-            speed = self.driven.rotor_speed(flight, self.numbers)
-            rows = rows._replace(rotor_speed=np.nan_to_num(speed))
-        acc_w, turn_b = accelerations_on(self.plant, rows, flight.has("voltage"))
-        if self.driven.drive == "torques":
-            commanded = after_delay_and_lag(flight.signals["torque_cmd_b"], self.numbers)
-            torque_b = np.nan_to_num(commanded)
-            wrench = Wrench(np.zeros_like(torque_b), torque_b)
-            _, turn_b = accelerations(self.plant, motion_of(self.plant, rows), wrench)
-        return acc_w, turn_b
-
-
-def driven_vehicle(flights: Sequence[FlightGrid], vehicle: Vehicle, drive: str) -> DrivenVehicle:
-    """Return `vehicle` under `drive`, with the usual command and voltage of `flights`."""
+    With motor commands it has a table `[motors]`, the map from motor command to thrust. A new table
+    gives full speed at full command. Its voltage exponent is 0 for flights without a voltage. An
+    exponent of 0 makes the nominal voltage meaningless, so it becomes the flights' median, but not
+    in a table of the file with `keep_motors`.
+    """
     if drive != "pwm":
         return DrivenVehicle(vehicle, drive)
-    assert vehicle.motors is not None
-    commands = np.concatenate([f.signals["pwm"].ravel() for f in flights])
-    volts = _median_volts(flights, vehicle.motors.voltage)
-    return DrivenVehicle(vehicle, drive, float(np.nanmedian(commands)), volts)
+    command = float(np.nanmedian(np.concatenate([f.signals["pwm"].ravel() for f in flights])))
+    volts = [f.signals["voltage"] for f in flights if f.has("voltage")]
+    exponent = 1.0 if volts else 0.0
+    motors = vehicle.motors or MotorMap((0.0, vehicle.rotors.thrust_max), 1.0, exponent)
+    usual_volts = float(np.nanmedian(np.concatenate(volts))) if volts else motors.voltage
+    if vehicle.motors is None or not (keep_motors or motors.voltage_exponent):
+        motors = replace(motors, voltage=usual_volts)
+    return DrivenVehicle(replace(vehicle, motors=motors), drive, command, usual_volts)
 
 
 def log_inertia_ratio(numbers: Mapping[str, float]) -> np.ndarray:
@@ -249,12 +209,9 @@ def log_inertia_ratio(numbers: Mapping[str, float]) -> np.ndarray:
     return np.array([x, y, 0.5 * (x + y) + z])
 
 
-def possible_inertia(inertia: np.ndarray) -> np.ndarray:
-    """Return the inertia (3,) in which the largest is at most the sum of the others.
-
-    That holds for every rigid body.
-    """
-    return np.minimum(inertia, inertia.sum() - inertia)
+def possible_inertia(inertia: ArrayLike) -> np.ndarray:
+    """Return the inertia (3,) in which none is more than the sum of the others, as in any body."""
+    return np.minimum(inertia, np.sum(inertia) - np.asarray(inertia))
 
 
 def after_delay_and_lag(commands: np.ndarray, numbers: Mapping[str, float]) -> np.ndarray:

@@ -1,101 +1,102 @@
-"""Converts fitted numbers into entries of a vehicle file, and makes the vehicle that has them.
-
-A fitted number is a parameter of a fit, such as `thrust` or `lag` (`body.py`). An entry (`Number`)
-has the key, unit and values of the vehicle file, such as `rotors.time_constant`, with intervals.
-"""
+"""Converts fitted numbers into entries of a vehicle file, and makes the vehicle that has them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from eval.effects import EFFECTS
 from eval.effects.interface import bound_value
 from eval.vehicles.vehicle import Vehicle
 from eval.vehicles.vehicle_check import check_vehicle
-from suite.diagnose.identify.drive import DrivenVehicle, log_inertia_ratio, possible_inertia
-from suite.diagnose.identify.fit import Fitted
-from suite.diagnose.identify.numbers import DELAY, Formula, Number, number_from
+from suite.diagnose.identify.drive import DrivenVehicle, possible_inertia
+from suite.diagnose.identify.fit import Z95, Fitted
+from suite.diagnose.identify.numbers import DELAY, Number
 
+Formula = Callable[[Mapping[str, float]], ArrayLike]
+"""Function from fitted numbers by name to the value of an entry, or to its values (V,)."""
 INERTIAS = ("inertia_x", "inertia_y", "inertia_z")
 """Names of the fitted numbers of the inertia."""
 EFFECTS_TABLE = "effects."
 """Prefix of the key of an effect's parameter."""
 
 
-def inertia_from(vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
-    """Return the inertia (3,) for the fitted `numbers` [kg m^2].
-
-    If `inertia_z` is not among them, the inertia about z changes by the mean ratio of the other
-    two.
-    """
-    return possible_inertia(np.asarray(vehicle.inertia) * np.exp(log_inertia_ratio(numbers)))
-
-
-def force_entries(driven: DrivenVehicle, fitted: Fitted) -> list[Number]:
-    """Return the entries that the force fit estimates: motors or rotors, and drag."""
-    # For each entry: key, unit, formula, and the number that each value needs.
-    rows: list[tuple[str, str, Formula, Sequence[str]]] = []
-    if "thrust" in fitted.names and driven.drive == "pwm":
-        motor_map = driven.motor_map
-        rows += [
-            ("motors.thrust", "N", lambda n: motor_map(n).thrust, ("thrust", "thrust")),
-            ("motors.voltage_exponent", "1", lambda n: motor_map(n).voltage_exponent, ("battery",)),
-        ]
-    elif "thrust" in fitted.names and driven.drive == "rotors":
-        key, unit = "rotors.thrust_coefficient", "N/(rad/s)^2"
-        rows.append((key, unit, driven.thrust_coefficient, ("thrust",)))
-    elif "thrust" in fitted.names:
-        rows.append(("effects.thrust_scale.scale", "1", lambda n: np.exp(n["thrust"]), ("thrust",)))
-    if "drag_z" in fitted.names:
-        axes = [f"drag_{axis}" for axis in "xyz"]
-        rows.append(("effects.linear_drag.coefficient", "1/s", driven.drag, axes))
-    return [number_from(fitted, *row) for row in rows]
-
-
-def torque_entries(driven: DrivenVehicle, fitted: Fitted, log_thrust: float) -> list[Number]:
-    """Return the entries that the torque fit estimates: inertia, yaw torque, lag and delay.
+def entries_of(driven: DrivenVehicle, fitted: Fitted, log_thrust: float = 0.0) -> list[Number]:
+    """Return the entries of a vehicle file that a fit estimates.
 
     `log_thrust` is the logarithm of the scale of the thrust, from the force fit.
     """
-    entries, vehicle = list[Number](), driven.start
-    if "inertia_x" in fitted.names:
-        inertia = number_from(
-            fitted, "inertia", "kg m^2", lambda n: inertia_from(vehicle, n), INERTIAS
-        )
-        entries.append(inertia)
-    if "yaw" in fitted.names:
+    names = [name for name in fitted.names if name not in fitted.known]
+    entries = list[Number]()
+
+    def add(
+        key: str, unit: str, formula: Formula, needs: Sequence[str], widest: float = np.inf
+    ) -> None:
+        """Add an entry whose intervals follow from the fit's covariance.
+
+        `needs` names for each value the fitted number that must be identified. An identified value
+        whose 95 % interval has a half-width above `widest` `follows` (see `Number`).
+        """
+        values = np.atleast_1d(formula(fitted.values()))
+        # Finite differences of the formula turn the covariance of the fit into that of the values.
+        slopes = np.zeros((len(values), len(fitted.unknowns)))
+        for k, unknown in enumerate(fitted.unknowns):
+            up, down = fitted.values(), fitted.values()
+            up[unknown.name] += unknown.step
+            down[unknown.name] -= unknown.step
+            change = np.atleast_1d(formula(up)) - np.atleast_1d(formula(down))
+            slopes[:, k] = change / (2.0 * unknown.step)
+        variance = np.einsum("vi,ij,vj->v", slopes, fitted.covariance, slopes)
+        half = Z95 * np.sqrt(np.maximum(variance, 0.0))
+        known = [fitted.identifies(name) for name in needs]
+        spans = [
+            (float(v - h), float(v + h)) if is_known and h <= widest else None
+            for v, h, is_known in zip(values, half, known, strict=True)
+        ]
+        follows = any(one and span is None for one, span in zip(known, spans, strict=True))
+        entries.append(Number(key, unit, values.tolist(), spans, follows))
+
+    # Thrust and drag.
+    if "thrust" in names and driven.drive == "pwm":
+        exponent: Formula = lambda n: driven.motor_map(n).voltage_exponent  # noqa: E731
+        add("motors.thrust", "N", lambda n: driven.motor_map(n).thrust, ("thrust", "thrust"))
+        add("motors.voltage_exponent", "1", exponent, ("battery",))
+    elif "thrust" in names and driven.drive == "rotors":
+        coefficient: Formula = lambda n: driven.vehicle(n).rotors.thrust_coefficient  # noqa: E731
+        add("rotors.thrust_coefficient", "N/(rad/s)^2", coefficient, ("thrust",))
+    elif "thrust" in names:
+        add("effects.thrust_scale.scale", "1", lambda n: np.exp(n["thrust"]), ("thrust",))
+    if "drag_z" in names:
+        drag: Formula = lambda n: driven.vehicle(n).effects["linear_drag"].coefficient  # noqa: E731
+        add("effects.linear_drag.coefficient", "1/s", drag, [f"drag_{axis}" for axis in "xyz"])
+    # Inertia and yaw torque.
+    if "inertia_x" in names:
+        add("inertia", "kg m^2", lambda n: possible_inertia(driven.vehicle(n).inertia), INERTIAS)
+    if "yaw" in names:
         # Flights show the ratio of torque to inertia about z. The uncertainty of the inertia counts
         # if the inertia is identified; otherwise the inertia is held fixed.
         identified = [name for name in INERTIAS if fitted.identifies(name)]
 
-        def torque_coefficient(n: Mapping[str, float]) -> float:
+        def twist(n: Mapping[str, float]) -> float:
             numbers = {name: n[name] for name in (*identified, "yaw")}
-            return driven.torque_coefficient({**numbers, "thrust": log_thrust})
+            return driven.vehicle({**numbers, "thrust": log_thrust}).rotors.torque_coefficient
 
-        key, unit = "rotors.torque_coefficient", "N m/(rad/s)^2"
-        entries.append(number_from(fitted, key, unit, torque_coefficient, ("yaw",)))
-    return [*entries, *loop_entries(vehicle, fitted)]
-
-
-def loop_entries(vehicle: Vehicle, fitted: Fitted) -> list[Number]:
-    """Return the entries of lag, delay and gains of the rate loop, as far as the fit has them."""
-    entries = []
-    if "late" in fitted.names:
-        lag = number_from(fitted, "rotors.time_constant", "s", lambda n: n["lag"], ("lag",))
+        add("rotors.torque_coefficient", "N m/(rad/s)^2", twist, ("yaw",))
+    # Lag, delay and gains of the rate loop.
+    if "late" in names:
+        add("rotors.time_constant", "s", lambda n: n["lag"], ("lag",))
         # `late` is the sum of lag and delay. The delay is at least as uncertain as the lag, however
         # exact the sum is. The delay in the file keeps the sum.
         widest = fitted.unknowns[fitted.index("late")].max_half_width
-        delay_s: Formula = lambda n: n["late"] - n["lag"]  # noqa: E731
-        entries += [lag, number_from(fitted, DELAY, "s", delay_s, ("late",), widest)]
-    if "gain_x" in fitted.names:
-        start, names = np.asarray(vehicle.controller.rate_gain), [f"gain_{a}" for a in "xyz"]
-        gains: Formula = lambda n: start * np.exp([n[name] for name in names])  # noqa: E731
-        entries.append(number_from(fitted, "controller.rate_gain", "1/s", gains, names))
+        add(DELAY, "s", lambda n: n["late"] - n["lag"], ("late",), widest)
+    if "gain_x" in names:
+        start, gains = np.asarray(driven.start.controller.rate_gain), [f"gain_{a}" for a in "xyz"]
+        add("controller.rate_gain", "1/s", lambda n: start * np.exp([n[g] for g in gains]), gains)
     return entries
 
 
@@ -110,7 +111,11 @@ def with_entries(
     """
     numbers, notes = [], []
     for entry in entries:
-        clipped = _clipped(vehicle, entry)
+        clipped, table = entry, entry.key.rpartition(".")[0]
+        if table.startswith(EFFECTS_TABLE):  # only the parameters of effects have limits
+            parameter = EFFECTS[table.removeprefix(EFFECTS_TABLE)].parameters[0]
+            low, high = (bound_value(end, vehicle) for end in (parameter.low, parameter.high))
+            clipped = entry._replace(value=[min(max(v, low), high) for v in entry.value])
         vehicle = with_entry(vehicle, clipped)
         removed = entry.key == DELAY and entry.is_entered and clipped.value == [0.0]
         if not removed:
@@ -126,19 +131,6 @@ def with_entries(
                 then = "the file has none"
             notes.append(f"{entry.key}{component}: these flights give {given}; {then}")
     return vehicle, numbers, notes
-
-
-def _clipped(vehicle: Vehicle, entry: Number) -> Number:
-    """Return an entry with the nearest values that a file may have; its intervals stay.
-
-    Only the parameters of effects have limits.
-    """
-    table, _, _ = entry.key.rpartition(".")
-    if not table.startswith(EFFECTS_TABLE):
-        return entry
-    parameter = EFFECTS[table.removeprefix(EFFECTS_TABLE)].parameters[0]
-    low, high = bound_value(parameter.low, vehicle), bound_value(parameter.high, vehicle)
-    return entry._replace(value=[min(max(v, low), high) for v in entry.value])
 
 
 def with_entry(vehicle: Vehicle, entry: Number) -> Vehicle:

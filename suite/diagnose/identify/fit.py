@@ -1,16 +1,17 @@
 """Robust least squares for `suite identify`; numbers that are not identifiable keep their start.
 
-A number is a parameter of the vehicle that is fitted; P is the count of all. Gauss-Newton steps
-with Huber's weights minimise the residuals of flights. Intervals come from the disagreement between
-flights, and between blocks (pieces of a flight). Numbers from an earlier fit are held fixed, with
-the covariance of that fit (Murphy and Topel 1985). If an interval is too wide, the least
-identifiable number is reset to its start, and the others are fitted again.
+A number is a fitted parameter; P is the count of all. Gauss-Newton steps with Huber's weights
+minimise the residuals of flights. Intervals come from the disagreement between flights, and between
+blocks (pieces of a flight). Numbers from an earlier fit are held fixed, with the covariance of that
+fit (Murphy and Topel 1985). If an interval is too wide, the least identifiable number is reset to
+its start, and the others are fitted again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -32,11 +33,9 @@ ROUNDS = 6
 """Largest number of rounds; each computes new weights and takes some Gauss-Newton steps."""
 DIFFER_P = 0.05
 """P-value below which flights differ more than their blocks explain. Intervals are then wider."""
-LEAST_SIGMA, LEAST_ERROR, LEAST_WEIGHT = 1e-9, 1e-9, 1e-12
-"""Lower limits that avoid a division by zero: of the noise, of an error divided by the noise, and
-of a sum of weights."""
-LEAST_VARIANCE = 1e-30
-"""Lower limit of a product of two standard deviations, for the same reason."""
+LEAST_SIGMA, LEAST_ERROR, LEAST_WEIGHT, LEAST_VARIANCE = 1e-9, 1e-9, 1e-12, 1e-30
+"""Lower limits that avoid a division by zero: of the noise, of an error divided by the noise, of a
+sum of weights, and of a product of two standard deviations."""
 
 
 class NoWholeWindow(ValueError):
@@ -76,8 +75,8 @@ class Rows(NamedTuple):
     before the flight; None for none."""
 
 
-Residuals = Callable[[np.ndarray], Sequence[Rows]]
-"""Function from the values of all numbers to the residuals of every flight."""
+Residuals = Callable[[Mapping[str, float]], Sequence[Rows]]
+"""Function from the values of numbers by name to the residuals of every flight."""
 
 
 class KnownNumbers(NamedTuple):
@@ -88,6 +87,10 @@ class KnownNumbers(NamedTuple):
     """(K, K) covariance of these numbers in the earlier fit."""
 
 
+NONE_KNOWN = KnownNumbers()
+"""No earlier fit."""
+
+
 @dataclass(frozen=True)
 class Fitted:
     """Result of a fit of P numbers."""
@@ -95,8 +98,6 @@ class Fitted:
     unknowns: tuple[Unknown, ...]
     value: np.ndarray
     """(P,) values of all numbers."""
-    half_width: np.ndarray
-    """(P,) half-widths of the 95 % intervals; NaN for a number that was not fitted."""
     covariance: np.ndarray
     """(P, P) covariance; for a number that was not fitted, the square of `max_half_width`."""
     not_identified: tuple[str, ...] = ()
@@ -121,6 +122,12 @@ class Fitted:
         """Names of all numbers."""
         return [unknown.name for unknown in self.unknowns]
 
+    @property
+    def half_width(self) -> np.ndarray:
+        """(P,) half-widths of the 95 % intervals; NaN for a number that was not fitted."""
+        half = Z95 * np.sqrt(np.diag(self.covariance))
+        return np.where([self.identifies(name) for name in self.names], half, np.nan)
+
     def index(self, name: str) -> int:
         """Return the position of the number `name` among the P numbers."""
         return self.names.index(name)
@@ -141,6 +148,8 @@ class ResidualEvidence:
 
     residuals: Residuals
     unknowns: tuple[Unknown, ...]
+    fixed: Mapping[str, float]
+    """Values of further numbers on which the residuals depend, by name."""
     noise: np.ndarray | None
     """(C,) standard deviation of the residuals, by channel; None to estimate it."""
     weights: tuple[np.ndarray, ...] = ()
@@ -154,9 +163,10 @@ class ResidualEvidence:
         )
         return ParameterSpace(tuple(entries), {})
 
-    def at(self, value: np.ndarray) -> Estimate:
-        """Return the estimate at the numbers `value` (P,), without further free parameters."""
-        return Estimate(value, np.zeros((0, 0)))
+    def rows(self, theta: np.ndarray) -> Sequence[Rows]:
+        """Return the residuals of every flight at the numbers `theta` (P,)."""
+        names = (unknown.name for unknown in self.unknowns)
+        return self.residuals({**self.fixed, **dict(zip(names, theta.tolist(), strict=True))})
 
     def weighed(self, at: Estimate) -> ResidualEvidence:
         """Return this evidence with weights of the residuals at the estimate `at`.
@@ -164,7 +174,7 @@ class ResidualEvidence:
         A weight is one over the variance of the channel's noise. If the noise is estimated, it is
         lower for an outlier (Huber 1964).
         """
-        errors = [np.abs(_without_median(row)) for row in self.residuals(at.theta)]
+        errors = [np.abs(_without_median(row)) for row in self.rows(at.theta)]
         if self.noise is not None:
             known = tuple(np.isfinite(error) / self.noise**2 for error in errors)
             return replace(self, weights=known)
@@ -181,13 +191,13 @@ class ResidualEvidence:
         """
         # Differentiate the residuals along each number.
         along = range(len(self.unknowns)) if indices is None else indices
-        rows, differences = self.residuals(at.theta), []
+        rows, differences = self.rows(at.theta), []
         for k in along:
             near_top = self.unknowns[k].high - at.theta[k] < self.unknowns[k].step
             step = -self.unknowns[k].step if near_top else self.unknowns[k].step
             moved = at.theta.copy()
             moved[k] += step
-            pairs = zip(self.residuals(moved), rows, strict=True)
+            pairs = zip(self.rows(moved), rows, strict=True)
             differences.append([(a.value - b.value) / step for a, b in pairs])
         # Remove the free constants of each flight, and scale by the root of the weights (whiten).
         values, slopes, blocks = [], [], []
@@ -215,23 +225,24 @@ def fit(
     residuals: Residuals,
     unknowns: Sequence[Unknown],
     held: Sequence[str] = (),
-    known: KnownNumbers | None = None,
+    known: KnownNumbers = NONE_KNOWN,
     noise: np.ndarray | None = None,
+    fixed: Mapping[str, float] = MappingProxyType({}),
 ) -> Fitted:
     """Return the numbers that minimise `residuals`, with intervals.
 
     A number that is not identifiable may be wrong by its `max_half_width`; the intervals of the
     others include the effect of that. The numbers `held` and `known` keep their start; another fit
     has identified the latter. `noise` (C,) is the standard deviation of the residuals by channel;
-    by default it is estimated.
+    by default it is estimated. `fixed` has the values of numbers that are not among `unknowns`.
 
     Raises:
         NoWholeWindow: if the residuals have no window.
     """
-    not_identified, known = list(held), known or KnownNumbers()
-    evidence = ResidualEvidence(residuals, tuple(unknowns), noise)
-    at = evidence.at(np.array([unknown.start for unknown in unknowns]))
-    if not sum(len(rows.value) for rows in residuals(at.theta)):
+    not_identified = list(held)
+    evidence = ResidualEvidence(residuals, tuple(unknowns), fixed, noise)
+    at = Estimate(np.array([unknown.start for unknown in unknowns]))
+    if not sum(len(rows.value) for rows in evidence.rows(at.theta)):
         raise NoWholeWindow("no window of these flights has all signals that this fit compares")
     while True:
         not_fitted = (*not_identified, *known.names)
@@ -243,18 +254,17 @@ def fit(
             if (at.theta == before.theta).all():
                 break
         # Reset the number with the widest interval to its start, until all intervals are narrow.
-        covariance, half = _errors(evidence.weighed(at), at, free, known)
+        covariance = _covariance(evidence.weighed(at), at, free, known)
+        half = Z95 * np.sqrt(np.diag(covariance))
         ratio = [half[k] / unknowns[k].max_half_width for k in free]
         if not free or max(ratio) <= 1.0:
             break
         worst = free[int(np.argmax(ratio))]
         not_identified.append(unknowns[worst].name)
         at.theta[worst] = unknowns[worst].start
-    misfit = np.concatenate([_without_median(row) for row in residuals(at.theta)])
+    misfit = np.concatenate([_without_median(row) for row in evidence.rows(at.theta)])
     rms = np.sqrt(np.ma.mean(np.ma.masked_invalid(misfit**2), axis=0).filled(0.0))
-    return Fitted(
-        evidence.unknowns, at.theta, half, covariance, tuple(not_identified), rms, known.names
-    )
+    return Fitted(evidence.unknowns, at.theta, covariance, tuple(not_identified), rms, known.names)
 
 
 def _without_median(rows: Rows) -> np.ndarray:
@@ -289,18 +299,14 @@ def unexplained(nuisance: np.ndarray, values: np.ndarray, weight: np.ndarray) ->
     return values - np.tensordot(nuisance, explained, axes=1)
 
 
-def _errors(
+def _covariance(
     evidence: ResidualEvidence, at: Estimate, free: Sequence[int], known: KnownNumbers
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the covariance (P, P) and the half-widths (P,) of the 95 % intervals.
-
-    `free` are the indices of the fitted numbers; the half-widths of the others are NaN.
-    """
+) -> np.ndarray:
+    """Return the covariance (P, P) of all numbers; `free` are the indices of the fitted ones."""
     unknowns = evidence.unknowns
     total, names = len(unknowns), [unknown.name for unknown in unknowns]
-    half = np.full(total, np.nan)
     if not free:
-        return np.diag([unknown.max_half_width**2 for unknown in unknowns]), half
+        return np.diag([unknown.max_half_width**2 for unknown in unknowns])
     fixed = [names.index(name) for name in known.names]
     others = [k for k in range(total) if k not in fixed]
     equations = evidence.linearise(at).equations
@@ -321,5 +327,4 @@ def _errors(
     covariance = np.zeros((total, total))
     covariance[np.ix_(others, others)] = own_covariance + response @ known.covariance @ response.T
     covariance[np.ix_(fixed, fixed)] = known.covariance
-    half[list(free)] = Z95 * np.sqrt(np.diag(covariance)[list(free)])
-    return covariance, half
+    return covariance

@@ -2,8 +2,7 @@
 
 The motors balance slow torques such as flapping. The fits of inertia and lag therefore use fast
 changes of the rates alone (`body.py`). Once inertia and motors are known, the slow part of the
-motors' torque shows the flapping that it balances. The uncertainty of motors and inertia widens the
-interval. `identify.py` calls this after the other fits.
+motors' torque shows the flapping that it balances. Their uncertainty widens the interval.
 """
 
 from __future__ import annotations
@@ -23,16 +22,14 @@ from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.identify.body import FORCE_NUMBERS
 from suite.diagnose.identify.drive import DrivenVehicle
-from suite.diagnose.identify.entries import force_entries, inertia_from, with_entry
+from suite.diagnose.identify.entries import entries_of, with_entry
 from suite.diagnose.identify.fit import Z95, Fitted
 from suite.diagnose.identify.numbers import Number
 from suite.diagnose.search.evaluation import SearchResult
 from suite.diagnose.search.search import search
 
-FLAPPING, KEY = "blade_flapping", "coefficient"
-"""Name of the effect and of its parameter."""
-UNIT = "N s^2/rad"
-"""Unit of the coefficient."""
+FLAPPING = "blade_flapping"
+"""Name of the effect."""
 
 
 def flapping_of(
@@ -46,10 +43,10 @@ def flapping_of(
     """
     complete = [log for log in logs if not log.partial]
     try:
-        flights = ready(complete, vehicle) if complete else None
-    except ValueError:  # the flights have no drive, or no stretch without a hole
+        flights = ready(complete, vehicle)
+    except ValueError:  # there is no flight, no drive, or no stretch without a hole
         return None
-    if flights is None or TORQUE not in flights.views:
+    if TORQUE not in flights.views:
         return None
     voltage = all(log.voltage is not None for log in complete)
     evidence = _torque_evidence(flights, vehicle, voltage)
@@ -66,7 +63,8 @@ def flapping_of(
     others = (_torque_evidence(ready(complete, other), other, voltage) for other in perturbed)
     steps = [_coefficient_step(other, result) for other in others]
     half = float(np.hypot(result.half_widths()[0], Z95 * np.linalg.norm(steps)))
-    return Number(f"effects.{FLAPPING}.{KEY}", UNIT, [value], [(value - half, value + half)])
+    ci95 = (value - half, value + half)
+    return Number(f"effects.{FLAPPING}.coefficient", "N s^2/rad", [value], [ci95])
 
 
 def _torque_evidence(flights: ViewFlights, vehicle: Vehicle, voltage: bool) -> ViewEvidence:
@@ -89,39 +87,26 @@ def _coefficient_step(evidence: ViewEvidence, result: SearchResult) -> float:
     return float(gradient[0] / hessian[0, 0])
 
 
-def one_sigma_off(fitted: Fitted, names: tuple[str, ...]) -> list[Fitted]:
-    """Return copies of a fit whose numbers `names` are moved by one standard deviation.
-
-    There is one copy for each principal axis of the covariance; these errors are independent.
-    """
-    known = fitted.known_numbers(*names)
-    if not known.names:
-        return []
-    variance, axes = np.linalg.eigh(known.covariance)
-    indices = [fitted.index(name) for name in known.names]
-    moved = []
-    for sigma, axis in zip(np.sqrt(np.maximum(variance, 0.0)), axes.T, strict=True):
-        value = fitted.value.copy()
-        value[indices] += sigma * axis
-        moved.append(replace(fitted, value=value))
-    return moved
-
-
 def perturbed_vehicles(
     vehicle: Vehicle, driven: DrivenVehicle, force: Fitted, torque: Fitted
 ) -> list[Vehicle]:
     """Return copies of `vehicle` with one error of one standard deviation each.
 
-    The errors are those of motors and inertia.
+    The errors are those of motors and inertia. There is one copy for each principal axis of the
+    covariance; these errors are independent.
     """
     vehicles = []
-    for fitted in one_sigma_off(force, FORCE_NUMBERS):
-        other = vehicle
-        for entry in force_entries(driven, fitted):
-            if not entry.key.startswith("effects."):
-                other = with_entry(other, entry)
-        vehicles.append(other)
-    for fitted in one_sigma_off(torque, ("inertia_x", "inertia_y")):
-        x, y, z = inertia_from(driven.start, fitted.values()).tolist()
-        vehicles.append(replace(vehicle, inertia=(x, y, z)))
+    motors = (force, FORCE_NUMBERS, ("motors", "rotors"))
+    inertia = (torque, ("inertia_x", "inertia_y"), ("inertia",))
+    for fitted, names, tables in (motors, inertia):
+        known = fitted.known_numbers(*names)
+        indices = [fitted.index(name) for name in known.names]
+        variance, axes = np.linalg.eigh(known.covariance)
+        for sigma, axis in zip(np.sqrt(np.maximum(variance, 0.0)), axes.T, strict=True):
+            value, other = fitted.value.copy(), vehicle
+            value[indices] += sigma * axis
+            for entry in entries_of(driven, replace(fitted, value=value)):
+                if entry.key.partition(".")[0] in tables:
+                    other = with_entry(other, entry)
+            vehicles.append(other)
     return vehicles

@@ -77,22 +77,16 @@ class FlightGrid(NamedTuple):
         With `attitude_of_path`, an attitude that was not measured is the one that the path requires
         (`LEANING`). Its yaw is arbitrary.
         """
-        attitude = self.signals.get(
-            "rot_w", self.signals.get(LEANING) if attitude_of_path else None
-        )
-        count = len(self.time_s)
-        zeros = np.zeros((count, 3))
-        volts = self.signals.get("voltage", np.zeros(count))
-        vel_w = self.signals.get("vel_w", zeros)
+        signals, count = self.signals, len(self.time_s)
+        zeros, no_speed, good = np.zeros((count, 3)), np.zeros((count, 4)), np.ones(count, bool)
+        pos_w, vel_w, rate_b = (signals.get(name, zeros) for name in ("pos_w", "vel_w", "rate_b"))
+        attitude = signals.get("rot_w", signals.get(LEANING) if attitude_of_path else None)
         if attitude is None:  # without an attitude the velocity in body axes is unknown
             attitude, vel_w = np.broadcast_to(np.eye(3), (count, 3, 3)), zeros
-        measured = (self.signals.get("pos_w", zeros), attitude, vel_w)
-        pos_w, rot_w, vel_w, rate_b = map(
-            np.nan_to_num, (*measured, self.signals.get("rate_b", zeros))
-        )
-        rotor_speed, good = np.zeros((count, 4)), np.ones(count, dtype=bool)
-        voltage_drop = volts[0] - volts
-        return FlightRows(self.time_s, pos_w, rot_w, vel_w, rate_b, rotor_speed, voltage_drop, good)
+        pos_w, rot_w, vel_w, rate_b = map(np.nan_to_num, (pos_w, attitude, vel_w, rate_b))
+        volts = signals.get("voltage", np.zeros(count))
+        drop = volts[0] - volts
+        return FlightRows(self.time_s, pos_w, rot_w, vel_w, rate_b, no_speed, drop, good)
 
 
 def grid_of(log: FlightLog) -> FlightGrid:

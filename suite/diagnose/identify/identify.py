@@ -2,20 +2,21 @@
 
 These parameters are called numbers here. There are four fits: force (thrust and drag), torque
 (inertia, lag and delay), rotors (lag and delay of measured rotor speeds), and loop (gains of the
-rate loop). The lag is the time constant with which the rotors follow their commands.
-
-Force and torque are fitted alternately, each with the result of the other, since the rotors' lag
-acts on both. The mass is never fitted: scaling it together with inertia and thrust changes no
-flight.
+rate loop). Force and torque are fitted alternately, each with the result of the other, since the
+rotors' lag acts on both. The mass is never fitted: scaling it together with inertia and thrust
+changes no flight.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
+from eval.effects import all_values
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.inertial import posed
@@ -31,29 +32,23 @@ from suite.diagnose.identify.drive import (
     KNOWN_MOTORS,
     common_drive,
     driven_vehicle,
-    with_known_thrust,
     with_merged_effects,
-    with_motor_map,
 )
-from suite.diagnose.identify.entries import (
-    force_entries,
-    loop_entries,
-    torque_entries,
-    with_entries,
-    with_reachable_speed,
-)
-from suite.diagnose.identify.fit import Fitted, KnownNumbers, NoWholeWindow, Unknown
+from suite.diagnose.identify.entries import entries_of, with_entries, with_reachable_speed
+from suite.diagnose.identify.fit import NONE_KNOWN, Fitted, NoWholeWindow, Unknown
 from suite.diagnose.identify.flapping import flapping_of, perturbed_vehicles
 from suite.diagnose.identify.grid import FlightGrid, grid_of
-from suite.diagnose.identify.loop import (
-    air_torque_unknowns,
-    coupling_unknowns,
-    fit_loop,
-    fit_rotor_lag,
-    gain_unknowns,
-)
+from suite.diagnose.identify.loop import fit_commanded, loop_rates, loop_unknowns, rotor_speeds
 from suite.diagnose.identify.numbers import Number, not_attempted, not_identified, notes_on
 
+PARTS = {
+    "drag": ("drag_",),
+    "motors": FORCE_NUMBERS,
+    "inertia": ("inertia_", "yaw"),
+    "lag": ("lag", "late"),
+    "loop": ("gain_",),
+}
+"""Allowed values of `--leave` -> with what the names of their numbers start."""
 ROUNDS = 2
 """How often force and torque are fitted."""
 NO_LAG_S = 0.004
@@ -107,6 +102,7 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
         fits.fit_torque()
     if drive in KNOWN_MOTORS:
         fits.fit_loop()
+    lacking = not_attempted(flights, fits.start, drive, fits.results, leave, fits.broken)
     if not fits.results:
         names = ", ".join(flight.name for flight in flights)
         if not leave:
@@ -114,25 +110,9 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
                 f"{names}: no stretch of a second with positions or body rates and the signals "
                 "that drive the motors; import these flights again and read the report"
             )
-        lacking = "; ".join(fits.lacking()) or "no stretch of a second with the needed signals"
-        raise ValueError(f"{names}: without {', '.join(leave)} nothing is identifiable: {lacking}")
-    identified = fits.identified(vehicle)
-    # Blade flapping needs the results of both fits, and motors whose thrust is known.
-    if drive not in KNOWN_MOTORS or "drag" in leave or not {"force", "torque"} <= {*fits.results}:
-        return identified
-    force, torque = fits.results["force"], fits.results["torque"]
-    perturbed = perturbed_vehicles(identified.vehicle, fits.driven, force, torque)
-    with_voltage = [log for log in logs if log.name not in fits.without_voltage]
-    entry = flapping_of(with_voltage, identified.vehicle, perturbed)
-    if entry is None:
-        return identified
-    with_flapping, numbers, notes = with_entries(identified.vehicle, [entry])
-    return replace(
-        identified,
-        vehicle=with_flapping,
-        numbers=(*identified.numbers, *numbers),
-        notes=(*identified.notes, *notes),
-    )
+        why = "; ".join(lacking) or "no stretch of a second with the needed signals"
+        raise ValueError(f"{names}: without {', '.join(leave)} nothing is identifiable: {why}")
+    return fits.identified(vehicle, logs, lacking)
 
 
 class _Fits:
@@ -141,25 +121,20 @@ class _Fits:
     def __init__(
         self, flights: list[FlightGrid], vehicle: Vehicle, drive: str, leave: tuple[str, ...]
     ) -> None:
-        self.flights, self.start, self.drive, self.leave = flights, vehicle, drive, leave
-        if drive == "pwm" and (vehicle.motors is None or "motors" not in leave):
-            self.start = with_motor_map(flights, vehicle)
-        self.driven = driven_vehicle(flights, self.start, drive)
+        self.flights, self.drive, self.leave = flights, drive, leave
+        self.driven = driven_vehicle(flights, vehicle, drive, keep_motors="motors" in leave)
+        self.start = self.driven.start
         self.results: dict[str, Fitted] = {}
         """Results by the name of the fit: force, torque, rotors or loop."""
         self.broken: set[str] = set()
         """Names of fits without a complete window."""
         self.without_voltage: set[str] = set()
         """Names of flights without a voltage, if others have one."""
-        lag_s: float = vehicle.rotors.time_constant
-        delay, scale = (vehicle.effects.get(name) for name in ("command_delay", "thrust_scale"))
-        self.log_thrust = 0.0 if scale is None else float(np.log(scale.scale))
+        effects, lag_s = all_values(vehicle), vehicle.rotors.time_constant
+        self.log_thrust = float(np.log(effects["thrust_scale"].scale))
         """Logarithm of the thrust's scale at the start."""
-        self.numbers = {
-            "thrust": self.log_thrust,
-            "lag": lag_s,
-            "late": lag_s + (0.0 if delay is None else delay.delay),
-        }
+        late_s = lag_s + float(effects["command_delay"].delay)
+        self.numbers = {"thrust": self.log_thrust, "lag": lag_s, "late": late_s}
         """Present values of the numbers on which several fits depend, by name."""
 
     def fit_force(self) -> None:
@@ -172,42 +147,33 @@ class _Fits:
             return
         flights = self.with_known_thrust(flights)
         voltage = all(flight.has("voltage") for flight in flights)
-        unknowns = self.wanted(
-            force_unknowns(self.driven, voltage, leaning, self.log_thrust),
-            {"drag": ("drag_",), "motors": ("thrust", "curve", "battery")},
-        )
+        unknowns = self.wanted(force_unknowns(self.driven, voltage, leaning, self.log_thrust))
         if unknowns:
             fixed = {**self.numbers, "thrust": self.log_thrust}
-            self.attempt("force", lambda: fit_force(flights, self.driven, unknowns, fixed))
+            self.attempt("force", fit_force, unknowns, flights, self.driven, fixed)
 
     def fit_torque(self) -> None:
         """Fit inertia, yaw torque, lag and delay to the rotation."""
         flights = [flight for flight in self.flights if flight.has("rate_b")]
         if self.drive in ("rates", "thrust") or not flights:  # these commands contain no torques
             return
-        unknowns = self.wanted(
-            torque_unknowns(self.drive, self.numbers["lag"], self.numbers["late"]),
-            {"inertia": ("inertia_", "yaw"), "lag": ("lag", "late")},
-        )
+        starts = torque_unknowns(self.drive, self.numbers["lag"], self.numbers["late"])
+        unknowns = self.wanted(starts)
         if not unknowns:
             return
         flights = self.with_known_thrust(flights)
-        fixed, known = dict(self.numbers), None
+        fixed, known = dict(self.numbers), NONE_KNOWN
         if "force" in self.results and self.drive in KNOWN_MOTORS:
             fixed |= self.results["force"].values()
             known = self.results["force"].known_numbers(*FORCE_NUMBERS)
-
-        def fitted(unknowns: Sequence[Unknown], held: Sequence[str] = ()) -> Fitted:
-            """Fit the torque; the numbers `held` keep their start."""
-            return fit_torque(flights, self.driven, unknowns, fixed, held, known)
-
-        result = self.attempt("torque", lambda: fitted(unknowns))
+        inputs = (flights, self.driven, fixed, known)
+        result = self.attempt("torque", fit_torque, unknowns, *inputs)
         start_lag_s = self.start.rotors.time_constant
         if result and result.identifies("lag") and result.values()["lag"] < NO_LAG_S < start_lag_s:
             # No rotor follows at once. Commands that are blurred in the log hide its lag, so the
             # start's lag is held and the other numbers are fitted again.
             unknowns = [u._replace(start=start_lag_s) if u.name == "lag" else u for u in unknowns]
-            self.attempt("torque", lambda: fitted(unknowns, ("lag",)))
+            self.attempt("torque", fit_torque, unknowns, *inputs, ("lag",))
 
     def fit_loop(self) -> None:
         """Fit the rotors' lag behind commanded speeds, and the nominal rate loop."""
@@ -216,44 +182,45 @@ class _Fits:
         commanded = [f for f in self.flights if f.has(*speeds) and not {*speeds} & {*f.in_turn}]
         if commanded and "lag" not in self.leave:
             starts = lag_unknowns(self.numbers["lag"], self.numbers["late"])
-            self.attempt("rotors", lambda: fit_rotor_lag(commanded, starts))
+            inputs = (commanded, "rotor_speed", rotor_speeds, starts, self.numbers)
+            self.attempt("rotors", fit_commanded, *inputs)
         flights = [f for f in self.flights if f.has("rate_b", "rate_cmd_b")]
         if not flights or self.start.controller.kind != "p" or "loop" in self.leave:
             return
         # If the motors are known, other fits identify lag and delay better: hold them fixed here.
-        lags, known = lag_unknowns(self.numbers["lag"], self.numbers["late"]), None
+        lags, known = lag_unknowns(self.numbers["lag"], self.numbers["late"]), NONE_KNOWN
         if "rotors" in self.results or self.drive == "pwm" or "lag" in self.leave:
             source = self.results.get("rotors", self.results.get("torque"))
-            known = source.known_numbers("late", "lag") if source else KnownNumbers()
+            known = source.known_numbers("late", "lag") if source else NONE_KNOWN
             lags = [u for u in lags if u.name in known.names]
-        nuisance = [*coupling_unknowns(self.start), *air_torque_unknowns(flights)]
-        unknowns = [*gain_unknowns(), *nuisance, *lags]
-        self.attempt("loop", lambda: fit_loop(flights, self.start, unknowns, self.numbers, known))
+        unknowns = [*loop_unknowns(self.start, flights), *lags]
+        model = partial(loop_rates, self.start)
+        self.attempt("loop", fit_commanded, flights, "rate_b", model, unknowns, self.numbers, known)
 
-    def wanted(
-        self, unknowns: Sequence[Unknown], prefixes: Mapping[str, tuple[str, ...]]
-    ) -> list[Unknown]:
-        """Return `unknowns` without the parts that the user chose not to fit.
-
-        `prefixes` are the first letters of the names of the numbers, by part.
-        """
-        not_wanted = tuple(prefix for part in self.leave for prefix in prefixes.get(part, ()))
+    def wanted(self, unknowns: Sequence[Unknown]) -> list[Unknown]:
+        """Return `unknowns` without the parts that the user chose not to fit."""
+        not_wanted = tuple(prefix for part in self.leave for prefix in PARTS[part])
         return [u for u in unknowns if not u.name.startswith(not_wanted)]
 
     def with_known_thrust(self, flights: list[FlightGrid]) -> list[FlightGrid]:
-        """Return the flights whose motor thrust is known, and remember those without a voltage."""
-        selected = with_known_thrust(flights, self.drive)
-        if len(selected) < len(flights):
-            self.without_voltage |= {flight.name for flight in flights if not flight.has("voltage")}
-        return selected
+        """Return the flights in which the motors' thrust is known best, and remember the others.
 
-    def attempt(self, name: str, fit: Callable[[], Fitted]) -> Fitted | None:
-        """Run `fit`, and keep its result for the following fits and under its name.
+        The thrust of a motor command depends on the battery. For this drive, flights without a
+        voltage are therefore left out if other flights have one.
+        """
+        with_voltage = [flight for flight in flights if flight.has("voltage")]
+        if self.drive != "pwm" or not with_voltage:
+            return flights
+        self.without_voltage |= {flight.name for flight in flights if not flight.has("voltage")}
+        return with_voltage
+
+    def attempt(self, name: str, fit: Callable[..., Fitted], *inputs: Any) -> Fitted | None:
+        """Run `fit` on `inputs`, and keep its result for the following fits and under its name.
 
         Without a complete window there is none, and the name is added to `broken`.
         """
         try:
-            result = fit()
+            result = fit(*inputs)
         except NoWholeWindow:
             self.broken.add(name)
             return None
@@ -262,35 +229,39 @@ class _Fits:
         self.numbers |= {number: values[number] for number in self.numbers if number in values}
         return result
 
-    def lacking(self) -> list[str]:
-        """Return a line for people for each number that was not fitted."""
-        return not_attempted(
-            self.flights, self.start, self.drive, self.results, self.leave, self.broken
-        )
+    def identified(
+        self, original: Vehicle, logs: Sequence[FlightLog], lacking: Sequence[str]
+    ) -> Identified:
+        """Return the result of all fits to `logs`; `original` is the vehicle before any change.
 
-    def identified(self, original: Vehicle) -> Identified:
-        """Return the result of all fits; `original` is the vehicle before any change."""
-        results, entries = self.results, list[Number]()
-        if "force" in results:
-            entries += force_entries(self.driven, results["force"])
-        if "torque" in results:
-            entries += torque_entries(self.driven, results["torque"], self.numbers["thrust"])
-        for name in ("rotors", "loop"):
-            if name in results:
-                entries += loop_entries(self.start, results[name])
-        by_key: dict[str, Number] = {}
-        for entry in entries:
-            # Several fits may estimate lag and delay. Later fits observe them more directly.
-            if entry.key not in by_key or entry.is_identified:
-                by_key[entry.key] = entry
+        `lacking` has a line for people for each number that was not fitted.
+        """
+        results, by_key = self.results, dict[str, Number]()
+        # Several fits may estimate lag and delay. Later fits in this order observe them more
+        # directly.
+        for name in ("force", "torque", "rotors", "loop"):
+            if name not in results:
+                continue
+            for entry in entries_of(self.driven, results[name], self.numbers["thrust"]):
+                if entry.key not in by_key or entry.is_identified:
+                    by_key[entry.key] = entry
         vehicle, numbers, notes = with_entries(self.start, by_key.values())
         if self.drive == "rotors":
             speeds = [f.signals["rotor_speed"] for f in self.flights]
             vehicle = with_reachable_speed(vehicle, speeds)
+        # Blade flapping needs the results of both fits, and motors whose thrust is known.
+        known_motors = self.drive in KNOWN_MOTORS and {"force", "torque"} <= {*results}
+        if known_motors and "drag" not in self.leave:
+            fits = (results["force"], results["torque"])
+            perturbed = perturbed_vehicles(vehicle, self.driven, *fits)
+            with_voltage = [log for log in logs if log.name not in self.without_voltage]
+            flapping = flapping_of(with_voltage, vehicle, perturbed)
+            vehicle, more, further = with_entries(vehicle, [flapping] if flapping else [])
+            numbers, notes = [*numbers, *more], [*notes, *further]
         return Identified(
             vehicle,
             tuple(numbers),
-            (*not_identified(results, by_key), *self.lacking()),
+            (*not_identified(results, by_key), *lacking),
             self.drive,
             {
                 name: results[name].residual_rms.tolist()

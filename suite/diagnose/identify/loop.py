@@ -15,104 +15,77 @@ Changes of rotor speed are assumed small.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from scipy.signal import cont2discrete, lfilter, lfilter_zi
 
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.identify.body import Windows, by_value
+from suite.diagnose.identify.body import Windows
 from suite.diagnose.identify.drive import LEAST_LAG_S, after_delay_and_lag, delayed, filled, lagged
-from suite.diagnose.identify.fit import Fitted, KnownNumbers, Rows, Unknown, fit
+from suite.diagnose.identify.fit import NONE_KNOWN, Fitted, KnownNumbers, Rows, Unknown, fit
 from suite.diagnose.identify.grid import STEP_S, FlightGrid
 
-LOOP_WIDTH_S = 0.08
-"""Width of the windows over which rates are averaged [s]."""
-SPEED_WIDTH_S = 0.16
-"""Width of the windows over which rotor speeds are averaged [s]."""
+WINDOWS = {"rate_b": ("rate_cmd_b", 0.08), "rotor_speed": ("rotor_speed_cmd", 0.16)}
+"""Measured signal -> its command, and the width of the windows over which both are averaged [s]."""
 
 
-def gain_unknowns() -> list[Unknown]:
-    """Return the gains of the rate loop, as logarithms of their ratios to those of the start.
+def loop_unknowns(vehicle: Vehicle, flights: Sequence[FlightGrid]) -> list[Unknown]:
+    """Return the numbers of the rate loop, apart from lag and delay.
 
-    (The start is the vehicle file from which the fit starts.)
-    """
-    return [Unknown(f"gain_{axis}", 0.0, -3.0, 3.0, 0.35, 1e-2, 0.02) for axis in "xyz"]
-
-
-def coupling_unknowns(vehicle: Vehicle) -> list[Unknown]:
-    """Return the factors from the rates about two axes to the angular acceleration of the third.
-
-    About x the factor is `(J_z - J_y) / J_x`. The factors are nuisance parameters, since the
-    inertia in the vehicle file may be wrong.
+    The gains are logarithms of their ratios to those of the start. All others are nuisance
+    parameters: the factors from the rates about two axes to the angular acceleration of the third,
+    since the inertia in the vehicle file may be wrong; and the ratios of angular acceleration by
+    moving air (flapping) to velocity [1/(m s)], if all flights have a velocity and an attitude.
     """
     x, y, z = vehicle.inertia
-    starts = ((z - y) / x, (x - z) / y, (y - x) / z)
-    by_axis = zip("xyz", starts, strict=True)
-    return [Unknown(f"coupling_{axis}", start, -1.0, 1.0, 0.2, 1e-2) for axis, start in by_axis]
+    couplings = zip("xyz", ((z - y) / x, (x - z) / y, (y - x) / z), strict=True)
+    air = "xy" if all(flight.has("vel_w", "rot_w") for flight in flights) else ""
+    return [
+        *(Unknown(f"gain_{axis}", 0.0, -3.0, 3.0, 0.35, 1e-2, 0.02) for axis in "xyz"),
+        *(Unknown(f"coupling_{axis}", start, -1.0, 1.0, 0.2, 1e-2) for axis, start in couplings),
+        *(Unknown(f"air_{axis}", 0.0, -20.0, 20.0, 2.0, 1e-2) for axis in air),
+    ]
 
 
-def air_torque_unknowns(flights: Sequence[FlightGrid]) -> list[Unknown]:
-    """Return the ratios of angular acceleration by moving air (flapping) to velocity [1/(m s)].
-
-    They are nuisance parameters. Without a velocity and an attitude in all flights there are none.
-    """
-    if not all(flight.has("vel_w", "rot_w") for flight in flights):
-        return []
-    return [Unknown(f"air_{axis}", 0.0, -20.0, 20.0, 2.0, 1e-2) for axis in "xy"]
-
-
-def fit_loop(
+def fit_commanded(
     flights: Sequence[FlightGrid],
-    vehicle: Vehicle,
+    measured: str,
+    model: Callable[[FlightGrid, Mapping[str, float]], np.ndarray],
     unknowns: Sequence[Unknown],
     fixed: Mapping[str, float],
-    known: KnownNumbers | None = None,
+    known: KnownNumbers = NONE_KNOWN,
 ) -> Fitted:
-    """Fit gains, lag and delay; each flight has a free constant rate (bias of the gyro, trim).
+    """Fit how a `measured` signal follows its command: body rates, or rotor speeds.
 
-    `unknowns` are the numbers of `gain_unknowns`, `coupling_unknowns`, `air_torque_unknowns` and
-    `body.lag_unknowns`, or some of them; `fixed` has the values of the others. Another fit has
-    identified those that are `known`.
-
-    Raises:
-        NoWholeWindow: if no window has all signals.
-    """
-    windows = [_windows(flight, LOOP_WIDTH_S, "rate_b", "rate_cmd_b") for flight in flights]
-
-    def residuals(numbers: Mapping[str, float]) -> list[Rows]:
-        return [one.residuals(loop_rates(one.flight, vehicle, numbers)) for one in windows]
-
-    return fit(by_value(residuals, unknowns, fixed), unknowns, known=known)
-
-
-def fit_rotor_lag(flights: Sequence[FlightGrid], unknowns: Sequence[Unknown]) -> Fitted:
-    """Fit lag and delay of measured rotor speeds behind commanded ones.
+    Each channel of a flight has a free constant (bias of the gyro, trim). `model` returns the
+    signal (G, C) of a flight from its commands, for the `unknowns` and the numbers that are
+    `fixed`. Another fit has identified those that are `known`.
 
     Raises:
-        NoWholeWindow: if no window has both measured and commanded speeds.
+        NoWholeWindow: if no window has both the signal and its command.
     """
-    measured, commanded = "rotor_speed", "rotor_speed_cmd"
-    windows = [_windows(flight, SPEED_WIDTH_S, measured, commanded) for flight in flights]
+    commanded, width_s = WINDOWS[measured]
+    windows = []
+    for flight in flights:
+        form, values = flight.form(width_s, (measured, commanded)), flight.signals[measured]
+        means = form.mean @ np.nan_to_num(values)
+        constants = np.ones(values.shape[1], dtype=bool)
+        windows.append(Windows(flight, flight.rows(False), form, means, constants))
 
     def residuals(numbers: Mapping[str, float]) -> list[Rows]:
-        return [
-            one.residuals(after_delay_and_lag(one.flight.signals[commanded], numbers))
-            for one in windows
-        ]
+        return [one.residuals(model(one.flight, numbers)) for one in windows]
 
-    return fit(by_value(residuals, unknowns, {}), unknowns)
+    return fit(residuals, unknowns, known=known, fixed=fixed)
 
 
-def _windows(flight: FlightGrid, width_s: float, measured: str, commanded: str) -> Windows:
-    """Return the windows of `flight` with both signals; each channel has a free constant."""
-    form = flight.form(width_s, (measured, commanded))
-    values = np.nan_to_num(flight.signals[measured])
-    return Windows(flight, form, form.mean @ values, np.ones(values.shape[1], dtype=bool))
+def rotor_speeds(flight: FlightGrid, numbers: Mapping[str, float]) -> np.ndarray:
+    """Return the rotor speeds (G, 4) that follow the commanded ones [rad/s]."""
+    return after_delay_and_lag(flight.signals["rotor_speed_cmd"], numbers)
 
 
-def loop_rates(flight: FlightGrid, vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
+def loop_rates(vehicle: Vehicle, flight: FlightGrid, numbers: Mapping[str, float]) -> np.ndarray:
     """Return the body rates (G, 3) of the rate loop from its commands alone [rad/s]."""
     # The loop uses rates that are half a period old on average. This delay, exp(-half_s s) for the
     # Laplace variable s, is expanded to second order.

@@ -1,20 +1,13 @@
-"""Makes entries of a vehicle file with intervals, and explains which numbers are not identified.
-
-A fitted number is a parameter of a fit, such as `late` (`body.py`). An entry of the file, such as
-the delay of commands, may depend on several fitted numbers.
-"""
+"""Entries of a vehicle file with intervals, and why other numbers are not identified."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
-
-import numpy as np
-from numpy.typing import ArrayLike
 
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.inertial import UNSEEN
-from suite.diagnose.identify.fit import Z95, Fitted
+from suite.diagnose.identify.fit import Fitted
 from suite.diagnose.identify.grid import IMU_ACC, FlightGrid
 
 DELAY = "effects.command_delay.delay"
@@ -44,43 +37,6 @@ class Number(NamedTuple):
     def is_entered(self) -> bool:
         """Whether the value in the file comes from these flights."""
         return self.is_identified or self.follows
-
-
-Formula = Callable[[Mapping[str, float]], ArrayLike]
-"""Function from fitted numbers by name to the value of an entry, or to its values (V,)."""
-
-
-def number_from(
-    fitted: Fitted,
-    key: str,
-    unit: str,
-    formula: Formula,
-    needs: Sequence[str],
-    max_half_width: float = np.inf,
-) -> Number:
-    """Return an entry of the file; its intervals follow from the fit's covariance.
-
-    `needs` names for each value the fitted number that must be identified. An identified value
-    whose 95 % interval has a half-width above `max_half_width` `follows` (see `Number`).
-    """
-    values = np.atleast_1d(formula(fitted.values()))
-    # Finite differences of the formula turn the covariance of the fit into that of the values.
-    slopes = np.zeros((len(values), len(fitted.unknowns)))
-    for k, unknown in enumerate(fitted.unknowns):
-        up, down = fitted.values(), fitted.values()
-        up[unknown.name] += unknown.step
-        down[unknown.name] -= unknown.step
-        change = np.atleast_1d(formula(up)) - np.atleast_1d(formula(down))
-        slopes[:, k] = change / (2.0 * unknown.step)
-    variance = np.einsum("vi,ij,vj->v", slopes, fitted.covariance, slopes)
-    half = Z95 * np.sqrt(np.maximum(variance, 0.0))
-    is_known = [fitted.identifies(name) for name in needs]
-    spans = [
-        (float(v - h), float(v + h)) if known and h <= max_half_width else None
-        for v, h, known in zip(values, half, is_known, strict=True)
-    ]
-    follows = any(known and span is None for known, span in zip(is_known, spans, strict=True))
-    return Number(key, unit, values.tolist(), spans, follows)
 
 
 def numbers_json(numbers: Sequence[Number]) -> dict[str, Any]:
@@ -114,9 +70,7 @@ WHY = {
     "thrust": "thrust: too little of the force along body z is explained",
     "curve": "curvature of the thrust curve: the motor commands hardly change",
     "battery": "voltage_exponent: the voltage hardly changes",
-    "drag_x": "drag along body x: too slow, or too little of it",
-    "drag_y": "drag along body y: too slow, or too little of it",
-    "drag_z": "drag along body z: too slow, or too little of it",
+    **{f"drag_{a}": f"drag along body {a}: too slow, or too little of it" for a in "xyz"},
     "inertia_x": "inertia about x: the body hardly rolls, or the rotors' lag may be another",
     "inertia_y": "inertia about y: the body hardly pitches, or the rotors' lag may be another",
     "inertia_z": "inertia about z: the body hardly yaws, or not while it rolls and pitches",
@@ -163,23 +117,18 @@ def not_attempted(
     The fits of `fitted` are force, torque, rotors and loop. `broken` names fits for which the logs
     have the columns, but no complete window.
     """
-    lines = []
 
-    def any_has(*names: str) -> bool:
-        """Return whether any flight has all of these signals."""
-        return any(flight.has(*names) for flight in flights)
+    def any_has(name: str) -> bool:
+        return any(flight.has(name) for flight in flights)
 
-    if any_has(IMU_ACC):  # some flight has no position
-        lines += UNSEEN
-    force = fitted.get("force")
-    if force is None:
-        if not {"drag", "motors"} <= set(leave):
-            why = "these logs have no stretch with a position"
-            if "force" in broken:
-                slow = "" if any_has("rot_w") else ", slow enough to do without an attitude"
-                why = f"{NEVER_BOTH} the path and the motors' commands or speeds{slow}"
-            lines.append(f"thrust and drag: {why}")
-    elif "drag" not in leave and "drag_x" not in force.names:
+    lines = [*UNSEEN] if any_has(IMU_ACC) else []  # some flight has no position
+    if "force" not in fitted and not {"drag", "motors"} <= set(leave):
+        why = "these logs have no stretch with a position"
+        if "force" in broken:
+            slow = "" if any_has("rot_w") else ", slow enough to do without an attitude"
+            why = f"{NEVER_BOTH} the path and the motors' commands or speeds{slow}"
+        lines.append(f"thrust and drag: {why}")
+    if "force" in fitted and "drag" not in leave and "drag_x" not in fitted["force"].names:
         lines.append(
             "drag along body x and y: without an attitude a force across the thrust equals "
             "a body that leans"

@@ -14,13 +14,11 @@ from suite.common.provenance import stamp
 from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.estimate.parameters import refuse_own_motion
 from suite.diagnose.identify.drive import unmodelled_effects
-from suite.diagnose.identify.identify import Identified, identify
+from suite.diagnose.identify.identify import PARTS, identify
 from suite.diagnose.identify.numbers import number_lines, numbers_json
 
 SCHEMA = 1
 """Version of the JSON that `suite identify` prints."""
-PARTS = ("drag", "motors", "inertia", "lag", "loop")
-"""Allowed values of `--leave`."""
 ESTIMATED = ("motor_map", "battery_scaling")
 """Faults of a vehicle file that an identification repairs, so it does not refuse them."""
 MADE_BY = "by suite identify"
@@ -66,7 +64,10 @@ def identify_files(
         )
     # Fit, and write the file.
     identified = identify(logs, start, leave)
-    header = _header(identified, vehicle)
+    counted = _counted(len(identified.flights))
+    lines = [f"From {vehicle} {MADE_BY}, {counted} ({identified.drive}); 95 % intervals:"]
+    lines += number_lines(identified.numbers)
+    header = "\n".join([*lines, *(f"not identifiable: {t}" for t in identified.not_identified)])
     try:
         save_vehicle(identified.vehicle, out, header)
     except ValueError as error:
@@ -92,17 +93,7 @@ def _counted(flights: int) -> str:
 
 def is_identified(vehicle: str) -> bool:
     """Return whether `vehicle` is a file that suite identify wrote."""
-    path = Path(vehicle)
-    if not path.is_file():
+    if not Path(vehicle).is_file():
         return False
-    first_line = path.read_text(encoding="utf-8").partition("\n")[0]
+    first_line = Path(vehicle).read_text(encoding="utf-8").partition("\n")[0]
     return first_line.startswith("#") and MADE_BY in first_line
-
-
-def _header(identified: Identified, start: str) -> str:
-    """Return the comment at the top of the vehicle file: all numbers with their intervals."""
-    flights = _counted(len(identified.flights))
-    lines = [f"From {start} {MADE_BY}, {flights} ({identified.drive}); 95 % intervals:"]
-    lines += number_lines(identified.numbers)
-    lines += [f"not identifiable: {text}" for text in identified.not_identified]
-    return "\n".join(lines)

@@ -44,10 +44,6 @@ class Clock(NamedTuple):
     shift_s: np.ndarray
     """(M,) shift in each block [s]; all zeros if it is not significant."""
 
-    def at(self, time_s: np.ndarray) -> np.ndarray:
-        """Return the shift at times of the gyro (T,) [s]."""
-        return np.interp(time_s, self.time_s, self.shift_s)
-
 
 def clock_of(log: FlightLog) -> Clock:
     """Return the shift between the times of gyro and reference in a flight."""
@@ -56,8 +52,7 @@ def clock_of(log: FlightLog) -> Clock:
     grid = np.arange(log.time_s[0], log.time_s[-1], STEP_S)
     size = round(BLOCK_S / STEP_S)
     blocks = len(grid) // size
-    has_attitude = np.isfinite(log.quat_wxyz).all(axis=1).sum() > 1
-    if not blocks or not has_attitude or not (np.isfinite(log.rate_b).sum(axis=0) > 1).all():
+    if not blocks:
         return no_shift
     shifts_s = np.arange(-LARGEST_S, LARGEST_S + 0.5 * FINE_S, FINE_S)
     misfit, rows = _misfits(log, grid[: blocks * size], shifts_s, size)
@@ -87,17 +82,11 @@ def clock_of(log: FlightLog) -> Clock:
 def _misfits(
     log: FlightLog, grid: np.ndarray, shifts_s: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compare the rates of gyro and reference at each shift.
-
-    Args:
-        log: the flight.
-        grid: times on which the rates are compared, M * `size` of them [s].
-        shifts_s: (S,) shifts that are tried [s].
-        size: number of grid times in a block.
+    """Compare the rates of gyro and reference on the times `grid` (M * `size`,) at each shift.
 
     Returns:
-        The sum of squared differences (M, S) in each block at each shift, and the number of grid
-        times (M,) of each block that are compared.
+        The sum of squared differences (M, S) in each block of `size` times at each shift, and the
+        number of times (M,) of each block that are compared.
     """
     half_s = SPAN_ROWS * STEP_S
     rot_w = attitude_at(grid, log.time_s, log.quat_wxyz)
@@ -143,7 +132,7 @@ def on_gyro_clock(log: FlightLog, clock: Clock) -> FlightLog:
     """Return the flight with pose and velocity of the reference moved to the gyro's times."""
     if not clock.shift_s.any():
         return log
-    reference_s = log.time_s - clock.at(log.time_s)
+    reference_s = log.time_s - np.interp(log.time_s, *clock)
     return replace(
         log,
         pos_w=interpolate(reference_s, log.time_s, log.pos_w, holes=True),

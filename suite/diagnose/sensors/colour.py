@@ -28,7 +28,7 @@ from eval.judging.statistics import Interval
 from suite.diagnose.estimate.block import NormalEquations, products
 from suite.diagnose.estimate.gauss_newton import intervals95
 from suite.diagnose.identify.fit import DIFFER_P
-from suite.diagnose.sensors.errors import STRETCH_S, significant
+from suite.diagnose.sensors.errors import ZERO, significant, stretches
 
 SHORT_S = 1.0
 """The autocorrelation is fitted up to this lag [s]."""
@@ -45,8 +45,6 @@ LOG_RATIO = (-7.0, -0.7)
 LONGEST_NEW = 0.3
 """A fast correlation time below this share of the time between rows counts as 0: rows do not
 show it."""
-ZERO = Interval(0.0, 0.0, 0.0)
-"""A parameter that is not in the model."""
 
 
 class Series(NamedTuple):
@@ -141,16 +139,16 @@ def fit_colour(flights: Sequence[Series]) -> Coloured | None:
     if variograms is None:
         return None
     drift = _drift(flights) if any(flight.speed.any() for flight in flights) else ZERO
-    best = _noise(flights, variograms, lag_s, 0.0)
+    theta, half = _noise(flights, variograms, lag_s, 0.0)
     if significant(drift):
         # At long lags a slow noise resembles a drift. Noise that lasts longer counts as a drift.
-        if best.colour.lasts_s > LONG_S:
-            best = _noise(flights, variograms, lag_s, drift.value**2)
+        if _colour(theta).lasts_s > LONG_S:
+            theta, half = _noise(flights, variograms, lag_s, drift.value**2)
         else:
             drift = drift._replace(value=0.0, low=0.0)
     # Convert the logarithms of the fit into parameters with intervals.
-    log_variance, share, _, _ = best.theta
-    half, colour, sd = best.half, best.colour, float(np.exp(0.5 * log_variance))
+    log_variance, share, _, _ = theta
+    colour, sd = _colour(theta), float(np.exp(0.5 * log_variance))
     low, high = np.clip([share - half[1], share + half[1]], 0.0, 1.0)
     fast_s = _from_log(colour.fast_s, float(np.hypot(half[2], half[3])))
     if colour.fast and colour.fast_s < LONGEST_NEW * step_s:
@@ -172,34 +170,22 @@ def _from_log(value: float, half: float) -> Interval:
     return Interval(value, value / factor, value * factor)
 
 
-class _Noise(NamedTuple):
-    """Fitted noise."""
-
-    theta: np.ndarray
-    """(4,) parameters: log v, f, log (T_f / T) and log T."""
-    half: np.ndarray
-    """(4,) half-widths of the parameters' intervals."""
-    cost: float
-    """Sum of the squared residuals of the fit, halved."""
-
-    @property
-    def colour(self) -> Colour:
-        """Correlation of the noise in time."""
-        return _colour(self.theta)
-
-
 def _colour(theta: np.ndarray) -> Colour:
-    """Return the correlation in time for the parameters of a `_Noise`."""
+    """Return the correlation in time for the parameters (4,) of `_noise`."""
     return Colour(float(theta[1]), float(np.exp(theta[2] + theta[3])), float(np.exp(theta[3])))
 
 
 def _noise(
     flights: Sequence[Series], variograms: _Variograms, lag_s: np.ndarray, walk: float
-) -> _Noise:
+) -> tuple[np.ndarray, np.ndarray]:
     """Fit the noise in addition to a given random walk.
 
     The fast process is used only if its share is significant. `lag_s` (L,) are the lags of the
     variograms [s]; `walk` is the variance of the random walk for each metre.
+
+    Returns:
+        The parameters log v, f, log (T_f / T) and log T (4,), and the half-widths of their
+        intervals.
     """
     duration_s = float(np.mean([flight.duration_s for flight in flights]))
     about_mean = _variograms(flights, None)
@@ -225,8 +211,8 @@ def _noise(
     low = np.array([np.log(size) - 10.0, 0.0, LOG_RATIO[0], np.log(LEAST_S)])
     high = np.array([np.log(size) + 3.0, 1.0, LOG_RATIO[1], np.log(longest)])
 
-    def fitted(free: list[int], start: np.ndarray) -> _Noise:
-        """Fit the entries of theta at `free`; the others keep their start."""
+    def fitted(free: list[int], start: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Fit the entries of theta at `free`; return theta, half-widths and squared error."""
 
         def complete(values: np.ndarray) -> np.ndarray:
             """Return all entries of theta for the values of the free ones."""
@@ -240,13 +226,14 @@ def _noise(
         half = np.zeros(4)
         slope = -best.jac.reshape(*weight.shape, len(free))
         half[free] = np.minimum(_half_widths(slope, best.fun, variograms.flight), 20.0)
-        return _Noise(complete(best.x), half, float(best.cost))
+        return complete(best.x), half, float(best.cost)
 
     # Fit the slow process alone, then both; keep both only if the fast share is significant.
-    slow = fitted([0, 3], np.array([np.log(size), 0.0, -1.5, np.log(0.3)]))
+    slow, slow_half, _ = fitted([0, 3], np.array([np.log(size), 0.0, -1.5, np.log(0.3)]))
     starts = [np.array([np.log(size), 0.3, ratio, np.log(0.5)]) for ratio in (-1.5, -4.0)]
-    mixed = min((fitted([0, 1, 2, 3], start) for start in starts), key=lambda noise: noise.cost)
-    return mixed if mixed.half[1] < mixed.theta[1] < 1.0 - mixed.half[1] else slow
+    fits = (fitted([0, 1, 2, 3], start) for start in starts)
+    mixed, half, _ = min(fits, key=lambda fit: fit[2])
+    return (mixed, half) if half[1] < mixed[1] < 1.0 - half[1] else (slow, slow_half)
 
 
 def _drift(flights: Sequence[Series]) -> Interval:
@@ -282,7 +269,7 @@ def _variograms(flights: Sequence[Series], lag_s: np.ndarray | None) -> _Variogr
     """
     values, counts, speeds, flight_of = [], [], [], []
     for number, flight in enumerate(flights):
-        stretch = (np.arange(len(flight.value)) * flight.step_s / STRETCH_S).astype(int)
+        stretch = stretches(len(flight.value), flight.step_s)
         size = stretch[-1] + 1
         if lag_s is None:
             squares = [(flight.value - np.nanmean(flight.value)) ** 2]
@@ -319,12 +306,8 @@ def _variograms(flights: Sequence[Series], lag_s: np.ndarray | None) -> _Variogr
 def _half_widths(slope: np.ndarray, residual: np.ndarray, flight: np.ndarray) -> np.ndarray:
     """Return the half-widths (K,) of the 95 % intervals of K parameters.
 
-    They follow from the disagreement between stretches and between flights.
-
-    Args:
-        slope: (B, L, K) slopes of the model along the parameters.
-        residual: (B * L,) residuals of the fit.
-        flight: (B,) number of the flight of each stretch.
+    `slope` (B, L, K) and `residual` (B * L,) are those of the fit, and `flight` (B,) is the number
+    of each stretch's flight.
     """
     residual = residual.reshape(*slope.shape[:2], 1)
     chi2 = (residual[..., 0] ** 2).sum(axis=1)

@@ -1,16 +1,19 @@
-"""Errors of an on-board state estimate relative to the log's reference pose, and their delay.
+"""Errors of an on-board state estimate relative to the log's reference pose, and their causes.
 
 To first order, an estimate that is late by d has the error -d times the derivative of the truth. A
-scale error k of the velocity v causes the error k v. Delay and scale are fitted by least squares
-to the errors of all flights (`identify/fit.py`), with a free constant of each flight.
-Errors are correlated in time, so intervals come from the disagreement between stretches of 5 s.
-Rows are not whitened (made uncorrelated in time): whitening would give a high weight to fast
-motion, in which the dynamics of the estimator dominate.
+scale error k of the velocity v causes the error k v. An estimator that neglects drag takes the
+deceleration by drag for a tilt of the vehicle; the tilt follows the velocity with a first-order
+lag, whose time constant is called correlation time (the sensor model `drag_tilt`).
+
+These causes are fitted by least squares to the errors of all flights (`identify/fit.py`), with a
+free constant of each flight. Errors are correlated in time, so intervals come from the disagreement
+between stretches of 5 s. Rows are not whitened (made uncorrelated in time): whitening would give a
+high weight to fast motion, in which the dynamics of the estimator dominate.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +24,7 @@ from eval.effects.interface import GRAVITY
 from eval.judging.statistics import Interval
 from eval.logs.columns import ESTIMATE, GROUPS, FlightLogError
 from eval.logs.flight_log import FlightLog
-from suite.diagnose.data.sampling import attitude_at, interpolate
+from suite.diagnose.data.sampling import attitude_at, follow_lag, interpolate
 from suite.diagnose.identify.fit import Rows, Unknown, fit
 from tracks.geometry.rotation import cross, to_local
 
@@ -35,6 +38,8 @@ SETTLES_S = 2.0
 """Time left out after the first row and before the last: the vehicle is near the ground [s]."""
 LEAST_S = 8.0
 """Least length of a flight; errors are correlated over seconds [s]."""
+ZERO = Interval(0.0, 0.0, 0.0)
+"""A parameter that is not in the model."""
 
 
 class Errors(NamedTuple):
@@ -92,7 +97,7 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
     vel_w, rot_w = vel_w[-len(grid) :], rot_w[-len(grid) :]
     # Estimate minus reference, part by part.
     then_s = grid - late_s
-    value, rate_b = np.full((len(grid), 9), np.nan), np.full((len(grid), 3), np.nan)
+    value = np.full((len(grid), 9), np.nan)
     for k, (part, estimate) in enumerate(estimates.items()):
         if estimate is None:
             continue
@@ -106,8 +111,7 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
         value[:, 3 * k : 3 * k + 3] = error
     # The time derivative of the reference is velocity, acceleration and body rates.
     acc_b = to_local(rot_w, _differentiated(vel_w, step_s))
-    if np.isfinite(log.rate_b).any():
-        rate_b = interpolate(then_s, log.time_s, log.rate_b, holes=True)
+    rate_b = interpolate(then_s, log.time_s, log.rate_b, holes=True)
     slope = np.concatenate([vel_w, acc_b, rate_b], axis=1)
     return Errors(step_s, value, slope, to_local(rot_w, vel_w), rot_w, lean_w)
 
@@ -149,57 +153,108 @@ STRETCH_S = 5.0
 """Errors further apart than this count as independent [s]."""
 ROUNDS = 3
 """Number of rounds of the fit; each is linearised at the delay of the round before."""
+TILT = slice(6, 9)
+"""Channels of the attitude among the errors. All three axes are fitted: if a body leans, a tilt
+about a horizontal world axis has a part about the body's z axis."""
 DELAY = Unknown("delay", 0.0, -1.0, 1.0, np.inf, 1e-3)
 SCALE = Unknown("scale", 0.0, -1.0, 1.0, np.inf, 1e-3)
-"""The fitted parameters: change of the delay [s], and relative scale error of the velocity."""
+DRAG = Unknown("drag", 0.3, -2.0, 5.0, np.inf, 1e-2)
+LOG_LASTS = Unknown("log_lasts", 0.0, np.log(0.05), np.log(10.0), np.inf, 1e-2)
+"""The fitted parameters: change of the delay [s], relative scale error of the velocity, drag [1/s],
+and logarithm of the tilt's correlation time in seconds. The drag does not start at 0, where the
+correlation time has no effect."""
+LOG_LIMITS = (-20.0, 20.0)
+"""Limits of the logarithm of the correlation time's interval."""
 
 
-class Lateness(NamedTuple):
+class Systematic(NamedTuple):
     """The systematic part of the errors."""
 
     delay_s: Interval
     """Delay of the estimate [s]."""
     velocity_scale: Interval
     """Relative scale error of the velocity."""
+    drag: Interval
+    """Drag that the estimator neglects [1/s]; zeros where it is not significant."""
+    tilt_lasts_s: Interval
+    """Correlation time of the tilt by this drag [s]; zeros without a drag."""
+
+    def removed(self, flight: Errors) -> np.ndarray:
+        """Return the errors (T, 9) of a flight without those by scale and neglected drag."""
+        value = _without_scale(flight, significant(self.velocity_scale))
+        if self.drag.value:
+            value[:, TILT] -= self.drag.value * _lean(flight, self.tilt_lasts_s.value)
+        return value
 
 
-def fit_lateness(logs: Sequence[FlightLog]) -> tuple[Lateness, list[Errors]]:
-    """Fit the delay and the scale of the velocity to the flights in `logs`.
+def fit_systematic(logs: Sequence[FlightLog]) -> tuple[Systematic, list[Errors]]:
+    """Fit the systematic part of the errors of the flights in `logs`.
 
     Returns:
-        The delay and the scale, and the errors of each flight at the fitted delay. A delay whose
+        The systematic part, and the errors of each flight at the fitted delay. A delay whose
         interval contains 0 counts as 0.
     """
-    lateness = _fitted([errors_of(log) for log in logs], 0.0)
-    for _ in range(ROUNDS - 1):
-        delay_s = lateness.delay_s.value
-        lateness = _fitted([errors_of(log, delay_s) for log in logs], delay_s)
-    return lateness, [errors_of(log, significant(lateness.delay_s)) for log in logs]
+    delay_s = scale = ZERO
+    for _ in range(ROUNDS):
+        late_s = delay_s.value
+        change_s, scale = _delay_and_scale([errors_of(log, late_s) for log in logs])
+        delay_s = Interval(*(late_s + end for end in change_s))
+    flights = [errors_of(log, significant(delay_s)) for log in logs]
+    return Systematic(delay_s, scale, *_neglected_drag(flights)), flights
 
 
-def _fitted(flights: Sequence[Errors], delay_s: float) -> Lateness:
-    """Return delay and scale, from errors that were computed with the delay `delay_s`."""
+def _delay_and_scale(flights: Sequence[Errors]) -> tuple[Interval, Interval]:
+    """Return the change of the delay [s], and the scale error of the velocity."""
 
-    def residuals(value: np.ndarray) -> list[Rows]:
-        """Return the errors that remain at a change of the delay, and at a scale if there is one.
+    def residuals(numbers: Mapping[str, float]) -> list[Rows]:
+        # To first order, a delay causes the error -delay * slope.
+        change_s, scale = numbers["delay"], numbers["scale"]
+        return [_rows(one, _without_scale(one, scale) + change_s * one.slope) for one in flights]
 
-        To first order, a delay causes the error -delay * slope.
-        """
-        change_s, scale = value[0], value[1] if len(value) > 1 else 0.0
-        return [rows_of(one, without_scale(one, scale) + change_s * one.slope) for one in flights]
-
-    noise = size_of([one.value for one in flights])
-    fitted, scale = fit(residuals, [DELAY], noise=noise), Interval(0.0, 0.0, 0.0)
+    noise = _size([one.value for one in flights])
+    fitted, scale = fit(residuals, [DELAY], noise=noise, fixed={"scale": 0.0}), ZERO
     if any(np.isfinite(one.value[:, VELOCITY]).any() for one in flights):
         both = fit(residuals, [DELAY, SCALE], noise=noise)
         scale = both.interval("scale")
         # A scale that is not significant would only widen the delay's interval.
         fitted = both if significant(scale) else fitted
-    change_s = fitted.interval("delay")
-    return Lateness(Interval(*(delay_s + end for end in change_s)), scale)
+    return fitted.interval("delay"), scale
 
 
-def size_of(values: Sequence[np.ndarray]) -> np.ndarray:
+def _neglected_drag(flights: Sequence[Errors]) -> tuple[Interval, Interval]:
+    """Return the drag [1/s] and the correlation time of its tilt [s]; zeros if not significant."""
+    if not any(np.isfinite(flight.value[:, TILT]).any() for flight in flights):
+        return ZERO, ZERO
+
+    def residuals(numbers: Mapping[str, float]) -> list[Rows]:
+        drag, lasts_s = numbers["drag"], float(np.exp(numbers["log_lasts"]))
+        return [_rows(one, one.value[:, TILT] - drag * _lean(one, lasts_s)) for one in flights]
+
+    noise = _size([one.value[:, TILT] for one in flights])
+    fitted = fit(residuals, [DRAG, LOG_LASTS], noise=noise)
+    drag, log_lasts = fitted.interval("drag"), fitted.interval("log_lasts")
+    if drag.value <= 0.0 or not significant(drag):
+        return ZERO, ZERO
+    return drag, Interval(*np.exp(np.clip(log_lasts, *LOG_LIMITS)).tolist())
+
+
+def _lean(flight: Errors, lasts_s: float) -> np.ndarray:
+    """Return the attitude error (T, 3) in body axes for a drag of 1/s, see `drag_tilt`.
+
+    `lasts_s` is the correlation time [s].
+    """
+    lean_w = follow_lag(np.nan_to_num(flight.lean_w), flight.step_s, lasts_s)
+    return to_local(flight.rot_w, lean_w[-len(flight.value) :])
+
+
+def _without_scale(flight: Errors, scale: float) -> np.ndarray:
+    """Return the errors (T, 9) without those by a relative `scale` error of the velocity."""
+    value = flight.value.copy()
+    value[:, VELOCITY] -= scale * flight.vel_b
+    return value
+
+
+def _size(values: Sequence[np.ndarray]) -> np.ndarray:
     """Return the RMS (C,) of errors (T, C) of each flight about the flight's mean.
 
     It serves as noise of a fit, which explains a small part of the errors.
@@ -209,22 +264,16 @@ def size_of(values: Sequence[np.ndarray]) -> np.ndarray:
     return np.maximum(np.sqrt(squares.mean(axis=0)).filled(1.0), 1e-150)
 
 
-def rows_of(flight: Errors, values: np.ndarray) -> Rows:
-    """Return remaining errors `values` (T, C) of a flight for a fit.
+def _rows(flight: Errors, values: np.ndarray) -> Rows:
+    """Return remaining errors `values` (T, C) of a flight for a fit; each has a free constant."""
+    return Rows(values, stretches(len(values), flight.step_s), np.ones(values.shape[1], bool))
 
-    Each channel has a free constant, and stretches of `STRETCH_S` are independent.
-    """
-    stretch = (np.arange(len(values)) * flight.step_s / STRETCH_S).astype(int)
-    return Rows(values, stretch, np.ones(values.shape[1], bool))
+
+def stretches(count: int, step_s: float) -> np.ndarray:
+    """Return the number (T,) of the stretch of `STRETCH_S` in which each of `count` rows is."""
+    return (np.arange(count) * step_s / STRETCH_S).astype(int)
 
 
 def significant(interval: Interval) -> float:
     """Return the value, or 0 if the interval contains 0."""
     return 0.0 if interval.low <= 0.0 <= interval.high else interval.value
-
-
-def without_scale(flight: Errors, scale: float) -> np.ndarray:
-    """Return the errors (T, 9) without those by a relative `scale` error of the velocity."""
-    value = flight.value.copy()
-    value[:, VELOCITY] -= scale * flight.vel_b
-    return value

@@ -25,35 +25,30 @@ from suite.diagnose.identify.numbers import Number, number_lines, numbers_json
 from suite.diagnose.sensors.clock import clock_of, on_gyro_clock
 from suite.diagnose.sensors.colour import SHORT_S, Coloured, Series, fit_colour
 from suite.diagnose.sensors.errors import (
+    ZERO,
     Errors,
-    Lateness,
+    Systematic,
     errors_of,
-    fit_lateness,
+    fit_systematic,
     significant,
-    without_scale,
 )
-from suite.diagnose.sensors.tilt import Tilt, fit_tilt
 
 SCHEMA = 1
 """Version of the JSON that `suite identify --sensors` prints."""
 WITHIN = 0.2
 """A model fits if its autocorrelation differs by at most this from the measured one, at every lag
 (time difference)."""
-ZERO = Interval(0.0, 0.0, 0.0)
-"""A parameter that is not in the model."""
 
 
 class Fitted(NamedTuple):
     """Model of an estimate's errors, fitted to flights."""
 
-    lateness: Lateness
-    """Delay of the estimate, and scale error of its velocity."""
+    systematic: Systematic
+    """Delay of the estimate, scale error of its velocity, and tilt by a neglected drag."""
     axes: Mapping[str, Coloured]
     """Noise parameters by axis (such as `position_x`), of each axis with enough data."""
     drift: Interval
     """Random walk of the position, averaged over its axes [m/sqrt(m)]."""
-    tilt: Tilt
-    """Attitude error of an estimator that neglects drag."""
 
 
 class HeldOut(NamedTuple):
@@ -80,15 +75,15 @@ def fit_sensors(logs: Sequence[FlightLog]) -> Fitted:
     Raises:
         FlightLogError: for a log without an estimate or without a reference.
     """
-    lateness, flights = fit_lateness(logs)
-    tilt, axes = fit_tilt(flights), {}
+    systematic, flights = fit_systematic(logs)
+    axes = {}
     for channel, axis in enumerate(AXES):
-        coloured = fit_colour(_series(flights, lateness, tilt, channel))
+        coloured = fit_colour(_series(flights, systematic, channel))
         if coloured is not None:
             axes[axis] = coloured
     drifts = [axes[axis].drift for axis in AXES[:3] if axis in axes]  # those of the position
     rms = (float(np.sqrt(np.mean(np.square(ends)))) for ends in zip(*drifts, strict=True))
-    return Fitted(lateness, axes, Interval(*rms) if drifts else ZERO, tilt)
+    return Fitted(systematic, axes, Interval(*rms) if drifts else ZERO)
 
 
 def held_out(logs: Sequence[FlightLog]) -> dict[str, HeldOut]:
@@ -100,10 +95,10 @@ def held_out(logs: Sequence[FlightLog]) -> dict[str, HeldOut]:
     worst: dict[str, HeldOut] = {}
     for half in (0, 1) if len(logs) > 1 else ():
         fitted = fit_sensors(logs[half::2])
-        late_s = significant(fitted.lateness.delay_s)
+        late_s = significant(fitted.systematic.delay_s)
         flights = [errors_of(log, late_s) for log in logs[1 - half :: 2]]
         for channel, axis in enumerate(AXES):
-            series = _series(flights, fitted.lateness, fitted.tilt, channel)
+            series = _series(flights, fitted.systematic, channel)
             if axis not in fitted.axes or not any(np.isfinite(s.value).any() for s in series):
                 continue
             compared = _compare(fitted.axes[axis], series)
@@ -138,25 +133,20 @@ def _autocorrelation(series: Sequence[Series], lag_s: np.ndarray) -> np.ndarray:
     return covariance / covariance[0]
 
 
-def _series(
-    flights: Sequence[Errors], lateness: Lateness, tilt: Tilt, channel: int
-) -> list[Series]:
-    """Return the errors of one channel in each flight, for the fit of their noise.
-
-    The parts that the scale of the velocity and a neglected drag cause are subtracted.
-    """
+def _series(flights: Sequence[Errors], systematic: Systematic, channel: int) -> list[Series]:
+    """Return the errors of one channel in each flight, for the fit of their noise."""
     series, can_drift = [], AXES[channel].startswith("position")
     for flight in flights:
-        values = without_scale(flight, significant(lateness.velocity_scale))
-        values = (values - tilt.errors(flight))[:, channel]
         speed = np.linalg.norm(flight.vel_b, axis=1)
+        values = systematic.removed(flight)[:, channel]
         series.append(Series(values, speed if can_drift else 0.0 * speed, flight.step_s))
     return series
 
 
 def parameters_of(fitted: Fitted) -> dict[str, tuple[Interval, str]]:
     """Return each parameter of the sensors file with its interval and its unit."""
-    parameters = {"delay.state": (fitted.lateness.delay_s, "s")}
+    delay_s, velocity_scale, drag, tilt_lasts_s = fitted.systematic
+    parameters = {"delay.state": (delay_s, "s")}
     for axis, coloured in fitted.axes.items():
         unit = GROUPS[axis.split("_")[0]][0]
         parameters |= {
@@ -167,11 +157,11 @@ def parameters_of(fitted: Fitted) -> dict[str, tuple[Interval, str]]:
         if coloured.fast.value:
             parameters[f"measured_state.{axis}_fast"] = (coloured.fast, "1")
             parameters[f"measured_state.{axis}_fast_lasts"] = (coloured.fast_s, "s")
-    parameters["measured_state.velocity_scale"] = (fitted.lateness.velocity_scale, "1")
+    parameters["measured_state.velocity_scale"] = (velocity_scale, "1")
     parameters["measured_state.position_drift"] = (fitted.drift, "m/sqrt(m)")
-    if fitted.tilt.drag.value:
-        parameters["drag_tilt.drag"] = (fitted.tilt.drag, "1/s")
-        parameters["drag_tilt.lasts"] = (fitted.tilt.lasts_s, "s")
+    if drag.value:
+        parameters["drag_tilt.drag"] = (drag, "1/s")
+        parameters["drag_tilt.lasts"] = (tilt_lasts_s, "s")
     return parameters
 
 
@@ -200,8 +190,14 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
         raise ValueError("no flight can be used:\n" + "\n".join(refused))
     warnings += [*kept_lines(used), *(f"not used: {text}" for text in refused)]
     console.say(f"{len(used)} flights with an estimate and a reference, {seconds:.0f} s in all")
-    # Fit, and check on held-out flights.
-    used, clocks_s = _on_gyro_clock(used)
+    # Move each reference to the gyro's clock, fit, and check on held-out flights.
+    clocks = [clock_of(log) for log in used]
+    clocks_s = {
+        log.name: [float(clock.shift_s.min()), float(clock.shift_s.max())]
+        for log, clock in zip(used, clocks, strict=True)
+        if clock.shift_s.any()
+    }
+    used = [on_gyro_clock(log, clock) for log, clock in zip(used, clocks, strict=True)]
     fitted, checked = fit_sensors(used), held_out(used)
     if not fitted.axes:
         raise ValueError(
@@ -219,7 +215,7 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
             "reference; the reference was moved to the gyro's times."
         )
         console.say(text)
-        header.insert(1, text)
+        header.append(text)
     numbers = [
         Number(key, unit, [interval.value], [(interval.low, interval.high)])
         for key, (interval, unit) in parameters.items()
@@ -238,22 +234,6 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
         "warnings": warnings,
         **stamp(SCHEMA, None),
     }
-
-
-def _on_gyro_clock(logs: Sequence[FlightLog]) -> tuple[list[FlightLog], dict[str, list[float]]]:
-    """Move the reference of each flight to the gyro's clock.
-
-    Returns:
-        The flights, and the least and largest shift [s] by the name of each flight that has one.
-    """
-    clocks = [clock_of(log) for log in logs]
-    moved = [on_gyro_clock(log, clock) for log, clock in zip(logs, clocks, strict=True)]
-    shifts_s = {
-        log.name: [float(clock.shift_s.min()), float(clock.shift_s.max())]
-        for log, clock in zip(logs, clocks, strict=True)
-        if clock.shift_s.any()
-    }
-    return moved, shifts_s
 
 
 def say_held_out(result: Mapping[str, Any], console: Console) -> None:

@@ -22,7 +22,6 @@ class Figure:
     value: float
     """The rate or time, in `unit`."""
     unit: str
-    """Unit of the value, such as "decisions/s"."""
     less_is_better: bool = False
     """Whether the figure is a time, not a rate."""
 
@@ -32,7 +31,6 @@ class Comparison:
     """The result of a benchmark."""
 
     name: str
-    """Name of the benchmark."""
     ours: Figure
     """Speed of the suite."""
     baseline: Figure
@@ -95,11 +93,11 @@ def compare_times(
     return Comparison(name, ours, baseline, details=dict(details))
 
 
-def load_warnings(interval_s: float = 1.0) -> tuple[str, ...]:
+def load_warnings() -> tuple[str, ...]:
     """Return a warning if other processes use the processor, measured while this one is idle."""
     import psutil
 
-    share = psutil.cpu_percent(interval_s) / 100
+    share = psutil.cpu_percent(interval=1.0) / 100
     if share <= BUSY_SHARE:
         return ()
     return (

@@ -18,27 +18,23 @@ from suite.diagnose.data.noise import noise_of
 from suite.diagnose.estimate.block import NormalEquations
 from suite.diagnose.estimate.gauss_newton import fit, intervals95
 from suite.diagnose.evidence.rollouts import RolloutModel, rollout_evidence, start_estimate
+from suite.experiments.bench import sysid_baseline
 from suite.experiments.bench.compare import Comparison, compare_times, in_turn
-from suite.experiments.bench.rigid_body import Task, make_task
 
 SEED = 20_001
 """Seed of the true parameters, the flights and their noise. No blind case and no tuning of the
 suite used it."""
-ROUNDS = 3
-"""Number of timed fits of each side."""
 
 
-def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Comparison:
+def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = 3) -> Comparison:
     """Time both fits in turn on five flights of `duration_s` [s], and compare their estimates.
 
     Raises:
         WorkFailed: if a package of `mujoco.sysid` is missing.
     """
-    from suite.experiments.bench import sysid_baseline
-
     if not sysid_baseline.is_installed():
         raise WorkFailed("mujoco.sysid lacks some of its packages: pip install 'mujoco[sysid]'")
-    task = make_task(seed, duration_s)
+    task = sysid_baseline.make_task(seed, duration_s)
     # Measured rotor speeds are the input of the simulation, as for the baseline.
     model = RolloutModel(
         task.nominal, task.space, rotor_input=True, voltage=False, integrator="euler"
@@ -64,7 +60,7 @@ def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Com
     return compare_times("diagnose", times_s, 60.0, "refits/min", details)
 
 
-def refit(model: RolloutModel, task: Task) -> tuple[np.ndarray, NormalEquations]:
+def refit(model: RolloutModel, task: sysid_baseline.Task) -> tuple[np.ndarray, NormalEquations]:
     """Fit the K parameters as the diagnosis does.
 
     It estimates the noise, linearises the simulation with respect to the parameters and the start
@@ -87,7 +83,7 @@ def refit(model: RolloutModel, task: Task) -> tuple[np.ndarray, NormalEquations]
 
 
 def _agreement(
-    task: Task, answers: Mapping[str, tuple[np.ndarray, NormalEquations]]
+    task: sysid_baseline.Task, answers: Mapping[str, tuple[np.ndarray, NormalEquations]]
 ) -> dict[str, Any]:
     """Return the parameters that each side fitted, and how far they are apart.
 

@@ -9,12 +9,9 @@ import numpy as np
 
 from suite.experiments.bench.compare import Comparison, compare_times, in_turn
 
-ENVS, DECISIONS = 64, 20
-"""Number of environments, and of decisions of each in a timed call."""
 
-
-def run(envs: int = ENVS, decisions: int = DECISIONS, repeats: int = 3) -> Comparison:
-    """Time `repeats` calls of both with the same random actions."""
+def run(envs: int = 64, decisions: int = 20, repeats: int = 3) -> Comparison:
+    """Time `repeats` calls of both, each of `decisions` with the same random actions."""
     from eval.envs.gymnasium_env import RaceEnv, RaceVectorEnv
 
     vector_env = RaceVectorEnv(envs, track="random")

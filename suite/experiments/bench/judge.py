@@ -1,10 +1,8 @@
 """The benchmark `judge`: trials per second of the judge, against depth images by `mj_multiRay`.
 
-The judge is the simulator that scores policies. The shipped policy flies the same trials on both
-sides, level 9 of every track family, in one process. The suite casts the rays of all images
-together (`tracks/geometry/tiles.py`). The baseline casts the rays of one camera after the other
-with MuJoCo's `mj_multiRay`, and flies 64 trials at once. Both are timed by the processor time of
-the process, which depends little on other work on the machine.
+The suite casts the rays of all images together (`tracks/geometry/tiles.py`). The baseline casts the
+rays of one camera after the other, and flies 64 trials at once. Both are timed by the processor
+time of the process, which depends little on other work on the machine.
 """
 
 from __future__ import annotations
@@ -26,8 +24,6 @@ from suite.experiments.bench.compare import Comparison, compare_times, in_turn
 from suite.judging.flying import default_policy
 from tracks.families import JUDGED
 
-TRIALS = 128
-"""Number of trials in a timed call."""
 BASELINE = "mujoco, its own rays"
 """Name of the baseline's simulator."""
 
@@ -52,7 +48,7 @@ class OwnRays(MujocoWorld):
         return np.array(images)
 
 
-def run(policy: str = "", trials: int = TRIALS, time_limit_s: float = 20.0) -> Comparison:
+def run(policy: str = "", trials: int = 128, time_limit_s: float = 20.0) -> Comparison:
     """Time both in turn, and count the trials (of at most `time_limit_s` [s]) that end alike."""
     if BASELINE not in WORLDS:
         WORLDS.register(BASELINE, OwnRays)
@@ -62,7 +58,6 @@ def run(policy: str = "", trials: int = TRIALS, time_limit_s: float = 20.0) -> C
     results: dict[str, list[TrialResult]] = {}
 
     def judge(simulator: str, slots: int) -> None:
-        """Fly all trials, `slots` at a time, and keep their results."""
         options = JudgeOptions(slots=slots, workers=1, rules=Rules(time_limit_s=time_limit_s))
         results[simulator] = fly(loaded, specs, vehicle, simulator, options)
 

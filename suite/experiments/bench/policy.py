@@ -22,11 +22,9 @@ in fast memory (two loads, the product, a share of the loop). Assumed, not measu
 A76_HZ, A76_CYCLES = 2.4e9, {"C float32": 0.5, "C int8": 0.5}
 """Processor Cortex-A76: clock [Hz], and clock cycles of a multiply-add, at a quarter of the peak
 speed of two units of four lanes. Assumed, not measured."""
-ROUNDS = 20
-"""Number of timed blocks of each engine."""
 
 
-def run(policy: str = "", rounds: int = ROUNDS) -> Comparison:
+def run(policy: str = "", rounds: int = 20) -> Comparison:
     """Time blocks of 100 steps of every engine (C export, ONNX Runtime, torch) in turn.
 
     Raises:

@@ -12,11 +12,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from eval.effects.interface import GRAVITY
 from policies.formats.torch_twin import torch_twin
 from suite.experiments.bench import torch_scene
-from suite.experiments.bench.torch_scene import Tensor, to_local, to_world
+from suite.experiments.bench.torch_scene import to_local, to_world
 from suite.train.config import TrainConfig
 from suite.train.dynamics.point_mass import HEADING_RATE, PointMassParams, PointMassState
 from suite.train.losses import BARRIER_HEIGHT, BARRIER_SLOPE, FIELD_DECAY, MAX_PULL, UNIT_FIELD

@@ -11,11 +11,10 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from tracks.geometry.scene import Gates, Scene
 
-Tensor = torch.Tensor
-"""Short name of the type."""
 FAR, TINY = 1e9, 1e-12
 """Depth of a ray that hits nothing [m], and the lower limit of divisors."""
 

@@ -1,9 +1,8 @@
 """The benchmark `train`: trained decisions per second against a plain torch-eager loop.
 
-Both sides make whole gradient steps (rollout, gradient, AdamW) on the same worlds of 64 solids with
-the recipe `paper`: batch 64, 150 steps, 24x32 images, two threads. A world is one simulated scene
-and drone, which is a point mass in this recipe. A gradient step with a quadrotor instead,
-randomised as in the recipe `race`, is timed too; its time is reported as a multiple.
+Both sides make whole gradient steps (rollout, gradient, AdamW) on the same worlds with the recipe
+`paper`, whose drones are point masses. A gradient step with a quadrotor instead, randomised as in
+the recipe `race`, is timed too.
 """
 
 from __future__ import annotations
@@ -30,10 +29,6 @@ BATCH, STEPS, THREADS = 64, 150, 2
 UNTRUSTED_BELOW = 2000.0
 """Decisions per second that the baseline reaches at least on two cores without other load; fewer
 mean that the machine is too busy for a comparison [1/s]."""
-ROUNDS = 4
-"""Number of timed rounds."""
-OURS, BASELINE, QUADROTOR = "ours", "baseline", "quadrotor"
-"""Names of the timed programs."""
 ENOUGH_S = 100.0
 """No further round begins after this time. Two cores without other load finish all rounds earlier
 [s]."""
@@ -95,7 +90,6 @@ def _ours(config: TrainConfig, worlds: Worlds) -> Callable[[], Any]:
     update, state = make_update(config), jax.device_put(start_state(config), jax.devices()[0])
 
     def call() -> Any:
-        """Make one gradient step and wait for its results."""
         nonlocal state
         state, numbers = update(state, worlds)
         return jax.block_until_ready((state, numbers))
@@ -113,7 +107,7 @@ def _baseline(config: TrainConfig, worlds: Worlds) -> Callable[[], Any]:
     return lambda: baseline.update(tensors)
 
 
-def run(batch: int = BATCH, steps: int = STEPS, rounds: int = ROUNDS) -> Comparison:
+def run(batch: int = BATCH, steps: int = STEPS, rounds: int = 4) -> Comparison:
     """Time both sides in turn and return the best of all rounds for each."""
     with _two_cores():
         return _compare(batch, steps, rounds)
@@ -143,13 +137,13 @@ def _compare(batch: int, steps: int, rounds: int) -> Comparison:
     quadrotor = replace(point, quadrotor=named_recipe("race").quadrotor)
     worlds = bench_worlds(point)
     sides = {
-        OURS: _ours(point, worlds),
-        BASELINE: _baseline(point, worlds),
-        QUADROTOR: _ours(quadrotor, bench_worlds(quadrotor)),
+        "ours": _ours(point, worlds),
+        "baseline": _baseline(point, worlds),
+        "quadrotor": _ours(quadrotor, bench_worlds(quadrotor)),
     }
     times_s = in_turn(sides, rounds, most_s=ENOUGH_S)
     rates = {key: batch * steps / min(seconds) for key, seconds in times_s.items()}
-    ours, baseline = rates[OURS], rates[BASELINE]
+    ours, baseline = rates["ours"], rates["baseline"]
     warnings = ()
     if baseline < UNTRUSTED_BELOW:
         warnings = (
@@ -161,10 +155,10 @@ def _compare(batch: int, steps: int, rounds: int) -> Comparison:
         "solids": sum(SOLIDS),
         "batch": batch,
         "steps": steps,
-        QUADROTOR: {
-            "ours": round(rates[QUADROTOR]),
+        "quadrotor": {
+            "ours": round(rates["quadrotor"]),
             "unit": unit,
-            "time_over_point_mass": round(ours / rates[QUADROTOR], 2),
+            "time_over_point_mass": round(ours / rates["quadrotor"], 2),
         },
         "rounds_s": times_s,
     }

@@ -15,9 +15,8 @@ from eval.judging.tables import Tally
 from suite.common.charts import LINES, dots, legend, plain_axes, png, titled
 from suite.common.curve import METRICS
 from suite.experiments.pages.paper import Ablated, sim_to_sim
-from suite.experiments.study.conditions import Sweep
-from suite.experiments.study.disturbed import ConditionResult
-from suite.experiments.study.summary import Spread, Summary
+from suite.experiments.study.conditions import ConditionResult, Sweep
+from suite.experiments.study.training import Spread, Summary
 from tracks.families import JUDGED
 
 

@@ -66,7 +66,10 @@ def write_document(
     """
     header, page = stamp(SCHEMA, config.seed), workspace.out / f"{name}.md"
     facts = {**contents.facts, **_provenance(header)}
-    old_page = page.read_text(encoding="utf-8") if page.is_file() else _new_page(name)
+    # A new page has a title, a summary and an empty generated part.
+    summary = EXPERIMENTS.get(name, name)
+    new_page = f"# {name}\n\n{summary[0].upper()}{summary[1:]}.\n\n{BEGIN}\n{END}\n"
+    old_page = page.read_text(encoding="utf-8") if page.is_file() else new_page
     before, after = _split_page(old_page, page)
     header["code_sha256"] = page_code(name)
     answer = {**header, "made_by": facts, "config": config, **contents.numbers}
@@ -90,18 +93,8 @@ def write_document(
     return {**plain(answer), "out": str(page)}
 
 
-def _new_page(name: str) -> str:
-    """Return the text of a page that does not exist yet: title, summary, empty generated part."""
-    summary = EXPERIMENTS.get(name, name)
-    return f"# {name}\n\n{summary[0].upper()}{summary[1:]}.\n\n{BEGIN}\n{END}\n"
-
-
 def _split_page(text: str, path: Path) -> tuple[str, str]:
-    """Return the hand-written text before and after the generated part of a page.
-
-    Raises:
-        ValueError: if one of the two comments is missing.
-    """
+    """Return the hand-written text before and after the generated part of a page."""
     before, begin, remainder = text.partition(BEGIN)
     _, end, after = remainder.partition(END)
     if not begin or not end:

@@ -27,13 +27,10 @@ class Printed(NamedTuple):
     method: str
     """Key of the method in paper.toml."""
     track: str
-    """Track family of the cell."""
     level: int
-    """Level of the cell."""
     won: int
     """Number of successful trials."""
     trials: int
-    """Number of trials."""
     v_max: float
     """Largest speed [m/s]; the paper does not say whether of one trial or of all."""
 
@@ -44,7 +41,6 @@ class SimToSim(NamedTuple):
     source: str
     """Citation of the table."""
     levels: tuple[int, ...]
-    """Levels of the rows."""
     methods: dict[str, str]
     """Key of each method -> its printed name, in the order of the table."""
     cells: tuple[Printed, ...]
@@ -67,7 +63,6 @@ class Ablated(NamedTuple):
 
 
 def _read_table(name: str) -> dict[str, Any]:
-    """Return one of the tables of paper.toml."""
     path = Path(__file__).with_name("paper.toml")
     return tomllib.loads(path.read_text(encoding="utf-8"))[name]
 
@@ -102,9 +97,7 @@ class Goal(NamedTuple):
     """The three goals of one cell, and the distances to them, which are 0 if a goal is met."""
 
     track: str
-    """Track family of the cell."""
     level: int
-    """Level of the cell."""
     success: float
     """First goal: the best printed success rate. If that is 1, the interval of our success rate
     must begin at `SURE` or above instead."""

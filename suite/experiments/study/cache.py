@@ -79,19 +79,13 @@ def _tree_text(node: Any) -> str:
 
     `ast.dump` also prints fields without a value, whose number grows from version to version.
     """
-    if isinstance(node, list):
-        return f"[{','.join(_tree_text(item) for item in node if not _is_docstring(item))}]"
+    match node:
+        case list():
+            return f"[{','.join(filter(None, map(_tree_text, node)))}]"
+        case ast.Expr(ast.Constant(str())):  # a docstring
+            return ""
     if not isinstance(node, ast.AST):
         return repr(node)
     fields = [(name, getattr(node, name, None)) for name in node._fields]
     words = [f"{name}={_tree_text(value)}" for name, value in fields if value not in (None, [])]
     return f"{type(node).__name__}({','.join(words)})"
-
-
-def _is_docstring(node: Any) -> bool:
-    """Return whether a statement is a bare string."""
-    return (
-        isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
-    )

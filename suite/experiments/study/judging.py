@@ -1,16 +1,15 @@
 """Judge trials with a permanent cache of results: each flight is flown only once.
 
-A trial is one flight: a track, a level of difficulty and a seed. The results of a setup (policy,
-vehicle, sensors, simulator) are in one file of the cache, its journal. The name of a journal is the
-SHA-256 of everything else that determines an outcome: the setup, the code of the judge and the
-versions of the packages. A result is written as soon as its trial ends. All pages share the
-journals.
+The results of a setup (policy, vehicle, sensors, simulator) are in one file of the cache, its
+journal. Its name is the SHA-256 of everything else that determines an outcome: the setup, the code
+of the judge and the versions of the packages. A result is written as soon as its trial ends. All
+pages share the journals.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -37,7 +36,7 @@ from suite.judging.flying import (
     relative_cost,
 )
 from suite.judging.trials import parse_levels, trial_list
-from tracks.common.work import Workers, run_pieces, usable_cores, worker_count
+from tracks.common.work import run_pieces, usable_cores, worker_count
 from tracks.families import JUDGED
 
 Key = TypeVar("Key", bound=Hashable)
@@ -74,7 +73,18 @@ def fly_trials(
     # 1. Find the journal of each request. Requests with the same setup share one.
     policies = {request.policy for request in requests.values()}
     digests = {policy: policy_digest(policy) for policy in policies}
-    inputs = {key: _inputs(request, digests) for key, request in requests.items()}
+    # Everything except the trial that determines the outcome of a flight.
+    inputs = {
+        key: {
+            "policy_sha256": digests[request.policy],
+            "vehicle": request.vehicle,
+            "sensors": request.sensors,
+            "world": request.simulator,
+            "code": code_digest(*FLIES),
+            "engines": engines(),
+        }
+        for key, request in requests.items()
+    }
     names = {key: digest(entry) for key, entry in inputs.items()}
     setups = {names[key]: request for key, request in requests.items()}
     # Trials of each journal: dictionaries as sets that keep their order.
@@ -111,7 +121,10 @@ def fly_trials(
                     all_journals[journal_number].close()
                     update(next(trial_numbers))
 
-                loaders = _loaders(policies, workers)
+                # Other machines lack the files of the policies, so they get the content.
+                local = isinstance(workers, int)
+                loaders = {p: partial(load_policy, p) if local else PolicyContent.of(p)
+                           for p in policies}  # fmt: skip
                 pieces = _pieces(missing, worker_count(workers))
                 run_pieces(partial(_fly_piece, loaders), pieces, workers, keep)
     # 3. Collect the results of each request.
@@ -158,35 +171,8 @@ def judged_trials(config: Any, levels: Sequence[int] | None = None) -> list[Tria
     return trial_list(JUDGED, levels, config.trials, config.seed)
 
 
-def _inputs(setup: TrialRequest, digests: Mapping[str, str]) -> dict[str, Any]:
-    """Return everything except the trial that determines the outcome of a flight."""
-    return {
-        "policy_sha256": digests[setup.policy],
-        "vehicle": setup.vehicle,
-        "sensors": setup.sensors,
-        "world": setup.simulator,
-        "code": code_digest(*FLIES),
-        "engines": engines(),
-    }
-
-
-Loaders = dict[str, Callable[[], Policy]]
-"""Policy -> function that loads it, called in the process that flies it."""
-
-
 Share = tuple[int, TrialRequest]
 """Number of a setup in the order of all setups, and trials of it in a piece of work."""
-
-
-def _loaders(policies: Iterable[str], workers: Workers) -> Loaders:
-    """Return functions that load policies.
-
-    Processes of this machine load them by name. Other machines lack the files, so they get the
-    content.
-    """
-    if isinstance(workers, int):
-        return {name: partial(load_policy, name) for name in policies}
-    return {name: PolicyContent.of(name) for name in policies}
 
 
 def _pieces(requests: Sequence[TrialRequest], processes: int) -> list[list[Share]]:
@@ -209,11 +195,10 @@ def _pieces(requests: Sequence[TrialRequest], processes: int) -> list[list[Share
     return pieces
 
 
-def _fly_piece(loaders: Loaders, piece: Sequence[Share]) -> Iterator[tuple[int, TrialResult]]:
-    """Fly a piece and yield (number of the setup, result) of each trial.
-
-    Each policy is loaded once.
-    """
+def _fly_piece(
+    loaders: Mapping[str, Callable[[], Policy]], piece: Sequence[Share]
+) -> Iterator[tuple[int, TrialResult]]:
+    """Fly a piece and yield (number of the setup, result) of each trial; load each policy once."""
     loaded: dict[str, Policy] = {}
     for number, request in piece:
         if request.policy not in loaded:

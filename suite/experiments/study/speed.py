@@ -5,27 +5,17 @@ from __future__ import annotations
 import math
 import resource
 import sys
-import time
 from collections.abc import Callable
 from typing import Any
 
 import jax
 
-REPEATS = 4
-"""Timed calls of a program; the fastest counts."""
+from suite.experiments.bench.compare import in_turn
 
 
-def best_time(call: Callable[[], Any], repeats: int = REPEATS) -> float:
-    """Return the shortest time of several calls of a compiled program [s].
-
-    The time of a call ends when its results are computed.
-    """
-    times_s = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        jax.block_until_ready(call())
-        times_s.append(time.perf_counter() - started)
-    return min(times_s)
+def best_time(call: Callable[[], Any]) -> float:
+    """Return the shortest of four times of a program, from its call to its results [s]."""
+    return min(in_turn({"": lambda: jax.block_until_ready(call())}, rounds=4)[""])
 
 
 def count_operations(function: Callable[..., Any], *args: Any) -> float:
@@ -78,7 +68,6 @@ def multiplying_rate(size: int) -> float:
     matrix = jax.random.normal(jax.random.key(0), (size, size))
     with jax.default_matmul_precision("highest"):
         product = jax.jit(lambda a: a @ a)
-        jax.block_until_ready(product(matrix))
         return 2.0 * size**3 / best_time(lambda: product(matrix))
 
 

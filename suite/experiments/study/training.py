@@ -1,7 +1,7 @@
-"""Train several settings from several seeds, and measure the policies; finished ones are reused.
+"""Train several settings from several seeds, measure the policies, and summarise over the seeds.
 
-The folder of a training is named by the hash of its configuration. A change of the code does not
-change this hash, so it does not repeat a training. Therefore pages name the commit of each one.
+Finished trainings are reused. Their folder is named by the hash of the configuration, which a
+change of the code does not change. Therefore pages name the commit of each training.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -33,7 +33,6 @@ class Setting(NamedTuple):
     """One of the compared configurations, which is trained from every seed."""
 
     key: str
-    """Name of the setting."""
     label: str
     """Label of the setting in tables."""
     recipe: Any
@@ -48,7 +47,6 @@ class UnseenWorlds(NamedTuple):
     trials: int
     """Number of worlds."""
     seed: int
-    """Seed of the worlds."""
     seconds: float
     """Length of a trial, from a standing start [s]."""
 
@@ -59,9 +57,6 @@ class TrainingResult(NamedTuple):
     setting: str
     """Key of the setting."""
     seed: int
-    """Seed of the training."""
-    policy: str
-    """Folder of the checkpoint. A diverged training has the last checkpoint with finite weights."""
     seconds: float
     """Time of the gradient steps that do not compile [s]."""
     compile_s: float
@@ -76,37 +71,27 @@ class TrainingResult(NamedTuple):
     until then, without measurements and compilation [s]."""
 
 
-@dataclass(frozen=True)
-class Study:
-    """What is trained and measured: every setting from every training seed."""
-
-    settings: Sequence[Setting]
-    """The compared settings."""
-    seeds: Sequence[int]
-    """Seeds of the trainings of each setting."""
-    unseen: UnseenWorlds
-    """How the policies are measured, in the dynamics of the training."""
-    by_seed: bool = False
-    """Whether all settings are trained from the first seed, then from the second, and so on. Times
-    can then be compared, because a changing load of the machine affects all settings alike."""
-
-    def pieces(self) -> list[tuple[str, Any]]:
-        """Return (key of the setting, configuration) of every training, in the order of work."""
-        if self.by_seed:
-            return [(r.key, replace(r.recipe, seed=s)) for s in self.seeds for r in self.settings]
-        return [(r.key, replace(r.recipe, seed=s)) for r in self.settings for s in self.seeds]
-
-
-def train_all(study: Study, workspace: Workspace, console: Console) -> list[TrainingResult]:
-    """Return every training of `study`; missing ones are trained or resumed first.
+def train_all(
+    settings: Sequence[Setting],
+    seeds: Sequence[int],
+    unseen: UnseenWorlds,
+    workspace: Workspace,
+    console: Console,
+    by_seed: bool = False,
+) -> list[TrainingResult]:
+    """Return the trainings of all settings from all seeds; missing ones are made or resumed first.
 
     If a training diverges, the others continue. With at most one worker the trainings run one after
-    the other on all cores.
+    the other on all cores. With `by_seed`, all settings are trained from the first seed, then from
+    the second, and so on. Times can then be compared, because a changing load of the machine
+    affects all settings alike.
     """
     from suite.train.ppo.update import estimate as ppo_estimate
     from suite.train.run import estimate
 
-    pieces = study.pieces()
+    pieces = [(each.key, replace(each.recipe, seed=seed)) for each in settings for seed in seeds]
+    if by_seed:
+        pieces = [piece for first in range(len(seeds)) for piece in pieces[first :: len(seeds)]]
     if not pieces:
         return []
     estimates = [ppo_estimate(c) if isinstance(c, PpoConfig) else estimate(c) for _, c in pieces]
@@ -115,25 +100,23 @@ def train_all(study: Study, workspace: Workspace, console: Console) -> list[Trai
     memory *= workspace.workers if isinstance(workspace.workers, int) else 1
     total = Estimate(sum(each.seconds for each in estimates), memory)
     announce(console, f"{len(pieces)} trainings, of which finished ones are reused", total)
-    jobs = [Job(piece, workspace.cache / _training_folder(piece, study.unseen)) for piece in pieces]
-    do = functools.partial(train_setting, unseen=study.unseen)
+    # Measurements during a training are in its folder, so they are a part of the folder's name.
+    folders = [
+        Path("schemes", digest([key, config, unseen]))
+        if unseen.measurements
+        else Path("trainings", digest(config))
+        for key, config in pieces
+    ]
+    jobs = [Job(each, workspace.cache / name) for each, name in zip(pieces, folders, strict=True)]
+    do = functools.partial(train_setting, unseen=unseen)
     results = do_jobs(do, jobs, workspace.workers, console, "training")
     return [_finished_training(job, *result) for job, result in zip(jobs, results, strict=True)]
-
-
-def _training_folder(piece: tuple[str, Any], unseen: UnseenWorlds) -> Path:
-    """Return the folder of a training within the cache."""
-    key, config = piece
-    # Measurements during a training are in its folder, so they are a part of the folder's name.
-    if unseen.measurements:
-        return Path("schemes", digest([key, config, unseen]))
-    return Path("trainings", digest(config))
 
 
 def train_setting(
     job: Job, console: Console, unseen: UnseenWorlds
 ) -> tuple[str, list[dict[str, float]]]:
-    """Train one of `Study.pieces` in the job's folder unless it is finished, and measure it.
+    """Train a job (key of a setting, configuration) in its folder, and measure the policy.
 
     Returns:
         The error message if it diverged, else ""; and the measurement of the finished policy, as a
@@ -180,7 +163,6 @@ def _finished_training(job: Job, diverged: str, at_end: list[dict[str, float]]) 
     return TrainingResult(
         setting=key,
         seed=config.seed,
-        policy=str(policy),
         seconds=sum(row["seconds"] for row in rows if not row["cold"]),
         compile_s=compile_s,
         commit=training_commit(policy),
@@ -235,3 +217,62 @@ def facts(config: Any, runs: Sequence[TrainingResult]) -> dict[str, str]:
         "trained at commit": ", ".join(sorted({run.commit for run in runs})),
         "unseen worlds": f"{config.trials}, seed {config.seed}, {config.seconds:g} s each",
     }
+
+
+class Spread(NamedTuple):
+    """The values of one measure, such as `v_max`, over the training seeds."""
+
+    mean: float
+    least: float
+    most: float
+
+
+class Summary(NamedTuple):
+    """One setting over its training seeds; diverged trainings are left out of all numbers."""
+
+    key: str
+    label: str
+    recipe: Any
+    """The trained configuration, a `TrainConfig` or a `PpoConfig`."""
+    seeds: int
+    """Number of trainings, including diverged ones."""
+    trainings: list[list[dict[str, float]]]
+    """Measurements of every training that did not diverge, in the order of time; a measurement
+    is a dictionary of measures."""
+    at: list[dict[str, Spread]]
+    """The spread of every measure over the seeds, at each measurement; empty if all diverged."""
+
+    @property
+    def diverged(self) -> int:
+        """Number of trainings that diverged."""
+        return self.seeds - len(self.trainings)
+
+    def values(self, name: str) -> list[float]:
+        """Return a measure at the end of each training, without diverged ones."""
+        return [points[-1][name] for points in self.trainings]
+
+    def text(self, name: str) -> str:
+        """Return a measure at the end as text for a table: mean over seeds [least, most]."""
+        if not self.at:
+            return "diverged"
+        _, scale, digits = curve.METRICS[name]
+        mean, least, most = (f"{scale * value:.{digits}f}" for value in self.at[-1][name])
+        return f"{mean} [{least}, {most}]"
+
+
+def summaries(settings: Sequence[Setting], runs: Sequence[TrainingResult]) -> list[Summary]:
+    """Return the summary of every setting, in order."""
+    result = []
+    for key, label, recipe in settings:
+        setting_runs = [run for run in runs if run.setting == key]
+        trainings = [run.points for run in setting_runs if not run.diverged]
+        at = [
+            {name: _spread([point[name] for point in seeds]) for name in seeds[0]}
+            for seeds in zip(*trainings, strict=True)
+        ]
+        result.append(Summary(key, label, recipe, len(setting_runs), trainings, at))
+    return result
+
+
+def _spread(values: Sequence[float]) -> Spread:
+    return Spread(float(np.mean(values)), min(values), max(values))

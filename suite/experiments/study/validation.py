@@ -1,8 +1,7 @@
 """Measure the success of a policy in the dynamics of the training, on worlds that no training uses.
 
-A world is one simulated scene and drone. The code of the training (`suite/train/rollout.py`)
-computes the flight, the collisions and the passed gates. A collision is a distance to an obstacle
-below `BODY_RADIUS_M`, at one of `PATH_SAMPLES` points on the path of a step.
+A collision is a distance to an obstacle below `BODY_RADIUS_M`, at one of `PATH_SAMPLES` points on
+the path of a step.
 """
 
 from __future__ import annotations
@@ -104,7 +103,6 @@ def make_flight(
 
     @jax.jit
     def fly(params: network.Params, worlds: Worlds) -> Scores:
-        """Fly the policy with `params` in all worlds, and return the scores of the trials."""
         embedding_shift = jnp.zeros((episode.steps, episode.batch, config.spec.hidden_size))
         key = jax.random.key(np.uint32(config.seed))
         _, records = rollout(params, embedding_shift, worlds, key, network.encode)

@@ -13,12 +13,10 @@ from eval.flights.simulate import SENSORS, fly, log_of
 from eval.flights.trajectory import Trajectory
 from eval.logs.flight_log import read_flight
 from suite.blind import build as module
-from suite.blind import make, simulators
+from suite.blind import make, oracle
 from suite.blind.build import build
 from suite.blind.cases import DRAWERS, MULTIPLES, SETS, Case, draw_cases, draw_continuous_cases
 from suite.blind.continuous.timing import draw_conditions
-from suite.blind.oracle import information as oracle
-from suite.blind.oracle import strength
 from suite.blind.outside import KINDS as OUTSIDE
 from suite.blind.outside import changed_values, draw_change
 from tests.support.blind import SINGLE
@@ -134,9 +132,9 @@ def test_every_effect_has_columns_but_what_cannot_be_told():
     ],
 )
 def test_the_committed_table_is_what_is_worked_out(vehicle, sensors, names):
-    stored = json.loads(strength.TABLE.read_text())["vehicles"][vehicle][sensors]
+    stored = json.loads(oracle.TABLE.read_text())["vehicles"][vehicle][sensors]
     assert list(stored) and set(stored) == set(nameable_effects())
-    for name, entry in strength.strengths(vehicle, sensors, names).items():
+    for name, entry in oracle.strengths(vehicle, sensors, names).items():
         assert entry["columns"] == stored[name]["columns"]
         if "matrix" in entry:
             np.testing.assert_allclose(entry["matrix"], stored[name]["matrix"], rtol=1e-6)
@@ -156,12 +154,12 @@ def test_a_wind_beyond_its_bound_is_never_detectable(monkeypatch, size, strong):
 
 
 def test_an_effect_that_is_not_in_the_table_is_worked_out(monkeypatch):
-    monkeypatch.setattr(strength, "_entry", strength._entry.__wrapped__)
+    monkeypatch.setattr(oracle, "_entry", oracle._entry.__wrapped__)
     entry = {"columns": [["turn", 0], ["late", 0]], "matrix": [[25.0, 0.0], [0.0, 100.0]]}
-    monkeypatch.setattr(strength, "strengths", lambda vehicle, sensors, names: {names[0]: entry})
-    along = [strength.detectable_along("bare", "full", "imu_fault", axis) for axis in np.eye(2)]
+    monkeypatch.setattr(oracle, "strengths", lambda vehicle, sensors, names: {names[0]: entry})
+    along = [oracle.detectable_along("bare", "full", "imu_fault", axis) for axis in np.eye(2)]
     assert along == pytest.approx([1.0, 0.5])
-    (_, late) = strength.columns_in_table("bare", "full", "imu_fault")
+    (_, late) = oracle.columns_in_table("bare", "full", "imu_fault")
     assert late == oracle.Column("imu_fault", "late", 0)
 
 
@@ -210,15 +208,15 @@ def test_physics_outside_the_catalogue_moves_the_vehicle_and_a_load_weighs_what_
 def test_a_strength_is_the_multiple_of_the_table_or_cut_at_a_bound():
     for name in nameable_effects():
         in_wind = name in ("constant_wind", "gusts")
-        vehicle = strength.nominal_vehicle("dragged" if in_wind else "bare")
+        vehicle = oracle.nominal_vehicle("dragged" if in_wind else "bare")
         rng = np.random.default_rng(3)
         change, multiple = draw_change(rng, vehicle, "full", name, 2.0)
         values = changed_values(vehicle, "full", name, change, rng)
         assert multiple <= 2.0 and np.abs(change).max() > 0.0, name
         direction = change / np.linalg.norm(change)
-        unit = strength.detectable_along(vehicle.name, "full", name, direction)
+        unit = oracle.detectable_along(vehicle.name, "full", name, direction)
         assert np.linalg.norm(change) / unit == pytest.approx(multiple, rel=1e-6), name
-        assert len(strength.columns_in_table(vehicle.name, "full", name)) == len(change)
+        assert len(oracle.columns_in_table(vehicle.name, "full", name)) == len(change)
         assert isinstance(values, EFFECTS[name].values)
 
 
@@ -243,8 +241,8 @@ def test_a_continuous_cases_vehicle_has_the_loop_that_its_seed_draws(monkeypatch
     assert nominal == first.nominal and list(named) == ["linear_drag"]
     jumps = [np.diff(log.vel_w, 2, axis=0).std() for log in (exact, first.logs[0])]
     assert jumps[0] < 0.1 * jumps[1]
-    simulator = simulators.simulator_for(CONTINUOUS, np.random.default_rng(3))
+    simulator = module.simulator_for(CONTINUOUS, np.random.default_rng(3))
     drawn = draw_conditions(np.random.default_rng(3))
     assert simulator.conditions["row_hz"] == drawn.row_hz
     assert simulator.nominal.controller.frequency == drawn.loop_hz
-    assert not simulators.simulator_for(SINGLE, np.random.default_rng()).conditions
+    assert not module.simulator_for(SINGLE, np.random.default_rng()).conditions

@@ -99,9 +99,9 @@ def test_a_flight_is_not_checked_after_its_end():
 
 
 def test_an_effect_that_rotorpy_does_not_have_as_it_is_is_refused():
-    rotorpy_flight.check_effects(with_effects(rotor_drag=(1e-5,)))
+    truth = with_effects(linear_drag=((0.1, 0.1, 0.1),), rotor_drag=(1e-5,))
     with pytest.raises(ValueError, match="effects.linear_drag: RotorPy does not have it; allowed:"):
-        rotorpy_flight.check_effects(with_effects(linear_drag=((0.1, 0.1, 0.1),)))
+        rotorpy_flight.fly_rotorpy(LAGGED, truth, SHORT, 100.0)
 
 
 def test_flights_side_by_side_are_each_as_if_alone_and_move_as_their_accelerometers_say():

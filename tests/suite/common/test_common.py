@@ -21,13 +21,13 @@ from matplotlib.figure import Figure
 
 from suite.common import curve
 from suite.common.charts import DPI, png
-from suite.common.console import Console, duration, size
+from suite.common.console import Console, Silent, duration, size
 from suite.common.errors import FAILED, UNUSABLE, WorkFailed, explain
 from suite.common.provenance import refuse_other_run, run_record, write_run_record
-from suite.common.report import Details, Links, Picture, Report, Section, write_report
+from suite.common.report import Details, Links, Picture, Report, Section, html
 from suite.common.running.remote import Job
 from suite.common.stages import MARK, Estimate, Stage, announce, claim, run_stages
-from suite.common.work import Forwarding, do_jobs, read_workers_option
+from suite.common.work import do_jobs, read_workers_option
 from suite.experiments.study.training import training_commit
 from suite.judging.requests import Collection, Evaluation
 from suite.judging.trials import parse_levels, parse_tracks
@@ -44,13 +44,13 @@ GRID = Grid(
 )
 
 
-def test_a_page_holds_everything_and_escapes_what_is_text(tmp_path):
+def test_a_page_holds_everything_and_escapes_what_is_text():
     parts = [
         "x < y", GRID, Picture(b"a png", "a picture"), Links([("a.md", "more")]),
         Details("log", "1 & 2"),
     ]  # fmt: skip
     report = Report("A & B", "It flew.", {"seed": "3"}, [Section("Part", parts)])
-    page = write_report(tmp_path / "report.html", report).read_text()
+    page = html(report)
     assert "<title>A &amp; B</title>" in page and "<p>x &lt; y</p>" in page
     assert "<dt>seed</dt><dd>3</dd>" in page and "<h2>Part</h2>" in page
     assert '<td class="good">3.1</td>' in page and '<tr class="sum"><td>&lt;all&gt;</td>' in page
@@ -264,9 +264,10 @@ def test_a_folder_of_another_kind_of_run_is_refused(tmp_path):
     refuse_other_run(tmp_path, Collection())  # none of ours
 
 
-def test_progress_without_a_terminal_is_a_plain_line_now_and_then(capsys):
+def test_progress_without_a_terminal_is_a_plain_line_now_and_then(capsys, monkeypatch):
     now = [0.0]
-    with Console().progress("flying", 100, clock=lambda: now[0]) as update:
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    with Console().progress("flying", 100) as update:
         for done in range(101):
             now[0] = done * 0.5
             update(done, "3.1 m/s")
@@ -275,7 +276,7 @@ def test_progress_without_a_terminal_is_a_plain_line_now_and_then(capsys):
     assert lines[0] == "flying: 20 of 100, 40 s left, 3.1 m/s"
     # Only what was done since it began counts.
     now[0] = 0.0
-    with Console().progress("training", 100, clock=lambda: now[0], begun=80) as update:
+    with Console().progress("training", 100, begun=80) as update:
         now[0] = 12.0
         update(90)
     assert capsys.readouterr().err == "training: 90 of 100, 12 s left\n"
@@ -295,12 +296,12 @@ class Recorded(Console):
         self.shown = []
 
     @contextmanager
-    def progress(self, label, total, clock=None, begun=0.0):
+    def progress(self, label, total, begun=0.0):
         yield lambda done, note="": self.shown.append((done, total))
 
 
 def double(job, console):
-    assert type(console) is Forwarding
+    assert type(console) is Silent
     with console.progress("halves", 10) as update:
         update(5)
         # A process returns messages five times a second.

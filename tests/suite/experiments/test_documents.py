@@ -17,10 +17,10 @@ from suite.experiments.pages.paper import ablation as printed
 from suite.experiments.schemes import Config as SchemesConfig
 from suite.experiments.schemes import document, first_times, schemes
 from suite.experiments.simulators import REASONS, Config, changed_trials, conditions
-from suite.experiments.study import disturbed, judging
+from suite.experiments.study import judging
 from suite.experiments.study.cache import Workspace
-from suite.experiments.study.summary import Spread, summaries
-from suite.experiments.study.training import TrainingResult
+from suite.experiments.study.conditions import ConditionResult
+from suite.experiments.study.training import Spread, TrainingResult, summaries
 from suite.train import run as training_run
 from suite.train.config import TrainConfig
 from suite.train.ppo.config import PpoConfig
@@ -145,7 +145,7 @@ def test_why_is_told_by_the_controls(rotorpy):
     assert flown_in[2].simulator == "mujoco" and flown_in[2].vehicle != flown_in[0].vehicle
     won = {base: "1111", single: "0111", aired: "1011", other: "0001"}
     tested = [
-        disturbed.ConditionResult(
+        ConditionResult(
             one,
             {"p": [judged_cells.result(k, digit == "1") for k, digit in enumerate(won[one.name])]},
         )
@@ -247,7 +247,7 @@ def test_the_comparison_of_schemes_from_one_command(tmp_path, small_scenes):
 
 
 def trained(key, seed, *points, diverged=""):
-    return TrainingResult(key, seed, "", 60.0, 5.0, "c", diverged, list(points))
+    return TrainingResult(key, seed, 60.0, 5.0, "c", diverged, list(points))
 
 
 def judged(key, *cross, rate=1.0, v_max=5.0):
@@ -292,7 +292,7 @@ def learnt(scheme, seed, pace, *gates, diverged=""):
 
 def test_a_page_of_schemes_that_all_diverged_has_no_chart(tmp_path, monkeypatch):
     runs = [learnt("ours", seed, 1.0, diverged="it diverged") for seed in (0, 1, 2)]
-    monkeypatch.setattr("suite.experiments.study.training.train_all", lambda *_: runs)
+    monkeypatch.setattr("suite.experiments.study.training.train_all", lambda *_, **__: runs)
     contents = document(SchemesConfig(only=("ours",)), Workspace(tmp_path, tmp_path), Console())
     chartless, *_ = contents.parts["Learning curves"]
     assert isinstance(chartless, Grid) and contents.numbers["rows"][0]["diverged"] == 3

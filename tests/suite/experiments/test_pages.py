@@ -20,7 +20,7 @@ from suite.experiments.pages.document import BEGIN, END, PageContents, check_pag
 from suite.experiments.pages.paper import goals
 from suite.experiments.study.cache import FLIES, Workspace, code_digest, page_code
 from suite.judging.content import policy_digest
-from suite.loop.tables import difference_cell
+from suite.loop.compare import difference_cell
 from tests.support import commands
 from tests.support.judged_cells import cell
 from tracks.common.grid import Cell, table

@@ -17,10 +17,9 @@ from suite.common.stages import is_done
 from suite.common.usage import renamed
 from suite.delta.replay import nominal_model
 from suite.loop import delta_action, hidden_effect, measured, work
-from suite.loop.compare import policy_results
+from suite.loop.compare import cell_grid, overall_grid, policy_results
 from suite.loop.config import loop_by_content, resolve
 from suite.loop.hidden_effect import LABELS
-from suite.loop.tables import cell_grid, overall_grid
 from suite.loop.variants import DeltaModel, Variant
 from suite.loop.work import LoopRun, Quiet, plan
 from suite.train.config import PointMassConfig
@@ -238,11 +237,11 @@ def test_ends_are_cut_and_noise_is_of_its_size(logs):
     short = measured.cut_end(log, 0.5)
     assert log.time_s[-1] - short.time_s[-1] == pytest.approx(0.5, abs=0.034)
     assert len(short.pos_w) == len(short.extra["action_x"]) == len(short.time_s) < len(log.time_s)
-    shaken = measured.noisy(log, measured.Noise(), np.random.default_rng(0))
+    shaken = measured.noisy(log, np.random.default_rng(0))
     turn = np.einsum("nij,nik->njk", log.rot_w, shaken.rot_w)
     angle = np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], -1)
-    assert angle.std() == pytest.approx(measured.Noise().attitude, rel=0.2)
-    assert (shaken.rate_b - log.rate_b).std() == pytest.approx(measured.Noise().gyro, rel=0.2)
+    assert angle.std() == pytest.approx(measured.NOISE["attitude"], rel=0.2)
+    assert (shaken.rate_b - log.rate_b).std() == pytest.approx(measured.NOISE["gyro"], rel=0.2)
     np.testing.assert_allclose(np.linalg.norm(shaken.quat_wxyz, axis=1), 1, atol=1e-12)
     np.testing.assert_array_equal(shaken.thrust_cmd, log.thrust_cmd)
 
@@ -263,7 +262,7 @@ def test_crashed_flights_lose_their_end_and_short_ones_are_left_out(logs, tmp_pa
     assert lost_s == pytest.approx(measured.CONTACT_MARGIN_S, abs=0.034)
     assert whole.duration_s == logs[1].duration_s
     noise = (whole.pos_w - logs[1].pos_w).std()
-    assert noise == pytest.approx(measured.Noise().pos, rel=0.2)
+    assert noise == pytest.approx(measured.NOISE["pos"], rel=0.2)
     np.testing.assert_array_equal(whole.action_b, logs[1].action_b)
     (flights / "flights.json").write_text(json.dumps({"flights": rows[:1]}))
     with pytest.raises(ValueError, match="no flight in .* is 1.5 s long"):

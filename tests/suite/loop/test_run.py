@@ -28,10 +28,9 @@ from suite.common.console import Quiet
 from suite.delta.fit import DeltaFit, ReplayErrors
 from suite.delta.replay import nominal_model
 from suite.loop import hidden_effect, work
-from suite.loop.compare import policy_results
+from suite.loop.compare import CAVEAT, policy_results
 from suite.loop.config import resolve
 from suite.loop.hidden_effect import LABELS, LOOP, describe_hidden, hidden_effects
-from suite.loop.tables import CAVEAT
 from tests.support.diagnosis_flights import fly
 from tests.support.engines import STAND_IN
 from tests.support.judged_cells import results_of

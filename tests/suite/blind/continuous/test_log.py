@@ -1,18 +1,18 @@
 """The engine of the blind cases apart from the model that fits, in time, and in what it logs."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import suite.blind.continuous
-from eval.flights.simulate import SENSORS
+from eval.flights.simulate import SENSORS, Sensors
 from eval.flights.trajectory import Trajectory
 from suite.blind.continuous import timing
 from suite.blind.continuous.body import POS, QUAT, RATE, VEL, Battery
 from suite.blind.continuous.engine import fly
-from suite.blind.continuous.log import Noise, gauss_markov, log_of_flight, rotate_attitude, state_at
+from suite.blind.continuous.log import gauss_markov, log_of_flight, rotate_attitude, state_at
 from suite.blind.continuous.quadrotor import quadrotor_of
 from suite.blind.continuous_flight import fly_continuous, with_loop_frequency
 from tests.suite.test_imports import imported
@@ -148,7 +148,7 @@ def test_conditions_are_within_bounds_and_of_every_kind():
     assert timing.draw_conditions(np.random.default_rng(7)) == drawn[7]
 
 
-NOISE = Noise(100.0, 0.002, 0.003, 0.02, 0.03, 0.3, 5.0, 0.02, 0.0)
+NOISE = Sensors("", 100.0, 0.002, 0.003, 0.02, 0.03, 0.3, 5.0, 0.02, 0.0)
 EVEN = timing.Conditions(500.0, 200.0, 0.0, 0.0, 0.0, 0.0, 0.1)
 
 
@@ -262,13 +262,13 @@ def test_rows_are_dropped_with_their_commands_and_stamps_are_off_by_at_most_the_
 
 
 def test_poses_are_lost_in_threes_and_a_channel_that_is_not_measured_is_not_there(flown):
-    log = logged(flown, np.random.default_rng(4), noise=NOISE._replace(lost=0.06))
+    log = logged(flown, np.random.default_rng(4), noise=replace(NOISE, lost=0.06))
     gone = np.isnan(log.pos_w[:, 0])
     np.testing.assert_array_equal(gone, np.isnan(log.quat_wxyz[:, 0]))
     assert 0.03 < gone.mean() < 0.09 and np.isfinite(log.rate_b).all()
     runs = np.diff(np.flatnonzero(np.diff(np.r_[False, gone, False])))[::2]
     assert runs.min() == 3
-    log = logged(flown, np.random.default_rng(0), noise=NOISE._replace(vel=0.0, acc=0.0, rotor=0.0))
+    log = logged(flown, np.random.default_rng(0), noise=replace(NOISE, vel=0.0, acc=0.0, rotor=0.0))
     assert log.velocity_derived and log.acc_b is None and log.rotor_speed is None
 
 

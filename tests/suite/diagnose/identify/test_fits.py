@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from suite.diagnose.identify import body, drive, flapping, loop
-from suite.diagnose.identify.fit import Fitted, KnownNumbers, NoWholeWindow, Rows, Unknown, fit
+from suite.diagnose.identify.fit import KnownNumbers, NoWholeWindow, Rows, Unknown, fit
 from suite.diagnose.identify.grid import LEANING, ROTOR_NOISE, STEP_S, FlightGrid
 from tests.support import identified as known
 from tests.support import real_flights
@@ -27,8 +27,9 @@ def flights(slopes, noise=0.1, count=200, seed=0):
         x = rng.normal(size=count)
         made.append((x, slope * x + noise * rng.normal(size=count), np.arange(count) // 10))
 
-    def residuals(value):
-        return [Rows((y - value[0] * x)[:, None], block, NONE) for x, y, block in made]
+    def residuals(numbers):
+        slope = numbers["slope"]
+        return [Rows((y - slope * x)[:, None], block, NONE) for x, y, block in made]
 
     return residuals
 
@@ -54,8 +55,8 @@ def test_what_is_known_widens_what_depends_on_it():
     """`y = (slope + other) x`: the slope is off by as much as the other, and by no less."""
     residuals = flights([2.0] * 4)
 
-    def both(value):
-        return residuals(np.array([value[0] + value[1]]))
+    def both(numbers):
+        return residuals({"slope": numbers["slope"] + numbers["other"]})
 
     known = KnownNumbers(("other",), np.array([[0.1**2]]))
     found = fit(both, [SLOPE, Unknown("other", 0.5, -9.0, 9.0, 1.0, 1e-3)], known=known)
@@ -76,8 +77,9 @@ def test_the_methods_own_errors_do_not_cancel_in_a_sum():
         made.append((x, near, 2.0 * x - 1.0 * near + 0.01 * rng.normal(size=200)))
     block = np.arange(200) // 10
 
-    def residuals(value):
-        return [Rows((y - value[0] * x - value[1] * n)[:, None], block, NONE) for x, n, y in made]
+    def residuals(numbers):
+        slope, other = numbers["slope"], numbers["other"]
+        return [Rows((y - slope * x - other * n)[:, None], block, NONE) for x, n, y in made]
 
     numbers = [SLOPE._replace(method_error=0.5), Unknown("other", 0.0, -9.0, 9.0, 1.0, 1e-3, 0.5)]
     found = fit(residuals, numbers)
@@ -100,8 +102,8 @@ def test_missing_values_are_left_out_and_a_fit_without_rows_is_refused():
     with pytest.raises(NoWholeWindow):
         fit(flights([2.0], count=0), [SLOPE])
 
-    def with_holes(value):
-        rows = flights([2.0] * 4)(value)
+    def with_holes(numbers):
+        rows = flights([2.0] * 4)(numbers)
         for one in rows:
             one.value[::3] = np.nan
         return rows
@@ -123,7 +125,7 @@ def test_the_thrust_is_what_path_and_gravity_need_in_fast_windows_with_an_attitu
         vel_w = np.outer(time_s, [2.0, 0.0, 0.0]) + [speed - 1.0, 0.0, 0.0]
         signals = {"vel_w": vel_w, "rotor_speed": np.full((500, 4), 1000.0), name: rot_w}
         unknowns = body.force_unknowns(driven, False, leaning=name == LEANING)[:1]
-        return body.fit_force([FlightGrid("made", time_s, signals)], driven, unknowns, LAGS)
+        return body.fit_force(unknowns, [FlightGrid("made", time_s, signals)], driven, LAGS)
 
     by_rotors = 4e6 * PLAIN.rotors.thrust_coefficient / PLAIN.mass
     for name in ("rot_w", LEANING):
@@ -140,13 +142,13 @@ def rolled(noise, **limits):
     grid = FlightGrid("made", STEP_S * np.arange(count), {"rotor_speed": true})
     true_inertia = (2.0 * PLAIN.inertia[0], *PLAIN.inertia[1:])
     driven = drive.DrivenVehicle(replace(PLAIN, inertia=true_inertia), "rotors")
-    _, turn_b = driven.at(LAGS).accelerations(grid, grid.rows(False))
+    _, turn_b = driven.accelerations(LAGS)(grid, grid.rows(False))
     rate_b = STEP_S * (np.cumsum(turn_b, axis=0) - 0.5 * turn_b)
     drawn = noise * rng.standard_normal((2, count, 4))
     signals = {"rotor_speed": true + drawn[0], ROTOR_NOISE: drawn[1], "rate_b": rate_b}
     unknowns = [body.torque_unknowns("rotors", 0.0, 0.0)[0]._replace(**limits)]
     grid = grid._replace(signals=signals)
-    return body.fit_torque([grid], drive.DrivenVehicle(PLAIN, "rotors"), unknowns, LAGS)
+    return body.fit_torque(unknowns, [grid], drive.DrivenVehicle(PLAIN, "rotors"), LAGS)
 
 
 def test_noise_of_the_rotor_speeds_widens_the_interval_and_makes_no_body_heavier():
@@ -176,16 +178,10 @@ def test_flapping_is_within_its_interval_and_none_without_what_it_needs():
         assert flapping.flapping_of(logs, real_flights.VEHICLE) is None
 
 
-def fit_of(names, covariance):
-    unknowns = tuple(Unknown(name, 0.0, -1.0, 1.0, 1.0, 1e-3) for name in names)
-    half = 1.96 * np.sqrt(np.diag(covariance))
-    return Fitted(unknowns, np.zeros(len(names)), half, np.asarray(covariance))
-
-
 def test_motors_are_off_by_their_covariance_and_inertia_by_its_own():
     start, covariance = known.start(), [[4e-4, 0, -1e-4], [0, 0.1, 0], [-1e-4, 0, 9e-4]]
-    force = fit_of(("thrust", "drag_x", "curve"), covariance)
-    torque = fit_of(("inertia_x", "inertia_y"), np.diag([0.01, 0.0004]))
+    force = known.fitted(("thrust", "drag_x", "curve"), covariance)
+    torque = known.fitted(("inertia_x", "inertia_y"), np.diag([0.01, 0.0004]))
     driven = drive.DrivenVehicle(start, "pwm", usual_command=0.5, usual_volts=15.0)
     found = flapping.perturbed_vehicles(start, driven, force, torque)
     assert len(found) == 4
@@ -197,7 +193,8 @@ def test_motors_are_off_by_their_covariance_and_inertia_by_its_own():
     assert all(v.motors == start.motors for v in found[2:])
 
 
-COUPLED = {unknown.name: unknown.start for unknown in loop.coupling_unknowns(PLAIN)}
+BARE = FlightGrid("made", np.zeros(0), {})
+COUPLED = {unknown.name: unknown.start for unknown in loop.loop_unknowns(PLAIN, [BARE])}
 
 
 def test_the_loop_follows_its_equations_integrated_by_another_method():
@@ -220,7 +217,7 @@ def test_the_loop_follows_its_equations_integrated_by_another_method():
     command = np.stack([wanted(t) for t in time_s])
     flight = FlightGrid("made", time_s, {"rate_cmd_b": command})
     # The command is joined here, not held: `delayed` takes it for half a step later.
-    rate = loop.loop_rates(flight, fast, {"lag": lag_s, "late": lag_s - 0.5 * STEP_S, **COUPLED})
+    rate = loop.loop_rates(fast, flight, {"lag": lag_s, "late": lag_s - 0.5 * STEP_S, **COUPLED})
     # The plain linear loop is 0.085 rad/s off.
     assert np.abs(rate - exact)[200:].max() < 0.02
 
@@ -233,9 +230,9 @@ def test_moving_air_turns_by_its_torque_over_the_gain():
     vel_w = np.where(np.arange(400)[:, None] < 100, 0.0, [-2.0, -3.0, 0.0])
     bare = FlightGrid("made", time_s, {"rate_cmd_b": still})
     flight = bare._replace(signals={"rate_cmd_b": still, "vel_w": vel_w, "rot_w": rot_w})
-    assert [one.name for one in loop.air_torque_unknowns([flight])] == ["air_x", "air_y"]
+    assert [one.name for one in loop.loop_unknowns(PLAIN, [flight])][-2:] == ["air_x", "air_y"]
     numbers = {"lag": 0.03, "late": 0.03, **COUPLED, "air_x": 0.5, "air_y": 0.4}
-    rate = loop.loop_rates(flight, PLAIN, numbers)
+    rate = loop.loop_rates(PLAIN, flight, numbers)
     gain = PLAIN.controller.rate_gain
     np.testing.assert_allclose(rate[-1], [0.5 * 2.0 / gain[0], 0.4 * 3.0 / gain[1], 0.0], rtol=1e-3)
-    assert loop.air_torque_unknowns([flight, bare]) == []
+    assert "air_x" not in [one.name for one in loop.loop_unknowns(PLAIN, [flight, bare])]

@@ -10,7 +10,6 @@ from suite.diagnose.identify.identify import identify
 from suite.diagnose.identify.numbers import numbers_json
 from tests.support import identified as known
 from tests.support.broken_logs import changed
-from tests.support.fleets import Fleet, logs_of
 from tests.support.tools import program
 from tests.support.vehicles import with_effects
 
@@ -110,9 +109,7 @@ def test_a_hover_identifies_thrust_and_reports_what_it_does_not(missing, lines):
 
 @pytest.mark.slow
 def test_what_turns_is_identified_by_the_attitude_without_rates_and_without_positions():
-    fleet, rng = Fleet(known.truth(), known.WAYS), np.random.default_rng(0)
-    sensors = replace(known.SENSORS, attitude=0.002)
-    logs = logs_of(fleet, known.recordings(known.WAYS), "pwm", rng, sensors=sensors)
+    logs = known.logs("pwm", 0, sensors=replace(known.SENSORS, attitude=0.002))
     found = identify(without(logs, "rate_b"), known.start(), leave=("loop",))
     assert {("inertia", 0), ("inertia", 1)} <= near_truth(found)
     found = identify(without(known.logs("pwm", 0), "pos_w", "vel_w"), known.start())
@@ -198,9 +195,7 @@ def test_rotors_that_are_logged_in_turn_identify_all_but_their_lag():
 
 
 def test_a_scale_of_the_thrust_that_is_left_alone_counts():
-    fleet = Fleet(known.truth(), known.WAYS, scale=0.8)
-    rng = np.random.default_rng(0)
-    logs = logs_of(fleet, known.recordings(known.WAYS), "thrust", rng, sensors=known.SENSORS)
+    logs = known.logs("thrust", 0, scale=0.8)
     begun = with_effects(known.start(), thrust_scale=(0.8,))
     found = identify(logs, begun, leave=("motors", *TURNING))
     assert found.vehicle.effects["thrust_scale"].scale == 0.8

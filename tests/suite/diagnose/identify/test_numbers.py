@@ -13,11 +13,11 @@ from eval.vehicles.vehicle import MotorMap
 from suite.common.console import Console
 from suite.diagnose.identify import drive, entries, run
 from suite.diagnose.identify.body import lag_unknowns
-from suite.diagnose.identify.fit import Fitted, Unknown
+from suite.diagnose.identify.fit import Fitted
 from suite.diagnose.identify.grid import ROTOR_NOISE, STEP_S, FlightGrid, grid_of
-from suite.diagnose.identify.identify import Identified, identify
+from suite.diagnose.identify.identify import PARTS, Identified, identify
 from suite.diagnose.identify.numbers import Number, not_attempted, not_identified
-from suite.diagnose.identify.run import PARTS, identify_files
+from suite.diagnose.identify.run import identify_files
 from tests.support import identified as known
 from tests.support.log_tables import level
 from tests.support.vehicles import PLAIN, with_effects
@@ -101,8 +101,8 @@ def test_what_is_late_by_less_than_nothing_is_early():
 def test_effects_of_the_start_act_on_the_torque():
     moved = with_effects(PLAIN, com_offset=((0.01, 0.0, 0.0),))
     flight = FlightGrid("made", TIME, {"rotor_speed": np.full((400, 4), 1000.0)})
-    driven = drive.DrivenVehicle(moved, "rotors").at({})
-    _, turn_b = driven.accelerations(flight, flight.rows(False))
+    driven = drive.DrivenVehicle(moved, "rotors").accelerations({})
+    _, turn_b = driven(flight, flight.rows(False))
     thrust = 4e6 * PLAIN.rotors.thrust_coefficient
     np.testing.assert_allclose(turn_b[0, 1], 0.01 * thrust / PLAIN.inertia[1], rtol=0.05)
     assert drive.unmodelled_effects(moved) == []
@@ -128,8 +128,8 @@ def test_motors_begin_with_those_of_the_file_or_at_full_speed(begun, with_volts,
     vehicle = replace(PLAIN, motors=begun and MotorMap(*begun))
     pwm = {"pwm": np.full((400, 4), 0.5)}
     flight = FlightGrid("made", TIME, {**pwm, "voltage": np.full(400, 15.0)})
-    assert drive.with_motor_map([flight], vehicle).motors == MotorMap(*with_volts)
-    bare = drive.with_motor_map([FlightGrid("made", TIME, pwm)], vehicle).motors
+    assert drive.driven_vehicle([flight], vehicle, "pwm").start.motors == MotorMap(*with_volts)
+    bare = drive.driven_vehicle([FlightGrid("made", TIME, pwm)], vehicle, "pwm").start.motors
     assert bare.voltage_exponent == 0.0 if without is None else bare == MotorMap(*without)
 
 
@@ -174,7 +174,9 @@ DRAG = "effects.linear_drag.coefficient"
 
 
 def test_the_inertia_about_z_follows_the_others():
-    found = entries.inertia_from(PLAIN, {"inertia_x": 0.2, "inertia_y": 0.0})
+    driven = drive.DrivenVehicle(PLAIN, "rotors")
+    inertia = driven.vehicle({"inertia_x": 0.2, "inertia_y": 0.0}).inertia
+    found = drive.possible_inertia(inertia)
     np.testing.assert_allclose(found[2], PLAIN.inertia[2] * np.exp(0.1))
     assert np.all(found <= found.sum() - found + 1e-15), "no body has one larger than both others"
 
@@ -209,8 +211,8 @@ def test_a_delay_is_no_better_known_than_the_lag_however_well_their_sum_is(half,
     """The widest interval is +-12 ms: a sum within 8 ms minus a lag within 8 ms has 11.3 ms."""
     covariance = np.diag([half**2, half**2]) / 1.96**2
     unknowns = tuple(lag_unknowns(0.03, 0.04))
-    fitted = Fitted(unknowns, np.array([0.05, 0.03]), np.full(2, half), covariance)
-    (delay,) = [one for one in entries.loop_entries(PLAIN, fitted) if one.key == entries.DELAY]
+    fitted = Fitted(unknowns, np.array([0.05, 0.03]), covariance)
+    _, delay = entries.entries_of(drive.DrivenVehicle(PLAIN, "pwm"), fitted)
     assert (delay.ci95 != [None]) == identified == (not delay.follows)
     vehicle = entries.with_entries(PLAIN, [delay])[0]
     assert vehicle.effects["command_delay"].delay == pytest.approx(0.02), "the file keeps the sum"
@@ -218,20 +220,14 @@ def test_a_delay_is_no_better_known_than_the_lag_however_well_their_sum_is(half,
     assert "command_delay" not in entries.with_entries(PLAIN, [negative])[0].effects
 
 
-def found(*names, left=()):
-    unknowns = tuple(Unknown(name, 0.0, -1.0, 1.0, 1.0, 0.1) for name in names)
-    none = np.zeros(len(names))
-    return Fitted(unknowns, none, none, np.diag(none), tuple(left))
-
-
 def test_what_one_fit_leaves_and_another_identifies_is_identified():
-    fitted = {"torque": found("lag", "late", left=["lag", "late"]), "loop": found("lag")}
+    torque = known.fitted(("lag", "late"), left=("lag", "late"))
+    fitted = {"torque": torque, "loop": known.fitted(("lag",))}
     given = {entries.DELAY: Number(entries.DELAY, "s", [0.0], [None])}
     assert [line.split(":")[0] for line in not_identified(fitted, given)] == ["command_delay"]
 
 
-COMPLETE = {"force": found("thrust", "drag_x"), "loop": found("gain_x")}
-COMPLETE |= {"torque": found("inertia_x", "late")}
+COMPLETE = {"force": ("thrust", "drag_x"), "loop": ("gain_x",), "torque": ("inertia_x", "late")}
 
 
 @pytest.mark.parametrize(
@@ -249,7 +245,7 @@ COMPLETE |= {"torque": found("inertia_x", "late")}
 def test_what_has_no_column_or_never_both_is_reported(drive, without, broken, line):
     signals = dict.fromkeys(["voltage", "rotor_speed", "rate_b", "rate_cmd_b"], np.zeros(COUNT))
     flights = [FlightGrid("made", TIME, signals)]
-    fitted = {name: fit for name, fit in COMPLETE.items() if name != without}
+    fitted = {name: known.fitted(of) for name, of in COMPLETE.items() if name != without}
     lines = not_attempted(flights, PLAIN, drive, fitted, [], [broken])
     assert lines == [] if line is None else any(re.match(line, text) for text in lines), lines
 

@@ -116,11 +116,11 @@ def test_a_drift_and_a_tilt_by_neglected_drag_are_found_where_they_are():
     drifting = flown(range(20, 22), 0.0, position_drift=0.05, **none)
     drift = fit_sensors(drifting).axes["position_x"].drift
     assert drift.low <= 0.05 <= drift.high and drift.value > 0.02
-    assert not fitted().tilt.drag.value
-    tilt = fit_sensors(flown(range(30, 36), drag=0.4)).tilt
-    assert tilt.drag.value == pytest.approx(0.4, abs=0.01)
-    assert tilt.lasts_s.value == pytest.approx(0.8, abs=0.04)
-    assert tilt.drag.high - tilt.drag.low < 0.05
+    assert not fitted().systematic.drag.value
+    drag, lasts_s = fit_sensors(flown(range(30, 36), drag=0.4)).systematic[2:]
+    assert drag.value == pytest.approx(0.4, abs=0.01)
+    assert lasts_s.value == pytest.approx(0.8, abs=0.04)
+    assert drag.high - drag.low < 0.05
 
 
 def test_a_wandering_clock_is_found_by_the_gyro_and_leaves_no_errors():

@@ -13,11 +13,12 @@ from eval.effects.interface import bound_value
 from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
 from eval.sensors.sensors_file import PERFECT, sensor_set
 from suite.common import curve
+from suite.common.console import Silent
 from suite.common.provenance import added_digest
-from suite.experiments.study import cache, validation
-from suite.experiments.study.cache import code_digest, digest
+from suite.experiments.study import cache, training, validation
+from suite.experiments.study.cache import Workspace, code_digest, digest
 from suite.experiments.study.conditions import effect_conditions, sweep_conditions, sweeps
-from suite.experiments.study.training import Setting, Study, UnseenWorlds, read_measurements
+from suite.experiments.study.training import Setting, UnseenWorlds, read_measurements
 from suite.train.recipes import named_recipe
 from suite.train.step import BODY_RADIUS_M
 from suite.train.worlds import sample_worlds
@@ -29,12 +30,17 @@ VEHICLE = load_vehicle("reference")
 RECIPE = named_recipe("race-paper")
 
 
-def test_rows_take_turns_where_they_are_to_meet_the_same_load():
+def test_rows_take_turns_where_they_are_to_meet_the_same_load(tmp_path, monkeypatch):
     rows, unseen = [Setting("a", "", RECIPE), Setting("b", "", RECIPE)], UnseenWorlds(0, 3, 9, 1.0)
-    study = Study(rows, (4, 5), unseen)
-    assert [(key, c.seed) for key, c in study.pieces()] == [("a", 4), ("a", 5), ("b", 4), ("b", 5)]
-    turns = Study(rows, (4, 5), unseen, by_seed=True)
-    assert [(key, c.seed) for key, c in turns.pieces()] == [("a", 4), ("b", 4), ("a", 5), ("b", 5)]
+    monkeypatch.setattr(training, "do_jobs", lambda do, jobs, *_: [("", [])] * len(jobs))
+
+    def order(**options):
+        place = Workspace(tmp_path, tmp_path), Silent()
+        runs = training.train_all(rows, (4, 5), unseen, *place, **options)
+        return [(run.setting, run.seed) for run in runs]
+
+    assert order() == [("a", 4), ("a", 5), ("b", 4), ("b", 5)]
+    assert order(by_seed=True) == [("a", 4), ("b", 4), ("a", 5), ("b", 5)]
 
 
 def test_time_leaves_compilation_out(tmp_path):
@@ -133,17 +139,16 @@ def test_sweeps_begin_at_the_vehicle_as_it_is_and_grow():
     named = {sweep.name: sweep for sweep in sweeps(VEHICLE)}
     assert named["motor lag"].sizes[0] == named["latency"].sizes[0] == pytest.approx(30)
     heavy, drag, late = (
-        named[name].make(VEHICLE, size)[0].effects
+        named[name].make(size).effects
         for name, size in (("mass", 40), ("drag", 4), ("latency", 80))
     )
     assert heavy["mass_offset"].offset == pytest.approx(0.3)
     assert drag["linear_drag"].coefficient == pytest.approx((0.72, 0.72, 2.88))
     assert drag["quadratic_drag"].coefficient == pytest.approx((0.04, 0.04, 0.16))
     assert late["command_delay"].delay == pytest.approx(0.08)
-    _, sensors = named["jittering age of both"].make(VEHICLE, 40)
+    sensors = named["jittering age of both"].make(40)
     assert sensors == sensor_set({"delay": {"state": 0.04, "image": 0.04, "jitter": 1.0}})
-    _, sensors = named["state-estimation noise"].make(VEHICLE, 2)
-    values = sensors.models["state_noise"]
+    values = named["state-estimation noise"].make(2).models["state_noise"]
     assert (values.position, values.velocity) == pytest.approx((0.06, 0.2))
     assert values.attitude == pytest.approx(np.radians(2)) and values.correlation == 0.5
 
@@ -168,7 +173,7 @@ def test_sweeps_of_a_vehicle_with_effects_begin_at_those():
     assert named["motor lag"].sizes == pytest.approx((200, 300, 400)), "it still grows"
     heavy = sweep_conditions(vehicle, named["mass"])[1].vehicle
     assert heavy.effects["mass_offset"].offset == pytest.approx(0.3)
-    more, _ = named["drag"].make(vehicle, 4)
+    more = named["drag"].make(4)
     assert more.effects["rotor_drag"].coefficient == pytest.approx(4e-5)
     assert more.effects["linear_drag"].coefficient == pytest.approx((0.8, 0.8, 2.8))
     assert "quadratic_drag" not in more.effects
