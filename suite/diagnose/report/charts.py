@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from eval.logs.flight_log import FlightLog
 from eval.view.comparison import ComparedFlight, Simulation, States, write_comparison
 from suite.common.charts import plain_axes, png, titled
 from suite.diagnose.data.windows import FlightWindows, take
@@ -66,16 +65,12 @@ def write_rollouts(path: Path, flown: RolloutSource, rollouts: Rollouts) -> Path
             paths, errors = [states for states, _ in kept], [error for _, error in kept]
             simulations.append(Simulation(label, paths, errors))
         log = flown.logs[int(number)]
-        flights.append(ComparedFlight(log.name, _measured(log, flown.since_s), simulations))
+        time_s = log.time_s - log.time_s[0]
+        is_held = time_s >= flown.since_s - 1e-6
+        fields = (time_s, log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b)
+        measured = States(*(field[is_held] for field in fields))
+        flights.append(ComparedFlight(log.name, measured, simulations))
     return write_comparison(path, flights, flown.vehicle.body.half_size)
-
-
-def _measured(log: FlightLog, first_s: float) -> States:
-    """Return the measured state of a flight from `first_s` on."""
-    time_s = log.time_s - log.time_s[0]
-    rows = time_s >= first_s - 1e-6
-    fields = (time_s, log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b)
-    return States(*(field[rows] for field in fields))
 
 
 def _rollout(window: FlightWindows, residual: np.ndarray) -> tuple[States, np.ndarray] | None:

@@ -50,7 +50,19 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "share": remaining_share(main.before, main.after) if named or diagnosis.tested else 1.0,
             "judged": diagnosis.verdict.share_left,
             "where": diagnosis.verdict.where,
-            "above_noise": above_noise(diagnosis, limits.above_noise),
+            "above_noise": [
+                {
+                    "view": one.source.name,
+                    "error": one.after.rms,
+                    "noise_floor": one.after.floor,
+                    "unit": one.source.unit,
+                    "reason": "that no effect of the catalogue explains"
+                    if one.remaining.structured
+                    else one.remaining.reason,
+                }
+                for one in diagnosis.findings
+                if one.after.rms > limits.above_noise * one.after.floor
+            ],
             "swing": swing and {"period_s": swing.period_s, "length_m": swing.length_m},
             **main.remaining.details,
         },
@@ -58,23 +70,6 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "not_examined": not_examined(diagnosis),
     }
     return {"headline": headline(entries), **entries}
-
-
-def above_noise(diagnosis: Diagnosis, least: float) -> list[dict[str, Any]]:
-    """Return an entry for each source whose error remains above `least` times the noise floor."""
-    return [
-        {
-            "view": one.source.name,
-            "error": one.after.rms,
-            "noise_floor": one.after.floor,
-            "unit": one.source.unit,
-            "reason": "that no effect of the catalogue explains"
-            if one.remaining.structured
-            else one.remaining.reason,
-        }
-        for one in diagnosis.findings
-        if one.after.rms > least * one.after.floor
-    ]
 
 
 def not_examined(diagnosis: Diagnosis) -> list[str]:

@@ -75,28 +75,22 @@ def figure(value: float) -> str:
 
 
 def answer(result: Mapping[str, Any]) -> str:
-    """Return the named effects, their sizes, and a sentence for the verdict."""
+    """Return the named effects, their sizes, the verdict, and the errors that it excludes."""
+    verdict, is_change = result["verdict"], bool(result["reference"])
     words = [_effect_words(effect) for effect in result["effects"]]
     if words:
-        is_change = bool(result["reference"])
         words.insert(
             0, "Changed in the vehicle:" if is_change else "Wrong or missing in the vehicle file:"
         )
-    words.append(_verdict_words(result))
-    if result["verdict"] == "no_gap" and result["negligible"]:
+    sentence, rest = (CHANGES if is_change else VERDICTS)[verdict], remaining_words(result)
+    if rest and (verdict == "named" or (verdict == "no_gap" and not is_change)):
+        agreed = sentence.removesuffix(".").removesuffix(" within the measurement noise")
+        sentence = f"{agreed}, except for {rest}."
+    words.append(sentence)
+    if verdict == "no_gap" and result["negligible"]:
         names = ", ".join(entry["name"] for entry in result["negligible"])
         words.append(f"Significant but too small to matter: {names}.")
     return " ".join(words)
-
-
-def _verdict_words(result: Mapping[str, Any]) -> str:
-    """Return a sentence for the verdict, with the errors that it excludes."""
-    words = (CHANGES if result["reference"] else VERDICTS)[result["verdict"]]
-    rest, noise = remaining_words(result), " within the measurement noise"
-    is_no_change = bool(result["reference"]) and result["verdict"] == "no_gap"
-    if not rest or is_no_change or result["verdict"] not in ("no_gap", "named"):
-        return words
-    return f"{words.removesuffix('.').removesuffix(noise)}, except for {rest}."
 
 
 def remaining_words(result: Mapping[str, Any]) -> str:
@@ -183,8 +177,6 @@ def _search_for(unexplained: Mapping[str, Any]) -> list[str]:
 LEAST_SHOWN = 0.001
 """A smaller gap is printed as "less than" this value, in the unit of the gap (times the noise,
 m/s^2 or rad/s^2)."""
-NOT_IDENTIFIABLE = "not identifiable"
-"""Text in place of a value that these flights do not identify."""
 
 
 class Component(NamedTuple):
@@ -216,7 +208,7 @@ class Component(NamedTuple):
     def texts(self) -> tuple[str, str]:
         """Return value and interval as texts, with as many digits as the interval supports."""
         if self.value is None:
-            return NOT_IDENTIFIABLE, ""
+            return "not identifiable", ""
         if self.ci95 is None:
             return f"{self.value:.4g}", ""
         numbers = (self.value, *self.ci95)

@@ -75,14 +75,11 @@ class ActuatorMismatch(NamedTuple):
     """Share of the speeds' variance that the commands and the vehicle file's lag explain."""
 
 
-Commanded = Callable[[float], np.ndarray]
-"""Delay of the commands [s] -> (S, 4) rotor speeds that are commanded in each step [rad/s]."""
-
-
 class _Stretch(NamedTuple):
     """N rows of a flight without a hole (a long time without a value)."""
 
-    commanded: Commanded
+    commanded: Callable[[float], np.ndarray]
+    """Delay of the commands [s] -> (S, 4) rotor speeds that are commanded in each step [rad/s]."""
     row: np.ndarray
     """(N,) number of the time step at whose start each measured row was taken."""
     measured: np.ndarray
@@ -107,7 +104,7 @@ RATE_LOOP, LOGGED = "nominal rate loop", "logged motor commands"
 
 def _commanded(
     commanded_by: str, log: FlightLog, step_time_s: np.ndarray, plant: Plant
-) -> Commanded | None:
+) -> Callable[[float], np.ndarray] | None:
     """Return the commanded rotor speeds of `log`; None where it has no such commands.
 
     `step_time_s` (S,) are the starts of the time steps [s]. The rate loop is that of `plant`, the

@@ -39,8 +39,6 @@ STEP_HZ = 0.01
 """Step between the tested frequencies [Hz]."""
 BAND_HZ = (0.15, 3.0)
 """Frequency band of the spectra [Hz]."""
-CORNERS_HZ = (0.2, 0.5, 1.2)
-"""Corner frequencies of the smooth backgrounds that fall with frequency [Hz]."""
 WIDTHS = (0.03, 0.1)
 """Tested half widths of a peak, as shares of its frequency."""
 HANN_BINS = 1.5
@@ -169,7 +167,7 @@ def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None
 def _peak_gains(spectrum: Spectrum, centre_hz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return gains in log-likelihood by peaks, and their heights, (widths, `centre_hz`) each."""
     frequency = spectrum.frequency_hz
-    falling = (1.0 / (1.0 + (frequency / corner) ** 2) ** 2 for corner in CORNERS_HZ)
+    falling = (1.0 / (1.0 + (frequency / corner_hz) ** 2) ** 2 for corner_hz in (0.2, 0.5, 1.2))
     background = np.stack([np.ones_like(frequency), frequency**2, *falling])
     without, _ = _fit_spectrum(spectrum.residual, background[None])
     shapes = []

@@ -39,12 +39,8 @@ from suite.diagnose.data.windows import (
 from suite.diagnose.evidence.rollouts import RolloutModel, true_starts
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
-HORIZONS_S = (0.1, 0.5, 1.0)
-"""Times after the start at which plain errors of rollouts are reported [s]."""
 DRAWS = 1000
 """Number of draws of a bootstrap."""
-START_SIGMAS = 3.0
-"""Largest correction of a number of a start state, in standard deviations of its noise."""
 
 
 def rms_length(vectors: np.ndarray) -> float:
@@ -145,8 +141,8 @@ def start_correction(
     """Return corrections (W, F) of the true start states, fitted to all rows of each window.
 
     The noise of a measured start state grows along a rollout. So each number of the state is
-    corrected by what fits the model with `theta` (P,) best, but at most by `START_SIGMAS`; without
-    a limit where nothing was measured. Windows in which the model diverges, and the rotor speeds,
+    corrected by what fits the model with `theta` (P,) best, but at most by three sigma; without a
+    limit where nothing was measured. Windows in which the model diverges, and the rotor speeds,
     are not corrected.
     """
     linear = from_true_starts(model, theta, windows)
@@ -157,7 +153,7 @@ def start_correction(
         linear, windows = take(linear, flies), take(windows, flies)
         whitening = make_whitening(linear, noise, windows, limits)
         best = block_of(whitening, linear, (), windows).free[:, :STATE]
-        most = START_SIGMAS * np.nan_to_num(noise.sigma[:STATE], nan=np.inf)
+        most = 3.0 * np.nan_to_num(noise.sigma[:STATE], nan=np.inf)
         correction[flies, :STATE] = np.clip(best, -most, most)
     return correction
 
@@ -178,7 +174,7 @@ def gap_of(
     rotors = np.full(linear.offset.shape[1] - STATE, rotor_spread(windows, limits))
     free_noise = np.append(np.nan_to_num(noise.sigma[:STATE]), rotors)
     channels: dict[str, dict[str, Channel]] = {}
-    for horizon_s in HORIZONS_S:
+    for horizon_s in (0.1, 0.5, 1.0):
         channels[f"{horizon_s:g} s"] = {}
         distance_s = np.abs(np.asarray(windows.row_s) - horizon_s)
         for name in STATE_GROUPS:

@@ -32,9 +32,6 @@ from suite.diagnose.data.whitening import (
 from suite.diagnose.data.windows import SLICES, FlightWindows
 from suite.diagnose.thresholds import Thresholds
 
-FAST = ("rates", "rotor speed")
-"""Groups of channels that follow a command within a few hundredths of a second."""
-
 
 def with_model_error(
     windows: FlightWindows, linear: Linearisation, coarser: np.ndarray, limits: Thresholds
@@ -68,8 +65,9 @@ def with_held_commands(
         _rms(errors, linear, noise, whitening, windows) for errors in (difference, linear.residual)
     )
     shares = residual / np.maximum(rms, 1e-12)
-    fast = (s for name, s in zip(SLICES, shares, strict=True) if name in FAST and s > 0.0)
-    share = min(fast, default=0.0)
+    by_group = dict(zip(SLICES, shares, strict=True))
+    fast = (by_group["rates"], by_group["rotor speed"])
+    share = min((share for share in fast if share > 0.0), default=0.0)
     if share < limits.held_share:
         return None
     # The error accumulates along a window, so its slow part exceeds that of white noise.

@@ -123,7 +123,7 @@ def test_components_are_named_by_axis_and_shown_in_digits_that_the_interval_supp
     assert (x.label, x.texts()) == ("offset x [m]", ("0.01200", "0.01190 to 0.01210"))
     assert x.is_significant and not y.is_significant and not z.is_significant
     assert y.texts() == ("not different from 0", "-0.0010 to 0.0018")
-    assert z.texts() == (summary.NOT_IDENTIFIABLE, "")
+    assert z.texts() == ("not identifiable", "")
     small = {"value": 1.21e-6, "ci95": [1.1e-6, 1.3e-6], "unit": "kg/rad"}
     (only,) = summary.components({"name": "rotor_drag", "parameters": {"coefficient": small}})
     assert only.texts() == ("1.21e-06", "1.10e-06 to 1.30e-06")
