@@ -32,8 +32,6 @@ class Thresholds:
     """Largest RMS difference of measured rotor speeds and those by the nominal rate loop, relative
     to the standard deviation of the measured ones. Above it another controller flew, and the
     measured rotor speeds are the input."""
-    speed_mean_s: float = 0.1
-    """Rotor speeds are compared as means over this time, to average noise [s]."""
     still_speed: float = 10.0
     """Smaller changes and errors of rotor speeds are ignored [rad/s]."""
     lag_settled_s: float = 0.2

@@ -20,8 +20,6 @@ from tracks.common.grid import Cell, Grid, table, table_of
 
 SHOWN = 12
 """Largest number of logs in the table of logs."""
-RIVALS = 6
-"""Largest number of alternatives ("rivals") to each effect in the table of alternatives."""
 
 
 def logs_section(logs: Sequence[FlightLog]) -> Section:
@@ -157,7 +155,7 @@ def rivals_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section:
     rows = []
     for finding, named in diagnosis.named:
         ordered = sorted(named.worse_by.items(), key=lambda item: item[1])
-        for label, worse_by in ordered[:RIVALS]:
+        for label, worse_by in ordered[:6]:
             name = label.rstrip(" 1234")  # a label may end in a motor's number
             # Another motor is no other effect, so it is not among the rivals.
             is_motor = name == named.candidate.name

@@ -77,16 +77,13 @@ def figure(value: float) -> str:
 def answer(result: Mapping[str, Any]) -> str:
     """Return the named effects, their sizes, the verdict, and the errors that it excludes."""
     verdict, is_change = result["verdict"], bool(result["reference"])
-    words = [_effect_words(effect) for effect in result["effects"]]
-    if words:
-        words.insert(
-            0, "Changed in the vehicle:" if is_change else "Wrong or missing in the vehicle file:"
-        )
+    effects = [_effect_words(effect) for effect in result["effects"]]
+    heading = "Changed in the vehicle:" if is_change else "Wrong or missing in the vehicle file:"
     sentence, rest = (CHANGES if is_change else VERDICTS)[verdict], remaining_words(result)
     if rest and (verdict == "named" or (verdict == "no_gap" and not is_change)):
         agreed = sentence.removesuffix(".").removesuffix(" within the measurement noise")
         sentence = f"{agreed}, except for {rest}."
-    words.append(sentence)
+    words = [heading, *effects, sentence] if effects else [sentence]
     if verdict == "no_gap" and result["negligible"]:
         names = ", ".join(entry["name"] for entry in result["negligible"])
         words.append(f"Significant but too small to matter: {names}.")

@@ -36,11 +36,7 @@ from suite.diagnose.verdict.actuators import (
     integrator_of,
     rotors_are_input,
 )
-from suite.diagnose.verdict.model_error import (
-    commands_are_slow,
-    with_held_commands,
-    with_model_error,
-)
+from suite.diagnose.verdict.model_error import with_held_commands, with_model_error
 
 BASE_S, STRETCH_S = 5.0, 0.25
 """Estimated duration on two cores: fixed part, and for each stretch [s]."""
@@ -108,7 +104,9 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
         other = model.residual(start.theta, linear.offset, coarser)
         limits = with_model_error(windows, linear, other, limits)
     coarser_share = 0.0 if coarser is None or not rotor_input else _coarser_share(logs, vehicle)
-    if not rotor_input and commands_are_slow(logs, limits):
+    commands = [(log.time_s, log.rate_cmd_b) for log in logs if log.rate_cmd_b is not None]
+    are_slow = any(own_spacing_s(*command) > limits.command_spacing_s for command in commands)
+    if are_slow and not rotor_input:
         fewer = take(windows_of(fewer_commands=all_windows)[0], is_finite)
         other = model.residual(start.theta, linear.offset, fewer)
         held = with_held_commands(windows, linear, other, limits)

@@ -316,7 +316,8 @@ def flown_by_other_controller(
     for log in logs:
         for stretch in _stretches(log, plant, RATE_LOOP, limits):
             commanded = _at_rows(stretch.commanded(delay), stretch.row, dt, lag)
-            bin_of_row = (stretch.row * dt / limits.speed_mean_s).astype(int)
+            # Means over 0.1 s average the noise.
+            bin_of_row = (stretch.row * dt / 0.1).astype(int)
             both = np.concatenate([stretch.measured, commanded], axis=1)
             measured, by_loop = np.split(means_of(both, bin_of_row), 2, axis=1)
             error += float(((measured - by_loop) ** 2).sum())

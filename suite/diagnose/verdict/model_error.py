@@ -13,15 +13,12 @@ of that. The share is estimated from the body rates and rotor speeds.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from eval.logs.flight_log import FlightLog
 from suite.diagnose.data.colour import Noise, measured_noise
 from suite.diagnose.data.noise import at_least
-from suite.diagnose.data.sampling import own_spacing_s
 from suite.diagnose.data.whitening import (
     Linearisation,
     Whitening,
@@ -81,15 +78,6 @@ def with_held_commands(
     expected = np.maximum(whitening.slow_freedom.sum(axis=0), 1e-9)
     factor = [np.sqrt(max(slow[c].sum() / expected[c].sum(), 1.0)) for c in SLICES.values()]
     return _raised(rms * np.array(factor), limits)
-
-
-def commands_are_slow(logs: Sequence[FlightLog], limits: Thresholds) -> bool:
-    """Return whether some log has commands in fewer rows than a drone usually receives them."""
-    return any(
-        own_spacing_s(log.time_s, log.rate_cmd_b) > limits.command_spacing_s
-        for log in logs
-        if log.rate_cmd_b is not None
-    )
 
 
 def beyond_error(change: np.ndarray, error: np.ndarray, width: np.ndarray) -> bool:
