@@ -173,10 +173,9 @@ class Diagnosis:
 
 
 def main_of(findings: Sequence[Finding]) -> Finding:
-    """Return the main finding.
+    """Return a finding with names, or any if none has; of these, the best explainable one.
 
-    Findings with named effects come first. Among equals it is the one of whose error a black box
-    explains most.
+    That is the one of whose error a black box explains most.
     """
     return max(findings, key=lambda one: (bool(one.names), one.remaining.explainable))
 
