@@ -306,10 +306,7 @@ class RolloutSource(Source):
         return windows, {GIVEN: errors(self.start.theta), **named}
 
     def series(self, found: SearchResult, rollouts: Rollouts | None = None) -> Series:
-        """Return a held-out flight along the axis with the clearest error, see `Source`.
-
-        `rollouts` are those of `simulated`, if they were computed before.
-        """
+        """Return a held-out flight along the axis with the clearest error in `rollouts`."""
         windows, simulated = rollouts or self.simulated(found)
         rows = np.asarray(windows.flight) == windows.flight[0]
         groups = ("position", "velocity", "rates")
