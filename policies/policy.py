@@ -130,7 +130,7 @@ def load_policy(name_or_path: str | Path, trust: bool = False) -> Policy:
     if text in shipped.names():
         from policies.native import load_native
 
-        return load_native(shipped.folder(text), text)
+        return load_native(shipped.locate(text), text)
     path = Path(name_or_path)
     if path.suffix == ".c" and path.is_file() or _is_c_folder(path):
         from policies.formats.c.c_file import load_c

@@ -91,7 +91,7 @@ def evaluate_policy(
         ValueError: for an argument that cannot be used, before the first flight.
     """
     from eval.judging.judge import JudgeOptions, fly
-    from eval.judging.outputs import FromFile, check_rows
+    from eval.judging.outputs import check_rows
     from policies.policy import check_is_policy, load_policy
     from suite.judging.flying import policy_for_workers
     from suite.judging.requests import Evaluation
@@ -106,7 +106,7 @@ def evaluate_policy(
     evaluation = Evaluation(trials=trials, seed=seed, simulator=simulator, **request)
     is_source = isinstance(policy, str | Path)
     trial_set = read_trial_set(evaluation, repeated=not is_source, **objects)
-    tests = [] if is_source or isinstance(loaded, FromFile) else check_rows(loaded)
+    tests = [] if is_source or hasattr(loaded, "notes") else check_rows(loaded)
     for note in (*trial_set.differences, *trial_set.notes, *tests):
         warnings.warn(note, stacklevel=2)
     flown, processes = loaded, 1 if workers is None else workers

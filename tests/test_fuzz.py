@@ -142,7 +142,7 @@ def drawn_and_used(kind, folder):
         name, valid = "odd.toml", (ROOT / place).read_bytes()
         drawn = mutated_toml(valid.decode())
     elif kind == "checkpoint":
-        source = shipped.folder("race-paper")
+        source = shipped.locate("race-paper")
         (folder / "weights.safetensors").write_bytes((source / "weights.safetensors").read_bytes())
         name, valid = "config.json", (source / "config.json").read_bytes()
         drawn, read = mutated_json(json.loads(valid)), lambda _: load_policy_checkpoint(folder)

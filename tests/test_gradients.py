@@ -5,7 +5,6 @@ it. Every function is compared with finite differences at its special states and
 """
 
 from functools import cache
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +19,7 @@ from eval.quadrotor.attitude import (
     level_heading,
 )
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.vehicles.vehicle import Controller
 from suite.train.config import QuadrotorConfig
 from suite.train.dynamics import quadrotor
 from suite.train.dynamics.quadrotor import QuadrotorParams, quadrotor_dynamics
@@ -34,22 +34,19 @@ PADDED = np.concatenate([OPENING, OPENING[-1:], OPENING[-1:]])
 """A gate of four corners among gates of six."""
 
 
-class Loop(NamedTuple):
-    """An attitude loop whose rates are not clipped."""
-
-    attitude_gain: np.ndarray = np.array([8.0, 8.0, 4.0])
-    rate_max: np.ndarray = np.full(3, 100.0)
+LOOP = Controller((20.0, 20.0, 8.0), 500.0, rate_max=(100.0, 100.0, 100.0))
+"""An attitude loop whose rates are not clipped."""
 
 
 def commanded(force_w):
     """Wanted force to body rates, upright."""
-    return attitude_command(Loop(), force_w, jnp.asarray(LEVEL), jnp.asarray(X)).rate_b
+    return attitude_command(LOOP, force_w, jnp.asarray(LEVEL), jnp.asarray(X)).rate_b
 
 
 def tilted(turn):
     """Small turn of the body to body rates, in hover."""
     force_w = action_to_force(jnp.zeros(3), exp_rot(turn))
-    return attitude_command(Loop(), force_w, exp_rot(turn), jnp.asarray(X)).rate_b
+    return attitude_command(LOOP, force_w, exp_rot(turn), jnp.asarray(X)).rate_b
 
 
 def headed(to_gate_w):

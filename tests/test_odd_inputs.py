@@ -24,7 +24,7 @@ EXAMPLE = Path(example.__file__).parent
 
 def checkpoint(folder):
     """Return a copy of a shipped policy."""
-    return Path(shutil.copytree(shipped.folder("race-paper"), folder / "policy"))
+    return Path(shutil.copytree(shipped.locate("race-paper"), folder / "policy"))
 
 
 READ = {

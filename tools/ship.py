@@ -13,13 +13,12 @@ import argparse
 import json
 import shlex
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from policies import contract
 from policies.formats.checkpoint import CONFIG, WEIGHTS
 from policies.formats.policy_file import load_policy_checkpoint
-from policies.formats.spec_json import spec_to_json
 from suite.common import curve
 from suite.common.charts import curves_chart
 from suite.common.console import duration
@@ -91,7 +90,7 @@ def main() -> None:
         if options.speed is not None:
             spec = replace(load_policy_checkpoint(policy).spec, speed=options.speed)
             new_contract = contract.contract_of(spec, (spec.hidden_size,)).to_json()
-            config |= {"spec": spec_to_json(spec), contract.KEY: new_contract}
+            config |= {"spec": asdict(spec), contract.KEY: new_contract}
         write_json(new / CONFIG, config)
         load_policy_checkpoint(new)  # refuses it before it replaces the shipped one
         (new / "curve.png").write_bytes(curves_chart({"training": curve.read(options.run)}))

@@ -16,8 +16,7 @@ from eval.effects import (
     drag,
     measurement,
     response,
-    rotor_flow,
-    rotor_inertia,
+    rotors,
     slung_load,
     thrust,
     weak_motor,
@@ -54,10 +53,10 @@ _BUILT_IN = (
     drag.QUADRATIC_DRAG,
     drag.ROTOR_DRAG,
     drag.HUB_DRAG,
-    rotor_flow.INFLOW,
-    rotor_flow.TRANSLATIONAL_LIFT,
-    rotor_flow.BLADE_FLAPPING,
-    rotor_flow.GROUND_EFFECT,
+    rotors.INFLOW,
+    rotors.TRANSLATIONAL_LIFT,
+    rotors.BLADE_FLAPPING,
+    rotors.GROUND_EFFECT,
     wind.CONSTANT_WIND,
     wind.GUSTS,
     response.MOTOR_LAG,
@@ -68,8 +67,8 @@ _BUILT_IN = (
     body.COM_OFFSET,
     body.TORQUE_TRIM,
     body.INERTIA_SCALE,
-    rotor_inertia.ROTOR_GYROSCOPIC,
-    rotor_inertia.ROTOR_SPIN_UP,
+    rotors.ROTOR_GYROSCOPIC,
+    rotors.ROTOR_SPIN_UP,
     response.RATE_GAIN,
     drag.ANGULAR_DAMPING,
     weak_motor.WEAK_MOTOR,
@@ -90,15 +89,6 @@ EFFECTS: Registry[Effect] = Registry(
     _registration_error,
 )
 """All effects by name, those of other packages included."""
-
-
-def find_effect(name: str) -> Effect:
-    """Return the effect called `name`.
-
-    Raises:
-        ValueError: for an unknown name; the message has the most similar known name.
-    """
-    return EFFECTS.find(name)
 
 
 def nameable_effects() -> list[str]:

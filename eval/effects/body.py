@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eval.effects.interface import Array, Constants, Effect, Flow, Parameter
+from eval.effects.interface import Array, Effect, Parameter
 
 
 class MassOffset(NamedTuple):
@@ -12,11 +12,6 @@ class MassOffset(NamedTuple):
 
     offset: Array
     """(...,) true mass minus nominal mass [kg]."""
-
-
-def mass_offset_constants(values: MassOffset, constants: Constants) -> Constants:
-    """Return the constants with the offset added to the mass; the inertia is unchanged."""
-    return constants._replace(mass=constants.mass + values.offset)
 
 
 MASS_OFFSET = Effect(
@@ -36,7 +31,8 @@ MASS_OFFSET = Effect(
             signs=(1, -1),
         ),
     ),
-    constants=mass_offset_constants,
+    # The inertia is unchanged.
+    constants=lambda values, constants: constants._replace(mass=constants.mass + values.offset),
 )
 
 
@@ -45,18 +41,6 @@ class ComOffset(NamedTuple):
 
     offset: Array
     """(..., 3) true centre of mass minus nominal one, body axes [m]."""
-
-
-def com_offset_constants(values: ComOffset, constants: Constants) -> Constants:
-    """Return the constants with rotor positions relative to the true centre of mass.
-
-    Positions in logs and in the simulation refer to the true centre of mass, and so does the
-    inertia.
-    """
-    return constants._replace(
-        com_offset_b=constants.com_offset_b + values.offset,
-        rotor_position_b=constants.rotor_position_b - values.offset[..., None, :],
-    )
 
 
 COM_OFFSET = Effect(
@@ -78,7 +62,11 @@ COM_OFFSET = Effect(
             direction=(0.6, 0.8, 0.0),
         ),
     ),
-    constants=com_offset_constants,
+    # Positions in logs and in the simulation refer to the true centre of mass, as does the inertia.
+    constants=lambda values, constants: constants._replace(
+        com_offset_b=constants.com_offset_b + values.offset,
+        rotor_position_b=constants.rotor_position_b - values.offset[..., None, :],
+    ),
 )
 
 
@@ -87,11 +75,6 @@ class TorqueTrim(NamedTuple):
 
     torque: Array
     """(..., 3) torque about body x, y, z [N m]."""
-
-
-def torque_trim_torque(values: TorqueTrim, flow: Flow) -> Array:
-    """Return the constant torque (..., 3) [N m]."""
-    return values.torque
 
 
 TORQUE_TRIM = Effect(
@@ -112,7 +95,7 @@ TORQUE_TRIM = Effect(
             direction=(0.6, 0.8, 0.0),
         ),
     ),
-    torque=torque_trim_torque,
+    torque=lambda values, flow: values.torque,
 )
 
 
@@ -121,11 +104,6 @@ class InertiaScale(NamedTuple):
 
     scale: Array
     """(..., 3) true inertia divided by nominal inertia, about each body axis."""
-
-
-def inertia_scale_constants(values: InertiaScale, constants: Constants) -> Constants:
-    """Return the constants with the inertia scaled per axis."""
-    return constants._replace(inertia=constants.inertia * values.scale)
 
 
 INERTIA_SCALE = Effect(
@@ -146,5 +124,7 @@ INERTIA_SCALE = Effect(
             signs=(1, -1),
         ),
     ),
-    constants=inertia_scale_constants,
+    constants=lambda values, constants: constants._replace(
+        inertia=constants.inertia * values.scale
+    ),
 )

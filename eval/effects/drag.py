@@ -19,11 +19,6 @@ class LinearDrag(NamedTuple):
     """(..., 3) D: drag along body x, y, z per mass and airspeed [1/s]."""
 
 
-def linear_drag_force(values: LinearDrag, flow: Flow) -> Array:
-    """Return -m D v_b (..., 3) [N], with the true mass."""
-    return -per_axis(flow.constants.mass) * values.coefficient * flow.air_vel_b
-
-
 LINEAR_DRAG = Effect(
     name="linear_drag",
     summary="Drag proportional to the airspeed",
@@ -33,7 +28,7 @@ LINEAR_DRAG = Effect(
     parameters=(
         Parameter("coefficient", "1/s", neutral=0.0, low=0.0, high=5.0, typical=(0.2, 0.5), size=3),
     ),
-    force=linear_drag_force,
+    force=lambda values, flow: -per_axis(flow.constants.mass) * values.coefficient * flow.air_vel_b,
 )
 
 
@@ -104,16 +99,6 @@ class HubDrag(NamedTuple):
     """(...,) c: drag along body z, per speed of the hub and rotor speed [kg/rad]."""
 
 
-def hub_drag_force(values: HubDrag, flow: Flow) -> Array:
-    """Return the sum of the rotors' drags (..., 3) [N]."""
-    return _hub_drags(values, flow).sum(axis=-2)
-
-
-def hub_drag_torque(values: HubDrag, flow: Flow) -> Array:
-    """Return the torque of the rotors' drags, which act at the hubs (..., 3) [N m]."""
-    return cross(flow.constants.rotor_position_b, _hub_drags(values, flow)).sum(axis=-2)
-
-
 def _hub_drags(values: HubDrag, flow: Flow) -> Array:
     """Return the drag of each rotor, -Omega_i diag(k, k, c) (v_b + w x r_i) (..., 4, 3) [N]."""
     turning_b = cross(flow.rate_b[..., None, :], flow.constants.rotor_position_b)
@@ -151,8 +136,10 @@ HUB_DRAG = Effect(
             fitted=False,
         ),
     ),
-    force=hub_drag_force,
-    torque=hub_drag_torque,
+    force=lambda values, flow: _hub_drags(values, flow).sum(axis=-2),
+    torque=lambda values, flow: cross(
+        flow.constants.rotor_position_b, _hub_drags(values, flow)
+    ).sum(axis=-2),
 )
 
 
@@ -161,11 +148,6 @@ class AngularDamping(NamedTuple):
 
     coefficient: Array
     """(..., 3) d: damping about body x, y, z per inertia [1/s]."""
-
-
-def angular_damping_torque(values: AngularDamping, flow: Flow) -> Array:
-    """Return -J d w (..., 3) [N m], with the true inertia."""
-    return -flow.constants.inertia * values.coefficient * flow.rate_b
 
 
 ANGULAR_DAMPING = Effect(
@@ -179,5 +161,5 @@ ANGULAR_DAMPING = Effect(
             "coefficient", "1/s", neutral=0.0, low=0.0, high=30.0, typical=(0.2, 3.0), size=3
         ),
     ),
-    torque=angular_damping_torque,
+    torque=lambda values, flow: -flow.constants.inertia * values.coefficient * flow.rate_b,
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eval.effects.interface import GRAVITY, Array, Constants, Effect, Parameter, Sample, tilted_e3
+from eval.effects.interface import GRAVITY, Array, Effect, Parameter, tilted_e3
 
 
 class GyroBias(NamedTuple):
@@ -12,11 +12,6 @@ class GyroBias(NamedTuple):
 
     bias: Array
     """(3,) logged minus true body rates [rad/s]."""
-
-
-def gyro_bias_measured(values: GyroBias, sample: Sample) -> Sample:
-    """Return the sample with the bias added to `rate_b`."""
-    return sample._replace(rate_b=sample.rate_b + values.bias)
 
 
 GYRO_BIAS = Effect(
@@ -28,7 +23,7 @@ GYRO_BIAS = Effect(
     parameters=(
         Parameter("bias", "rad/s", neutral=0.0, low=-2.0, high=2.0, typical=(0.01, 0.2), size=3),
     ),
-    measure=gyro_bias_measured,
+    measure=lambda values, sample: sample._replace(rate_b=sample.rate_b + values.bias),
     of_log=True,
 )
 
@@ -40,11 +35,6 @@ class AccelerometerBias(NamedTuple):
     """(3,) logged minus true specific force, body axes [m/s^2]."""
 
 
-def accelerometer_bias_measured(values: AccelerometerBias, sample: Sample) -> Sample:
-    """Return the sample with the bias added to `acc_b`."""
-    return sample._replace(acc_b=sample.acc_b + values.bias)
-
-
 ACCELEROMETER_BIAS = Effect(
     name="accelerometer_bias",
     summary="A constant error of the logged accelerometer values",
@@ -54,7 +44,7 @@ ACCELEROMETER_BIAS = Effect(
     parameters=(
         Parameter("bias", "m/s^2", neutral=0.0, low=-10.0, high=10.0, typical=(0.05, 0.5), size=3),
     ),
-    measure=accelerometer_bias_measured,
+    measure=lambda values, sample: sample._replace(acc_b=sample.acc_b + values.bias),
     of_log=True,
     needs=("acc_b",),
 )
@@ -65,11 +55,6 @@ class FrameTilt(NamedTuple):
 
     angle: Array
     """(..., 2) tilt of gravity about world x, then y [rad]."""
-
-
-def frame_tilt_constants(values: FrameTilt, constants: Constants) -> Constants:
-    """Return the constants with gravity along Rot(a_x, a_y, 0) (0, 0, -1)."""
-    return constants._replace(gravity_w=-GRAVITY * tilted_e3(values.angle))
 
 
 FRAME_TILT = Effect(
@@ -90,7 +75,9 @@ FRAME_TILT = Effect(
             direction=(0.6, 0.8),
         ),
     ),
-    constants=frame_tilt_constants,
+    constants=lambda values, constants: constants._replace(
+        gravity_w=-GRAVITY * tilted_e3(values.angle)
+    ),
     of_log=True,
 )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eval.effects.interface import Array, Constants, Effect, Parameter
+from eval.effects.interface import Array, Effect, Parameter
 
 
 class MotorLag(NamedTuple):
@@ -12,11 +12,6 @@ class MotorLag(NamedTuple):
 
     time_constant: Array
     """(...,) tau_m: time constant with which the rotor speeds follow their commands [s]."""
-
-
-def motor_lag_constants(values: MotorLag, constants: Constants) -> Constants:
-    """Return the constants with this rotor time constant instead of the vehicle file's."""
-    return constants._replace(time_constant=values.time_constant)
 
 
 MOTOR_LAG = Effect(
@@ -36,7 +31,7 @@ MOTOR_LAG = Effect(
             whole=True,
         ),
     ),
-    constants=motor_lag_constants,
+    constants=lambda values, constants: constants._replace(time_constant=values.time_constant),
     needs=("command",),
 )
 
@@ -46,11 +41,6 @@ class CommandDelay(NamedTuple):
 
     delay: Array
     """(...,) additional delay of the commands [s]."""
-
-
-def command_delay_constants(values: CommandDelay, constants: Constants) -> Constants:
-    """Return the constants with this delay added."""
-    return constants._replace(delay=constants.delay + values.delay)
 
 
 COMMAND_DELAY = Effect(
@@ -70,7 +60,7 @@ COMMAND_DELAY = Effect(
             tried=(0.01, 0.02, 0.03, 0.04),
         ),
     ),
-    constants=command_delay_constants,
+    constants=lambda values, constants: constants._replace(delay=constants.delay + values.delay),
     needs=("command",),
 )
 
@@ -80,11 +70,6 @@ class RateGain(NamedTuple):
 
     scale: Array
     """(..., 3) true gain divided by nominal gain, about each body axis."""
-
-
-def rate_gain_constants(values: RateGain, constants: Constants) -> Constants:
-    """Return the constants with the rate loop's gain scaled per axis."""
-    return constants._replace(rate_gain=constants.rate_gain * values.scale)
 
 
 RATE_GAIN = Effect(
@@ -98,6 +83,8 @@ RATE_GAIN = Effect(
             "scale", "1", neutral=1.0, low=0.1, high=5.0, typical=(0.1, 0.3), size=3, signs=(-1, 1)
         ),
     ),
-    constants=rate_gain_constants,
+    constants=lambda values, constants: constants._replace(
+        rate_gain=constants.rate_gain * values.scale
+    ),
     needs=("command",),
 )

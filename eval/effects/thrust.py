@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eval.effects.interface import Array, Constants, Effect, Flow, Parameter, per_axis, tilted_e3
+from eval.effects.interface import Array, Effect, Flow, Parameter, per_axis, tilted_e3
 
 
 class ThrustScale(NamedTuple):
@@ -12,13 +12,6 @@ class ThrustScale(NamedTuple):
 
     scale: Array
     """(...,) true thrust coefficient k_T divided by nominal k_T."""
-
-
-def thrust_scale_constants(values: ThrustScale, constants: Constants) -> Constants:
-    """Return the constants with k_T scaled and the torque coefficient k_Q unchanged."""
-    return constants._replace(
-        thrust_coefficient=constants.thrust_coefficient * per_axis(values.scale)
-    )
 
 
 THRUST_SCALE = Effect(
@@ -32,7 +25,9 @@ THRUST_SCALE = Effect(
             "scale", "1", neutral=1.0, low=0.3, high=2.0, typical=(0.05, 0.15), signs=(-1, 1)
         ),
     ),
-    constants=thrust_scale_constants,
+    constants=lambda values, constants: constants._replace(
+        thrust_coefficient=constants.thrust_coefficient * per_axis(values.scale)
+    ),
 )
 
 
@@ -59,11 +54,6 @@ def battery_sag_thrust(values: BatterySag, flow: Flow, thrust: Array) -> Array:
         # Written as a sum, so that the gradient for per_volt exists at 0, where a fit starts.
         lost = values.per_volt * flow.voltage_drop + xp.where(values.per_volt == 0.0, by_time, 0.0)
     return thrust * per_axis(xp.maximum(xp.asarray(1.0 - lost), 0.0))
-
-
-def battery_sag_by_voltage(values: BatterySag, fall: float) -> BatterySag:
-    """Return values per volt that equal `values.rate` for a voltage drop of `fall` [V/s]."""
-    return BatterySag(0.0, values.rate / fall)
 
 
 BATTERY_SAG = Effect(
@@ -96,7 +86,7 @@ BATTERY_SAG = Effect(
     ),
     thrust=battery_sag_thrust,
     slow=True,
-    with_voltage=battery_sag_by_voltage,
+    with_voltage=lambda values, fall: BatterySag(0.0, values.rate / fall),
 )
 
 
@@ -105,11 +95,6 @@ class ThrustTilt(NamedTuple):
 
     angle: Array
     """(..., 2) tilt of the thrust about body x, then y [rad]."""
-
-
-def thrust_tilt_constants(values: ThrustTilt, constants: Constants) -> Constants:
-    """Return the constants with the thrust's axis tilted; torques are unchanged."""
-    return constants._replace(thrust_axis_b=tilted_e3(values.angle))
 
 
 THRUST_TILT = Effect(
@@ -130,5 +115,5 @@ THRUST_TILT = Effect(
             direction=(0.6, 0.8),
         ),
     ),
-    constants=thrust_tilt_constants,
+    constants=lambda values, constants: constants._replace(thrust_axis_b=tilted_e3(values.angle)),
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from eval.effects.interface import Array, Constants, Effect, Parameter
+from eval.effects.interface import Array, Effect, Parameter
 from tracks.input.ranges import is_number, shown
 
 
@@ -15,14 +15,6 @@ class WeakMotor(NamedTuple):
     scale: Array
     """(..., 4) thrust and torque of each rotor, relative to nominal; with `index = 2`, a number for
     this rotor alone."""
-
-
-def constants_of(values: WeakMotor, constants: Constants) -> Constants:
-    """Return the constants with each rotor's k_T and k_Q scaled."""
-    return constants._replace(
-        thrust_coefficient=constants.thrust_coefficient * values.scale,
-        torque_coefficient=constants.torque_coefficient * values.scale,
-    )
 
 
 def read(table: Mapping[str, Any]) -> WeakMotor:
@@ -89,7 +81,10 @@ WEAK_MOTOR = Effect(
             one_at_a_time=True,
         ),
     ),
-    constants=constants_of,
+    constants=lambda values, constants: constants._replace(
+        thrust_coefficient=constants.thrust_coefficient * values.scale,
+        torque_coefficient=constants.torque_coefficient * values.scale,
+    ),
     read=read,
     write=write,
 )

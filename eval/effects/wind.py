@@ -14,11 +14,6 @@ class ConstantWind(NamedTuple):
     """(..., 3) velocity of the air in the world [m/s]."""
 
 
-def constant_wind_wind(values: ConstantWind, gust: Gust) -> Array:
-    """Return the air's velocity in the world (..., 3) [m/s]."""
-    return values.velocity
-
-
 CONSTANT_WIND = Effect(
     name="constant_wind",
     summary="Steady wind; acts through the effects that use the airspeed",
@@ -37,7 +32,7 @@ CONSTANT_WIND = Effect(
             direction=(-0.6, 0.8, 0.0),
         ),
     ),
-    wind=constant_wind_wind,
+    wind=lambda values, gust: values.velocity,
 )
 
 

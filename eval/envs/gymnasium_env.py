@@ -80,7 +80,27 @@ def seeds_of(seed: Any, count: int) -> list[int | None]:
     return [None if each is None else int(each) for each in seeds]
 
 
-class RaceEnv(gymnasium.Env):
+class _OfRaces:
+    """What the two environments have in common: their contract, and copies before `reset`."""
+
+    _races: Races
+    _arguments: dict[str, Any]
+    """Arguments of the environment, in addition to the fields of its `RaceConfig`."""
+
+    @property
+    def contract(self) -> Contract:
+        """The contract for the file of a policy that is trained here."""
+        return self._races.contract
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        return self.__reduce__()[0](*self.__reduce__()[1])
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        """Return the arguments for pickling; the copy is a new environment before `reset`."""
+        return _make, (type(self), vars(self._races.config), self._arguments)
+
+
+class RaceEnv(_OfRaces, gymnasium.Env):
     """Fly through the gates of a track in order, by the rules of the judge.
 
     The judge is the part of the suite that flies policies and scores them. Each component of an
@@ -111,15 +131,10 @@ class RaceEnv(gymnasium.Env):
         self._races = Races(RaceConfig(**config), 1)
         self.action_space = action_space(self._races.spec)
         self.observation_space = observation_space(self._races.spec)
-        self.render_mode = render_mode
+        self.render_mode, self._arguments = render_mode, {"render_mode": render_mode}
         self.metadata = {**self.metadata, "render_fps": round(self._races.spec.rate_hz)}
         self._started = False
         self._scenery: Scenery | None = None
-
-    @property
-    def contract(self) -> Contract:
-        """The contract for the file of a policy that is trained here."""
-        return self._races.contract
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -172,15 +187,8 @@ class RaceEnv(gymnasium.Env):
         picture = chase_image(self._scenery, drone, view.vel_w[0], RENDER_SIZE)
         return inset(picture, view.depth_m[0], self._races.spec.camera.range_m, INSET)
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> RaceEnv:
-        return self.__reduce__()[0](*self.__reduce__()[1])
 
-    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
-        """Return the arguments for pickling; the copy is a new environment before `reset`."""
-        return _make, (type(self), vars(self._races.config), {"render_mode": self.render_mode})
-
-
-class RaceVectorEnv(VectorEnv):
+class RaceVectorEnv(_OfRaces, VectorEnv):
     """N races at once in one process; the results equal those of N `RaceEnv` to the bit.
 
     Autoreset is `SAME_STEP`: a step that ends an episode returns the first observation of the next
@@ -213,11 +221,6 @@ class RaceVectorEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._rngs: list[np.random.Generator] = []
-
-    @property
-    def contract(self) -> Contract:
-        """The contract for the file of a policy that is trained here."""
-        return self._races.contract
 
     def reset(
         self,
@@ -273,12 +276,6 @@ class RaceVectorEnv(VectorEnv):
         for slot in slots:
             infos = self._add_info(infos, self._races.info(slot), slot)
         return infos
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> RaceVectorEnv:
-        return self.__reduce__()[0](*self.__reduce__()[1])
-
-    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
-        return _make, (type(self), vars(self._races.config), self._arguments)
 
 
 def _make(cls: type, config: dict[str, Any], arguments: dict[str, Any]) -> Any:

@@ -5,8 +5,6 @@ A race is one trial (flight) by the rules of the judge, which flies policies and
 
 from __future__ import annotations
 
-import math
-
 import mujoco
 import numpy as np
 
@@ -14,26 +12,11 @@ from eval.judging.guard import check_rate
 from eval.quadrotor.autopilot import AutopilotState, autopilot_step, make_autopilot, start_autopilot
 from eval.quadrotor.plant import uses_noise
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds.engine import DepthCamera, compile_model, motion_of, start_state
-from eval.worlds.slots import gust_draws, layout_of
-from eval.worlds.trial import (
-    ENDINGS,
-    FLYING,
-    Course,
-    Progress,
-    Rules,
-    TrialSpec,
-    has_diverged,
-    is_wrench,
-    judge_state,
-    next_centre,
-    next_gate,
-    start_progress,
-)
+from eval.worlds.engine import DepthCamera, OneTrial, motion_of
+from eval.worlds.slots import GustDraws
+from eval.worlds.trial import ENDINGS, FLYING, Rules, TrialSpec, next_centre, next_gate
 from policies.observation import observe, view_of
 from policies.spec import PolicySpec, check_spec
-from tracks.geometry.rotation import to_world
-from tracks.geometry.scene import Gates
 from tracks.track import Track
 
 ACTION_LIMIT = 20.0
@@ -46,7 +29,7 @@ CRASH_REWARD = -1.0
 """Reward for an episode that fails, except by the time limit. With -5, PPO learns to hover."""
 
 
-class Race:
+class Race(OneTrial):
     """A trial by the judge's rules; the caller provides MuJoCo's `MjData`."""
 
     def __init__(self, track: Track, vehicle: Vehicle, spec: PolicySpec, rules: Rules) -> None:
@@ -55,8 +38,7 @@ class Race:
         Raises:
             ValueError: for a spec that this environment cannot fly.
         """
-        self.spec, self.rules = spec, rules
-        self.autopilot = make_autopilot(vehicle)
+        self.spec, self.autopilot = spec, make_autopilot(vehicle)
         check_spec(spec)
         check_rate("the spec", spec.rate_hz, vehicle.controller.frequency)
         if spec.action.kind != "acceleration" or not spec.action.is_plain:
@@ -69,22 +51,14 @@ class Race:
                 f"spec.depth is {spec.depth}, allowed is channel_axis=False and uint8=False; use "
                 "`RaceEnv` for other images"
             )
-        layout = layout_of([track])
-        self.model = compile_model(track, vehicle, self.autopilot.dt, layout.solids)
-        period = 1 / (spec.rate_hz * self.autopilot.dt)
-        self.steps_a_decision = max(1, round(period))
+        super().__init__(track, vehicle, self.autopilot.dt, rules)
+        self.steps_a_decision = max(1, round(1 / (spec.rate_hz * self.autopilot.dt)))
         """Number of physics steps between decisions, rounded to a constant."""
-        self._start = start_state(track)
-        gates = Gates(*(np.asarray(field)[None] for field in track.scene.gates))
-        self._course = Course(gates, np.array([gates.center_w.shape[1]], np.int32))
-        self._noise: np.ndarray | None = None
+        self._gusts: GustDraws | None = None
         if uses_noise(self.autopilot.plant):
-            trial = TrialSpec(track.family, track.level, track.seed)
-            steps = round(rules.time_limit_s / self.autopilot.dt)
-            self._noise = gust_draws(trial, steps + math.ceil(period) + 2)
+            self._gusts = GustDraws(TrialSpec(track.family, track.level, track.seed))
         self._eye = DepthCamera(spec.camera)
         self._loops: AutopilotState
-        self.progress: Progress
         self.action_b = np.zeros((1, 3))
 
     @property
@@ -95,14 +69,11 @@ class Race:
 
     def place(self, data: mujoco.MjData) -> None:
         """Put the hovering quadrotor at the start; `data` has just been reset."""
-        data.qpos[:], data.qvel[:] = self._start, 0.0
-        mujoco.mj_step1(self.model, data)
-        motion = motion_of(data)
-        noise = None if self._noise is None else self._noise[:1]
+        motion = self.put_at_start(data)
+        noise = self._gusts and self._gusts.at(0, 1)
         self._loops = start_autopilot(self.autopilot, motion, noise)
-        self.progress = start_progress(motion.pos_w)
         self.action_b = np.zeros((1, 3))
-        self._judge(data, bad_wrench=False)
+        self.judge(data, np.array([False]))
 
     def advance(self, data: mujoco.MjData, action_b: np.ndarray, steps: int) -> float:
         """Fly an action for some physics steps, or until the episode ends; return the reward.
@@ -126,54 +97,29 @@ class Race:
         for _ in range(steps):
             if self.progress.ended[0] != FLYING:
                 break
-            progress_before = self.progress
-            motion, step = motion_of(data), progress_before.step
-            gate_w = next_centre(self._course, progress_before.gates)
-            noise = None if self._noise is None else self._noise[step + 1]
+            motion, step = motion_of(data), self.progress.step
+            gate_w = next_centre(self.course, self.progress.gates)
+            noise = self._gusts and self._gusts.at(int(step[0]) + 1, 1)
             self._loops, wrench = autopilot_step(
                 self.autopilot, self._loops, motion, self.action_b, gate_w, step, noise
             )
-            valid = bool(is_wrench(self.rules, wrench)[0])
-            if valid:
-                data.qfrc_applied[:3] = to_world(motion.rot_w, wrench.force_b)[0]
-                data.qfrc_applied[3:] = wrench.torque_b[0]
-                mujoco.mj_step2(self.model, data)
-            self.progress = progress_before._replace(step=step + np.int32(1))
-            if valid and not has_diverged(self.rules, motion_of(data))[0]:
-                mujoco.mj_step1(self.model, data)
-                self._judge(data, bad_wrench=False)
-            else:
-                self._judge(data, bad_wrench=True)
+            self.move(data, motion, wrench)
         passed = int(self.progress.gates[0]) - gates_before
         reward = path_before - self._remaining_path() + GATE_REWARD * passed
         crashed = self.ended_by not in (None, "finished", "timeout")
         return reward + CRASH_REWARD * crashed
 
     def _remaining_path(self) -> float:
-        progress, centres_w = self.progress, self._course.gates.center_w[0]
+        progress, centres_w = self.progress, self.course.gates.center_w[0]
         return remaining_path(progress.pos_w[0], centres_w, int(progress.gates[0]))
-
-    def _judge(self, data: mujoco.MjData, bad_wrench: bool) -> None:
-        """Update the progress (gates, collision, time, ...) by the judge's rules."""
-        motion = motion_of(data)
-        with np.errstate(invalid="ignore", over="ignore"):
-            self.progress = judge_state(
-                self.rules,
-                self.progress,
-                self._course,
-                self.autopilot.dt,
-                motion,
-                np.array([data.ncon > 0]),
-                np.array([bad_wrench]),
-            )
 
     def observation(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
         """Return the observation: `state` (spec.state_size,) and `image` (H, W), float32."""
         pos_w, rot_w, vel_w, _ = motion_of(data)
-        gate = next_gate(self._course, self.progress.gates)
+        gate = next_gate(self.course, self.progress.gates)
         if self.ended_by == "diverged":
             pos_w, rot_w, vel_w = self.progress.pos_w, np.eye(3)[None], np.zeros((1, 3))
-        second_gate = next_gate(self._course, self.progress.gates + 1)
+        second_gate = next_gate(self.course, self.progress.gates + 1)
         depth = self._eye.image(self.model, data, pos_w[0], rot_w[0])[None]
         view = view_of(pos_w, rot_w, vel_w, gate, second_gate, depth)
         state, image = (part[0] for part in observe(self.spec, view, self.action_b))

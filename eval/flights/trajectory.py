@@ -92,10 +92,6 @@ Path = Callable[[Trajectory, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarr
 """A function of a trajectory and its eased time u (T,) [s] that returns x, y and z, (T,) [m]."""
 
 
-def _hover(path: Trajectory, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return 0.0 * u, 0.0 * u, 0.0 * u
-
-
 def _figure_eight(path: Trajectory, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     phase = path.speed * EIGHT_FACTOR / path.size * u
     return path.size * np.sin(phase), 0.5 * path.size * np.sin(2.0 * phase), 0.2 * np.sin(phase)
@@ -117,10 +113,6 @@ def _speed_range(path: Trajectory, u: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _climb(path: Trajectory, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     phase = path.speed / path.size * u
     return 0.7 * path.size * np.sin(0.5 * phase), 0.0 * u, path.size * (1.0 - np.cos(phase))
-
-
-def _vertical(path: Trajectory, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return 0.0 * u, 0.0 * u, path.size * (1.0 - np.cos(path.speed / path.size * u))
 
 
 def _punches(path: Trajectory, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -146,12 +138,16 @@ def _low(path: Trajectory, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 KINDS: dict[str, Path] = {
-    "hover": _hover,
+    "hover": lambda path, u: (0.0 * u, 0.0 * u, 0.0 * u),
     "figure_eight": _figure_eight,
     "circle": _circle,
     "speed_range": _speed_range,
     "climb": _climb,
-    "vertical": _vertical,
+    "vertical": lambda path, u: (
+        0.0 * u,
+        0.0 * u,
+        path.size * (1.0 - np.cos(path.speed / path.size * u)),
+    ),  # fmt: skip
     "punches": _punches,
     "chirp": _chirp,
     "low": _low,
@@ -190,8 +186,8 @@ def ordinary_flights(rng: np.random.Generator, duration_s: float = 10.0) -> list
     ]
 
 
-def long_flights(rng: np.random.Generator, count: int = 3) -> list[Trajectory]:
-    """Return `count` random flights of a minute, for effects that change slowly."""
+def long_flights(rng: np.random.Generator) -> list[Trajectory]:
+    """Return three random flights of a minute, for effects that change slowly."""
     return [
         Trajectory(
             "figure_eight",
@@ -201,5 +197,5 @@ def long_flights(rng: np.random.Generator, count: int = 3) -> list[Trajectory]:
             direction=float(rng.uniform(0.0, 2.0 * np.pi)),
             turn="wobble",
         )
-        for _ in range(count)
+        for _ in range(3)
     ]

@@ -17,11 +17,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 from eval.judging.ages import Delays
-from eval.judging.filtered import Filtered, single_steps
 from eval.judging.guard import ActionLimits, call_policy, check_rate, first_action, limits_of
 from eval.judging.outputs import Outputs
 from eval.judging.recorder import Recorder
-from eval.judging.sensors import Sensors
+from eval.judging.sensors import Filtered, Sensors, single_steps
 from eval.logs.flight import Flight
 from eval.sensors import view_models
 from eval.sensors.sensors_file import PERFECT, SensorSet
@@ -159,9 +158,7 @@ def check_records(world: str) -> None:
         )
 
 
-def pieces_of(
-    trials: Sequence[Trial], processes: int, most: int = MOST_A_PIECE
-) -> list[Sequence[Trial]]:
+def pieces_of(trials: Sequence[Trial], processes: int, most: int) -> list[Sequence[Trial]]:
     """Divide trials into pieces of at most `most` trials, with equally many pieces a process.
 
     Small pieces lose little when a process dies, but at the end of each piece some slots are empty.

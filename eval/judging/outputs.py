@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
@@ -126,17 +126,13 @@ def _warnings(
     return notes
 
 
-@runtime_checkable
-class FromFile(Protocol):
-    """A policy that was loaded from a file."""
-
-    notes: tuple[Note, ...]
-    """Assumptions about the policy that its file does not state."""
-
-
 def notes_of(policy: Policy) -> tuple[Note, ...]:
-    """Return the assumptions about a policy's file, and the probable faults of its outputs."""
-    return (*policy.notes, *probable_faults(policy)) if isinstance(policy, FromFile) else ()
+    """Return the assumptions about a policy's file, and the probable faults of its outputs.
+
+    A policy object that is from no file has no `notes`.
+    """
+    notes = getattr(policy, "notes", None)
+    return () if notes is None else (*notes, *probable_faults(policy))
 
 
 def probable_faults(policy: Policy) -> tuple[Note, ...]:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eval.judging.statistics import Interval, bootstrap_median
+from eval.judging.statistics import Interval, bootstrap
 from eval.worlds.trial import TrialResult, TrialSpec
 
 VEHICLE = "reference"
@@ -73,6 +73,6 @@ def over_plan(results: Sequence[TrialResult]) -> list[OverPlan]:
         rows = [row for row in results if row.policy == policy and row.trial in plans()]
         ratios = [row.time_s / plans()[row.trial].lap_s for row in rows if row.success]
         if rows:
-            ratio = bootstrap_median(np.array(ratios))
+            ratio = bootstrap(np.array(ratios))
             comparisons.append(OverPlan(policy, ratio, len(ratios), len(rows)))
     return comparisons

@@ -31,22 +31,16 @@ flight is empty if its trial ended at the start."""
 class Recorder:
     """Collects the rows of the flights in N slots, and returns a slot's flight at its end."""
 
-    def __init__(
-        self,
-        slots: int,
-        depth: bool,
-        first: np.ndarray | None = None,
-        action_kind: str = "acceleration",
-    ) -> None:
+    def __init__(self, slots: int, depth: bool, first: np.ndarray, action_kind: str) -> None:
         """Make a recorder.
 
         Depth images take 3 kB each at 24 x 32 pixels. The action `first` (size,) is recorded before
-        the first decision; None: an acceleration of zero (3,).
+        the first decision.
         """
         self._depth, self._action_kind = depth, action_kind
         self._rows: list[list[tuple[Any, ...]]] = [[] for _ in range(slots)]
         self._images: list[list[np.ndarray]] = [[] for _ in range(slots)]
-        self._first = np.zeros(3) if first is None else first
+        self._first = first
         self._action = np.tile(self._first, (slots, 1))
         self._is_new = np.zeros(slots, bool)
         self._last_image = [np.zeros(0, np.float32)] * slots
@@ -81,24 +75,11 @@ class Recorder:
         columns = [np.array(column) for column in zip(*rows, strict=True)]
         if not self._rows[slot]:
             columns = [column[:0] for column in columns]
-        time_s, pos, quat, vel, rate, thrust, rate_cmd, rotor, gate, action, is_new = columns
+        *states, gate, action, is_new = columns
         images = None
         if self._depth:
             images = np.stack(self._images[slot]) if self._images[slot] else np.zeros((0, 0, 0))
             images = images.astype(np.float32)
-        return Flight(
-            time_s,
-            pos,
-            quat,
-            vel,
-            rate,
-            thrust,
-            rate_cmd,
-            rotor,
-            action,
-            is_new,
-            gate.astype(np.int32),
-            images,
-            about,
-            self._action_kind,
-        )
+        gate = gate.astype(np.int32)
+        values: Any = (*states, action, is_new, gate, images, about, self._action_kind)
+        return Flight(*values)

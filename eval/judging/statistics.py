@@ -42,7 +42,7 @@ class PairedDifference(NamedTuple):
     """Number of trials in which only the second succeeded."""
 
 
-def wilson(successes: float, trials: int, confidence: float = CONFIDENCE) -> Interval:
+def wilson(successes: float, trials: int) -> Interval:
     """Return the success rate with its score interval (Wilson 1927, no continuity correction).
 
     A trial that was flown several times counts with its mean.
@@ -55,7 +55,7 @@ def wilson(successes: float, trials: int, confidence: float = CONFIDENCE) -> Int
             f"{successes} successes in {trials} trials: expected 0 <= successes <= trials and at "
             "least one trial"
         )
-    z = NormalDist().inv_cdf((1 + confidence) / 2)
+    z = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
     rate = successes / trials
     middle = (rate + z * z / (2 * trials)) / (1 + z * z / trials)
     half = z / (1 + z * z / trials) * sqrt(rate * (1 - rate) / trials + (z / (2 * trials)) ** 2)
@@ -65,24 +65,29 @@ def wilson(successes: float, trials: int, confidence: float = CONFIDENCE) -> Int
     return Interval(rate, low, high)
 
 
-def bootstrap_median(
-    values: np.ndarray, seed: int = 0, confidence: float = CONFIDENCE, resamples: int = 4000
+def bootstrap(
+    values: np.ndarray,
+    seed: int = 0,
+    statistic: Callable[..., np.ndarray] = np.median,
+    resamples: int = 4000,
 ) -> Interval:
-    """Return the median of values (n,) with its percentile bootstrap interval (Efron 1979).
+    """Return a statistic of values (n,) with its percentile bootstrap interval (Efron 1979).
 
     Without values, estimate and interval are NaN. The same seed gives the same interval.
     """
-    return _bootstrap(np.median, values, seed, confidence, resamples)
-
-
-def bootstrap_mean(
-    values: np.ndarray, seed: int = 0, confidence: float = CONFIDENCE, resamples: int = 4000
-) -> Interval:
-    """Return the mean of values (n,) with its percentile bootstrap interval (Efron 1979).
-
-    Without values, estimate and interval are NaN. The same seed gives the same interval.
-    """
-    return _bootstrap(np.mean, values, seed, confidence, resamples)
+    values = np.asarray(values, float)
+    if not len(values):
+        return Interval(float("nan"), float("nan"), float("nan"))
+    rng, rows = np.random.default_rng(seed), max(1, AT_ONCE // len(values))
+    resampled = np.concatenate(
+        [
+            statistic(values[rng.integers(0, len(values), (count, len(values)))], axis=1)
+            for count in [rows] * (resamples // rows) + [resamples % rows]
+            if count
+        ]
+    )
+    low, high = np.quantile(resampled, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Interval(float(statistic(values)), float(low), float(high))
 
 
 def expected_largest(values: np.ndarray, among: int) -> float | None:
@@ -98,32 +103,7 @@ def expected_largest(values: np.ndarray, among: int) -> float | None:
     return float(np.sort(values) @ np.array(probability))
 
 
-def _bootstrap(
-    statistic: Callable[..., np.ndarray],
-    values: np.ndarray,
-    seed: int,
-    confidence: float,
-    resamples: int,
-) -> Interval:
-    """Return a statistic of values (n,) with its percentile interval, in batches of resamples."""
-    values = np.asarray(values, float)
-    if not len(values):
-        return Interval(float("nan"), float("nan"), float("nan"))
-    rng, rows = np.random.default_rng(seed), max(1, AT_ONCE // len(values))
-    resampled = np.concatenate(
-        [
-            statistic(values[rng.integers(0, len(values), (count, len(values)))], axis=1)
-            for count in [rows] * (resamples // rows) + [resamples % rows]
-            if count
-        ]
-    )
-    low, high = np.quantile(resampled, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return Interval(float(statistic(values)), float(low), float(high))
-
-
-def paired_bootstrap(
-    first: np.ndarray, second: np.ndarray, seed: int = 0, confidence: float = CONFIDENCE
-) -> Interval:
+def paired_bootstrap(first: np.ndarray, second: np.ndarray, seed: int = 0) -> Interval:
     """Return the median of first - second with its interval; both are (n,), on the same trials.
 
     Raises:
@@ -131,7 +111,7 @@ def paired_bootstrap(
     """
     if len(first) != len(second):
         raise ValueError(f"{len(first)} values against {len(second)}: pairs need as many of each")
-    return bootstrap_median(np.asarray(first, float) - np.asarray(second, float), seed, confidence)
+    return bootstrap(np.asarray(first, float) - np.asarray(second, float), seed)
 
 
 def mcnemar_exact(only_first: int, only_second: int) -> float:
@@ -144,9 +124,7 @@ def mcnemar_exact(only_first: int, only_second: int) -> float:
     return min(1.0, 2 * tail / 2**n)
 
 
-def paired_success(
-    first: np.ndarray, second: np.ndarray, confidence: float = CONFIDENCE
-) -> PairedDifference:
+def paired_success(first: np.ndarray, second: np.ndarray) -> PairedDifference:
     """Return the difference of two success rates on the same trials.
 
     The interval is that of Newcombe (1998, method 10): Wilson intervals combined by the
@@ -162,8 +140,8 @@ def paired_success(
     n = len(first)
     both, neither = int((first & second).sum()), int((~first & ~second).sum())
     only_first, only_second = int((first & ~second).sum()), int((~first & second).sum())
-    rate_1 = wilson(both + only_first, n, confidence)
-    rate_2 = wilson(both + only_second, n, confidence)
+    rate_1 = wilson(both + only_first, n)
+    rate_2 = wilson(both + only_second, n)
     product = (
         (both + only_first)
         * (only_second + neither)
@@ -189,9 +167,7 @@ def paired_success(
     )
 
 
-def over_seeds(
-    first: np.ndarray, second: np.ndarray | None = None, seed: int = 0, draws: int = 4000
-) -> Interval:
+def over_seeds(first: np.ndarray, second: np.ndarray | None = None, draws: int = 4000) -> Interval:
     """Return a mean, or the difference of two means, with its 95 % interval.
 
     The interval is over training seeds and trials.
@@ -204,7 +180,6 @@ def over_seeds(
     Args:
         first: (S, T) values, such as successes, of S training seeds on T trials.
         second: (R, T) values of another method on the same trials, which are subtracted.
-        seed: seed of the random numbers.
         draws: number of resamples.
 
     Raises:
@@ -228,7 +203,7 @@ def over_seeds(
     # Variance of the mean: between trials, plus between seeds, less the noise that both contain.
     variance = float(np.var(trial_means, ddof=1)) / trial_count
     variances, part_degrees = [variance], [trial_count - 1.0]
-    rng, resampled = np.random.default_rng(seed), np.zeros(draws)
+    rng, resampled = np.random.default_rng(0), np.zeros(draws)
     trials = (
         rng.multinomial(trial_count, np.full(trial_count, 1 / trial_count), draws) / trial_count
     )

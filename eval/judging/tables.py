@@ -13,7 +13,7 @@ import numpy as np
 
 from eval.judging.statistics import (
     Interval,
-    bootstrap_median,
+    bootstrap,
     expected_largest,
     paired_bootstrap,
     paired_success,
@@ -104,7 +104,7 @@ def _cell(policy: str, track: str, difficulty: int, rows: list[TrialResult]) -> 
     seed = _seed(track, difficulty)
 
     def median(values: list[float]) -> Interval:
-        return bootstrap_median(np.array(values), seed)
+        return bootstrap(np.array(values), seed)
 
     return Tally(
         policy,

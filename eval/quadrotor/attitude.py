@@ -7,10 +7,11 @@ Brescianini and D'Andrea 2018).
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 from eval.effects.interface import GRAVITY
 from eval.quadrotor.plant import Command
+from eval.vehicles.vehicle import Controller
 from tracks.geometry.rotation import cross, to_local, to_world
 from tracks.geometry.scene import Array
 
@@ -20,20 +21,6 @@ LEAST_FORCE = 0.1
 """Wanted specific force [m/s^2] below which its direction is undefined, and the tilt is held."""
 SMALL = 1e-6
 """Length of a vector (or projection) below which its direction counts as undefined."""
-
-
-class AttitudeLoop(Protocol):
-    """Gains and limits of an attitude loop: those of a vehicle file, or (..., 3) arrays."""
-
-    @property
-    def attitude_gain(self) -> Any:
-        """Body rate per attitude error [1/s]."""
-        ...
-
-    @property
-    def rate_max(self) -> Any:
-        """Largest commanded body rates [rad/s]."""
-        ...
 
 
 def action_to_force(action_b: Array, rot_w: Array) -> Array:
@@ -48,7 +35,7 @@ def action_to_force(action_b: Array, rot_w: Array) -> Array:
 
 
 def attitude_command(
-    controller: AttitudeLoop, force_w: Array, rot_w: Array, heading_w: Array
+    controller: Controller, force_w: Array, rot_w: Array, heading_w: Array
 ) -> Command:
     """Return the thrust and body rates that turn body z to a force, and body x to a heading.
 
@@ -56,7 +43,7 @@ def attitude_command(
     held. A body that is upside down rolls about its x axis.
 
     Args:
-        controller: gains and limits.
+        controller: gain [1/s] and limits [rad/s] of the attitude loop.
         force_w: (..., 3) wanted specific force, world axes [m/s^2].
         rot_w: (..., 3, 3) current attitude, body to world.
         heading_w: (..., 3) wanted heading, a horizontal unit vector.

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.effects import EFFECTS, all_values, find_effect
+from eval.effects import EFFECTS, all_values
 from eval.effects.interface import GRAVITY, Array, Constants, as_arrays
 from eval.quadrotor.loops import NOMINAL, Loop, loop_of
 from eval.quadrotor.mixer import mixer_matrix, unequal_arms
@@ -122,7 +122,7 @@ def make_plant(
         ValueError: for an effect that is not in the catalogue.
     """
     effects = dict(vehicle.effects) if effects is None else effects
-    values = {find_effect(name).name: as_arrays(value) for name, value in effects.items()}
+    values = {EFFECTS.find(name).name: as_arrays(value) for name, value in effects.items()}
     return assemble(*nominal_quadrotor(vehicle), values, dt, max_delay, loop_of(vehicle))
 
 

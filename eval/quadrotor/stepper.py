@@ -32,7 +32,7 @@ from eval.quadrotor.plant import (
     uses_memory,
     uses_rotor_acc,
 )
-from eval.quadrotor.rotors import RotorStep, delayed, follow, speed_command, steady
+from eval.quadrotor.rotors import delayed, follow, speed_command, steady
 
 
 class PlantState(NamedTuple):
@@ -153,18 +153,6 @@ def loop_update(
     return memory, speed_command(thrust, nominal.thrust_coefficient)
 
 
-def rotor_step(
-    plant: Plant, state: PlantState, command: Any, rate_b: Array, speed_cmd: Array | None = None
-) -> tuple[PlantState, RotorStep]:
-    """Return the plant's state after one step of rate loop and rotors, and the rotors' step.
-
-    The arguments are those of `rotor_command`.
-    """
-    state, wanted = rotor_command(plant, state, command, rate_b, speed_cmd)
-    rotors = follow(state.rotor_speed, wanted, plant.constants.time_constant, plant.dt)
-    return state._replace(rotor_speed=rotors.end), rotors
-
-
 def rotor_command(
     plant: Plant, state: PlantState, command: Any, rate_b: Array, speed_cmd: Array | None = None
 ) -> tuple[PlantState, Array]:
@@ -199,9 +187,9 @@ def plant_step(
     speed_before = state.rotor_speed
     if inputs.rotor_speed is not None:
         rotors = steady(inputs.rotor_speed)
-        state = state._replace(rotor_speed=rotors.end)
     else:
-        state, rotors = rotor_step(plant, state, inputs.command, motion.rate_b, inputs.speed_cmd)
+        state, wanted = rotor_command(plant, state, inputs.command, motion.rate_b, inputs.speed_cmd)
+        rotors = follow(speed_before, wanted, plant.constants.time_constant, plant.dt)
     winds, flow = wind_and_flow(
         plant, state.wind, motion, rotors, time_s, inputs.noise, inputs.voltage_drop
     )
@@ -209,7 +197,7 @@ def plant_step(
         flow = flow._replace(rotor_acc=(rotors.end - speed_before) / plant.dt)
     wrench = with_push(plant, wrench_on(plant, rotors, flow, state.carried), inputs.push_b)
     carried = _next_states(plant, state.carried, motion, flow, wrench)
-    return state._replace(wind=winds, carried=carried), wrench
+    return state._replace(rotor_speed=rotors.end, wind=winds, carried=carried), wrench
 
 
 def step(

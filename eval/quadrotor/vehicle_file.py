@@ -13,7 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from eval.effects import EFFECTS, find_effect
+from eval.effects import EFFECTS
 from eval.effects.interface import Effect, bound_value
 from eval.quadrotor.loops import KINDS, NOMINAL
 from eval.vehicles.vehicle import CollisionBox, Controller, MotorMap, Rotors, Vector, Vehicle
@@ -128,7 +128,7 @@ def _effects(tables: Table, vehicle: Vehicle) -> dict[str, Any]:
     """Return the values of the tables [effects.NAME], by name, checked against their bounds."""
     values_of = {}
     for name in tables.values:
-        effect, table = find_effect(name), tables.table(name)
+        effect, table = EFFECTS.find(name), tables.table(name)
         if effect.read:
             try:
                 values_of[name] = effect.read(table.values)

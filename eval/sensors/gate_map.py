@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from eval.sensors.interface import Array, Moment, Needs, Parameter, Sensor, View, column, yaw_matrix
-from tracks.geometry.rotation import to_world
+from eval.sensors.interface import Array, Moment, Needs, Parameter, Sensor, View, column
+from tracks.geometry.rotation import to_world, yaw_rotation
 
 GATES = 32
 """Number of different gate errors; a track with more gates repeats them."""
@@ -70,9 +70,9 @@ def _in_map(
     xp = gate_w.__array_namespace__()
     moved_w = xp.take_along_axis(memory["moved_w"], number[..., None, None], axis=-2)[..., 0, :]
     turned = xp.take_along_axis(memory["turned"], number[..., None], axis=-1)[..., 0]
-    offset_w = to_world(yaw_matrix(memory["yaw"]), gate_w - memory["origin_w"])
+    offset_w = to_world(yaw_rotation(memory["yaw"]), gate_w - memory["origin_w"])
     mapped_w = memory["origin_w"] + column(memory["scale"]) * offset_w + memory["shift_w"] + moved_w
-    return mapped_w, to_world(yaw_matrix(memory["yaw"] + turned), axis_w)
+    return mapped_w, to_world(yaw_rotation(memory["yaw"] + turned), axis_w)
 
 
 SENSOR = Sensor(

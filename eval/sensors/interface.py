@@ -8,13 +8,18 @@ magnitudes of one model use the same numbers.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from policies.observation import View
 from tracks.geometry.camera import Camera
 from tracks.geometry.scene import Array
+
+if TYPE_CHECKING:
+    import jax
 
 Values = Any
 """The parameters of a model: its NamedTuple of floats or arrays (...,)."""
@@ -131,7 +136,7 @@ class Sensor:
     ages: Callable[[Values], Ages] | None = None
     """For a delay: returns the ages of the observation."""
     estimate: Callable[[Values], Any] | None = None
-    """For a state estimator: returns its `eval.sensors.filter.kalman.FilterSettings`."""
+    """For a state estimator: returns its settings, an `eval.sensors.gate_filter.GateFilter`."""
     measure: Callable[[Values, Memory, Inertial, Draws, Any], tuple[Inertial, Memory]] | None = None
     """For an inertial sensor: (values, state, truth, draws, dt_s) -> measurement, state."""
 
@@ -213,9 +218,49 @@ def product(a: Array, b: Array) -> Array:
     return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
 
 
-def yaw_matrix(angle: Array) -> Array:
-    """Return rotation matrices (..., 3, 3) about z by `angle` (...,) [rad]."""
-    xp = angle.__array_namespace__()
-    cos, sin, zero = xp.cos(angle), xp.sin(angle), xp.zeros_like(angle)
-    rows = ((cos, -sin, zero), (sin, cos, zero), (zero, zero, zero + 1.0))
-    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+def blank_draws(needs: Needs, rows: int, camera: Camera) -> Draws:
+    """Return arrays of zeros for the draws `needs` of `rows` drones."""
+    shape = camera.height, camera.width
+    return Draws(
+        np.zeros((rows, needs.normal)),
+        np.zeros((rows, needs.uniform)),
+        np.zeros((rows, needs.grain, *shape)),
+        np.zeros((rows, needs.chance, *shape)),
+    )
+
+
+def blank_model_draws(
+    models: Iterable[Sensor], rows: int, camera: Camera
+) -> tuple[dict[str, Draws], dict[str, Draws]]:
+    """Return arrays of zeros for the draws of a trial and of an observation, by model."""
+    models = list(models)
+    trial = {model.name: blank_draws(model.trial, rows, camera) for model in models}
+    observation = {model.name: blank_draws(model.observation, rows, camera) for model in models}
+    return trial, observation
+
+
+def draw(into: Draws, row: int, generator: np.random.Generator) -> None:
+    """Draw the random numbers of drone `row`, in place: see `Draws` for the distributions."""
+    fills = {
+        "normal": generator.standard_normal,
+        "uniform": generator.random,
+        "grain": generator.standard_normal,
+        "chance": generator.random,
+    }
+    for field, numbers in into._asdict().items():
+        if numbers[row].size:
+            fills[field](out=numbers[row])
+
+
+def keyed_draws(needs: Needs, key: jax.Array, camera: Camera) -> Draws:
+    """Return the random numbers of one drone from a JAX `key`."""
+    import jax
+
+    shape = camera.height, camera.width
+    keys = jax.random.split(key, 4)
+    return Draws(
+        jax.random.normal(keys[0], (needs.normal,)),
+        jax.random.uniform(keys[1], (needs.uniform,)),
+        jax.random.normal(keys[2], (needs.grain, *shape)),
+        jax.random.uniform(keys[3], (needs.chance, *shape)),
+    )

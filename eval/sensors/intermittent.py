@@ -50,7 +50,7 @@ def state_loss_sense(
     Each loss of track leaves a jump of the position.
     """
     xp, draws, dt_s = seen.pos_w.__array_namespace__(), moment.draws, moment.dt_s
-    lost = markov_step(memory["lost"], draws.uniform[..., 0], values.share, values.length, dt_s)
+    lost = _is_present(values, memory["lost"], moment)
     lost_before, lost_now = column(memory["lost"]), column(lost)
     new_acc_w = column(values.acceleration) * draws.normal[..., :3]
     acc_w = xp.where(lost_before, memory["acc_w"], new_acc_w)
@@ -108,12 +108,17 @@ def _fault(usual_share: tuple[float, float], **fields: Any) -> Sensor:
     )
 
 
+def _is_present(values: Any, present: Array, moment: Moment) -> Array:
+    """Return whether the fault is present at this observation, bool (...,)."""
+    chance = moment.draws.uniform[..., 0]
+    return markov_step(present, chance, values.share, values.length, moment.dt_s)
+
+
 def wrong_gate_sense(
     values: Fault, memory: Array, seen: View, moment: Moment
 ) -> tuple[View, Array]:
     """Return the view with the second gate in place of the first one during the fault."""
-    xp, chance = seen.pos_w.__array_namespace__(), moment.draws.uniform[..., 0]
-    is_wrong = markov_step(memory, chance, values.share, values.length, moment.dt_s)
+    xp, is_wrong = seen.pos_w.__array_namespace__(), _is_present(values, memory, moment)
     gate_w = xp.where(column(is_wrong), seen.second_w, seen.gate_w)
     axis_w = xp.where(column(is_wrong), seen.second_axis_w, seen.axis_w)
     return seen._replace(gate_w=gate_w, axis_w=axis_w), is_wrong
@@ -132,8 +137,7 @@ WRONG_GATE = _fault(
 
 def exposure_sense(values: Fault, memory: Array, seen: View, moment: Moment) -> tuple[View, Array]:
     """Return the view with an image that is at full range everywhere during the fault."""
-    xp, chance = seen.depth_m.__array_namespace__(), moment.draws.uniform[..., 0]
-    blind = markov_step(memory, chance, values.share, values.length, moment.dt_s)
+    xp, blind = seen.depth_m.__array_namespace__(), _is_present(values, memory, moment)
     depth_m = xp.where(over_image(blind), moment.camera.range_m, seen.depth_m)
     return seen._replace(depth_m=depth_m), blind
 
@@ -159,9 +163,7 @@ def frame_loss_sense(
     values: Fault, memory: dict[str, Any], seen: View, moment: Moment
 ) -> tuple[View, dict[str, Any]]:
     """Return the view with the last image that was not lost; the first one is never lost."""
-    xp = seen.depth_m.__array_namespace__()
-    chance = moment.draws.uniform[..., 0]
-    lost = markov_step(memory["lost"], chance, values.share, values.length, moment.dt_s)
+    xp, lost = seen.depth_m.__array_namespace__(), _is_present(values, memory["lost"], moment)
     repeated = over_image(lost & memory["has_image"])
     shown_m = xp.where(repeated, memory["shown_m"], seen.depth_m)
     memory = {"lost": lost, "shown_m": shown_m, "has_image": memory["has_image"] | True}

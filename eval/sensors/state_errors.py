@@ -22,9 +22,8 @@ from eval.sensors.interface import (
     noise_factor,
     product,
     rotation_since,
-    yaw_matrix,
 )
-from tracks.geometry.rotation import cross, exp_rot, to_world
+from tracks.geometry.rotation import cross, exp_rot, to_world, yaw_rotation
 
 SMALL = 1e-3
 """Distances [m] and angles [rad] well below this add hardly any drift. So the slope of the square
@@ -69,7 +68,7 @@ def state_drift_sense(
     root_angle = root(length(rotation_since(truth.rot_w, memory["rot_w"])))
     yaw = memory["yaw"] + values.yaw * root_path * draws[..., 3]
     yaw = yaw + values.yaw_turning * root_angle * draws[..., 4]
-    yaw_rot, scale = yaw_matrix(yaw), column(memory["scale"])
+    yaw_rot, scale = yaw_rotation(yaw), column(memory["scale"])
     error_w = memory["error_w"] + scale * to_world(yaw_rot, step_w) - step_w
     error_w = error_w + column(values.position * root_path) * draws[..., :3]
     seen = seen._replace(

@@ -33,11 +33,6 @@ class Tab(NamedTuple):
     """Kind of the policy's action."""
 
 
-def trials_blueprint(tabs: Sequence[Tab], playback_s: tuple[float, float]) -> rrb.Blueprint:
-    """Return the layout of a recording of trials, which plays the span `playback_s` [s]."""
-    return tabs_blueprint([_trial_view(tab) for tab in tabs], playback_s)
-
-
 def tabs_blueprint(
     views: Sequence[rrb.Container], playback_s: tuple[float, float]
 ) -> rrb.Blueprint:
@@ -63,7 +58,7 @@ def tabs_blueprint(
     )
 
 
-def _trial_view(tab: Tab) -> rrb.Vertical:
+def trial_view(tab: Tab) -> rrb.Vertical:
     """Return the views of one trial."""
     world = f"{tab.root}/world"
     overview = rrb.Spatial3DView(

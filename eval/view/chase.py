@@ -9,17 +9,15 @@ from PIL import Image
 
 from eval.view import colours
 from eval.view.scene3d import Faces, Lines, divide_faces, look_at, paint
-from eval.view.solids import track_solids
+from eval.view.solids import DRONE_HALF_SIZE, ROTOR_RADIUS_M, track_solids
 from tracks.track import Track
 
 FOV_DEG = 78.0
 """Horizontal field of view of pictures and videos [deg]."""
 OVERSAMPLING = 2
 """Factor by which pictures are drawn larger before they are reduced, for smooth edges."""
-ARM_M, ROTOR_RADIUS_M = 0.12, 0.0635
-"""Distance of the drawn rotors from the drone's centre, and their radius [m]."""
-BODY_HALF_SIZE_M = (0.064, 0.064, 0.025)
-"""Half extents of the drawn body [m]."""
+ARM_M = 0.12
+"""Distance of the drawn rotors from the drone's centre [m]."""
 BEHIND_M, ABOVE_M, AHEAD_M = 1.5, 0.55, 1.2
 """Distances of the camera behind and above the drone, and of its target ahead [m]."""
 MIN_EYE_HEIGHT_M = 0.15
@@ -137,7 +135,7 @@ def _track_colour(gate: np.ndarray, next_gate: int) -> np.ndarray:
 
 def _drone_faces(pos_w: np.ndarray, rot_w: np.ndarray) -> Faces:
     """Return the faces of a body and four rotors, the front ones orange."""
-    x, y, z = BODY_HALF_SIZE_M
+    x, y, z = DRONE_HALF_SIZE
     box = np.array([[i * x, j * y, k * z] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
     body = [box[[q[0], q[a], q[a + 1]]] for q in quads for a in (1, 2)]

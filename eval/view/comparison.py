@@ -19,8 +19,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from eval.view.blueprint import BACKGROUND, tabs_blueprint
-from eval.view.recording import APPLICATION, DRONE_HALF_SIZE, time_columns
-from tracks.common.files import replacing_file
+from eval.view.recording import open_recording, time_columns
+from eval.view.solids import DRONE_HALF_SIZE
 from tracks.common.provenance import stamp
 
 SCHEMA = 1
@@ -85,17 +85,9 @@ def write_comparison(
     """
     if not flights:
         raise ValueError("a recording needs at least one flight; got none")
-    recording = rr.RecordingStream(APPLICATION)
-    with replacing_file(path) as temporary:
-        recording.save(temporary, default_blueprint=_layout(flights))
-        try:
-            texts = {k: str(v) for k, v in stamp(SCHEMA, None).items() if v is not None}
-            recording.send_property("suite", rr.AnyValues(drop_untyped_nones=True, **texts))
-            for number, flight in enumerate(flights):
-                _log_flight(recording, f"/flight_{number}", flight, half_size)
-            recording.flush()
-        finally:
-            recording.disconnect()
+    with open_recording(path, _layout(flights), stamp(SCHEMA, None)) as recording:
+        for number, flight in enumerate(flights):
+            _log_flight(recording, f"/flight_{number}", flight, half_size)
     return Path(path)
 
 

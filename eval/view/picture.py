@@ -49,7 +49,6 @@ def write_picture(
     track: Track,
     flight: Flight | None = None,
     result: TrialResult | None = None,
-    dpi: int = 130,
 ) -> Path:
     """Draw a trial, or a track without a flight, from above and from the side.
 
@@ -81,10 +80,10 @@ def write_picture(
     if flight is not None:
         _colour_bar(figure, [top, side], speed)
     _legend(figure, [(track, flight, result)])
-    return _save(figure, path, dpi)
+    return _save(figure, path, dpi=130)
 
 
-def write_grid(path: str | Path, trials: Sequence[Shown], columns: int = 3, dpi: int = 110) -> Path:
+def write_grid(path: str | Path, trials: Sequence[Shown], columns: int = 3) -> Path:
     """Draw several trials from above, each in a panel, with one colour bar.
 
     The file's ending sets the format. `columns` panels are in a row.
@@ -125,7 +124,7 @@ def write_grid(path: str | Path, trials: Sequence[Shown], columns: int = 3, dpi:
     if any(flight is not None for _, flight, _ in trials):
         _colour_bar(figure, list(grid.flat), speed)
     _legend(figure, trials)
-    return _save(figure, path, dpi)
+    return _save(figure, path, dpi=110)
 
 
 def _draw(

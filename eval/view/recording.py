@@ -12,17 +12,25 @@ the timeline `time` in seconds from the trial's start.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
 from eval.logs.flight import Flight
 from eval.view import colours
-from eval.view.blueprint import TIMELINE, Tab, trials_blueprint
-from eval.view.solids import flat_normals, join_solids, track_solids
+from eval.view.blueprint import TIMELINE, Tab, tabs_blueprint, trial_view
+from eval.view.solids import (
+    DRONE_HALF_SIZE,
+    ROTOR_RADIUS_M,
+    flat_normals,
+    join_solids,
+    track_solids,
+)
 from eval.worlds.trial import TrialResult
 from policies.spec import ACTIONS
 from tracks.common.files import replacing_file
@@ -40,10 +48,6 @@ GROUND_MARGIN_M = 3.0
 """Distance by which the ground extends beyond track and flight [m]."""
 BEFORE_GATE_S = 0.6
 """Time before the first gate at which the playback starts [s]."""
-DRONE_HALF_SIZE = (0.064, 0.064, 0.025)
-"""Default half extents of the drawn body [m]."""
-ROTOR_RADIUS_M = 0.0635
-"""Radius of the drawn rotors [m]."""
 ROTORS_B = ((0.075, -0.10, 0.03), (-0.075, -0.10, 0.03), (-0.075, 0.10, 0.03), (0.075, 0.10, 0.03))
 """Default positions of the drawn rotors, body axes [m]."""
 
@@ -78,29 +82,37 @@ def write_recording(
     drone = drone or Drone()
     with_policy = len({result.policy for _, _, result in rollouts}) > 1
     tabs = [_tab(k, *rollout, with_policy) for k, rollout in enumerate(rollouts)]
+    blueprint = tabs_blueprint(list(map(trial_view, tabs)), _playback_span(rollouts))
+    with open_recording(path, blueprint, stamp(SCHEMA, rollouts[0][2].seed)) as recording:
+        for tab, (track, flight, result) in zip(tabs, rollouts, strict=True):
+            world = f"{tab.root}/world"
+            recording.log(world, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+            _log_track(recording, world, tab, track, flight)
+            _log_marks(recording, world, track, result)
+            if len(flight.time_s):  # a trial that ended at its first step has no rows
+                _log_path(recording, world, flight)
+                _log_drone(recording, f"{world}/drone", flight, drone)
+                _log_series(recording, tab.root, flight)
+            _log_events(recording, f"{tab.root}/events", flight, result)
+    return Path(path)
+
+
+@contextmanager
+def open_recording(
+    path: str | Path, blueprint: rrb.Blueprint, origin: Mapping[str, Any]
+) -> Iterator[rr.RecordingStream]:
+    """Yield a recording that becomes the file `path`, with its layout and its provenance."""
     # Nothing is sent before `save`, so that the blueprint comes first in the file.
     recording = rr.RecordingStream(APPLICATION)
     with replacing_file(path) as temporary:
-        blueprint = trials_blueprint(tabs, _playback_span(rollouts))
         recording.save(temporary, default_blueprint=blueprint)
         try:
-            origin = stamp(SCHEMA, rollouts[0][2].seed)
             texts = {key: str(value) for key, value in origin.items() if value is not None}
             recording.send_property("suite", rr.AnyValues(drop_untyped_nones=True, **texts))
-            for tab, (track, flight, result) in zip(tabs, rollouts, strict=True):
-                world = f"{tab.root}/world"
-                recording.log(world, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-                _log_track(recording, world, tab, track, flight)
-                _log_marks(recording, world, track, result)
-                if len(flight.time_s):  # a trial that ended at its first step has no rows
-                    _log_path(recording, world, flight)
-                    _log_drone(recording, f"{world}/drone", flight, drone)
-                    _log_series(recording, tab.root, flight)
-                _log_events(recording, f"{tab.root}/events", flight, result)
+            yield recording
             recording.flush()
         finally:
             recording.disconnect()
-    return Path(path)
 
 
 def _tab(number: int, track: Track, flight: Flight, result: TrialResult, with_policy: bool) -> Tab:

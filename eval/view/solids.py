@@ -9,6 +9,11 @@ import numpy as np
 from tracks.formats.meshes import solid_meshes
 from tracks.track import Track
 
+DRONE_HALF_SIZE = (0.064, 0.064, 0.025)
+"""Default half extents of a drawn body [m]."""
+ROTOR_RADIUS_M = 0.0635
+"""Radius of the drawn rotors [m]."""
+
 
 class Solid(NamedTuple):
     """One convex solid as triangles in the world frame."""

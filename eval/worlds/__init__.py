@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from eval.quadrotor.plant import Command
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import Progress, TrialSpec
 from policies.observation import View
@@ -62,6 +63,22 @@ class Rows(NamedTuple):
     """(N, 4) rotor speeds [rad/s]."""
     gate: np.ndarray
     """(N,) number of the next gate."""
+
+
+def rows_of(
+    due: Any,
+    progress: Progress,
+    dt: float,
+    qpos: Any,
+    qvel: Any,
+    command: Command,
+    rotor_speed: Any,
+) -> Rows:
+    """Return the rows of free joints `qpos` (N, 7) and `qvel` (N, 6); numpy and JAX arrays."""
+    return Rows(
+        due, progress.step * dt, qpos[:, :3], qpos[:, 3:], qvel[:, :3], qvel[:, 3:],
+        command.thrust, command.rate_b, rotor_speed, progress.gates,
+    )  # fmt: skip
 
 
 class World(Protocol):

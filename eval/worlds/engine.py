@@ -6,11 +6,22 @@ import mujoco
 import numpy as np
 
 from eval.quadrotor.model import compile_quadrotor
-from eval.quadrotor.plant import Motion
+from eval.quadrotor.plant import Motion, Wrench
 from eval.vehicles.vehicle import Vehicle
+from eval.worlds.slots import layout_of
+from eval.worlds.trial import (
+    Course,
+    Progress,
+    Rules,
+    has_diverged,
+    is_wrench,
+    judge_state,
+    start_progress,
+)
 from tracks.formats.mujoco_scene import add_scene, solid_name
 from tracks.geometry.camera import Camera, cast_rays_b, nearest
-from tracks.geometry.scene import Counts, counts
+from tracks.geometry.rotation import to_world
+from tracks.geometry.scene import Counts, Gates, counts
 from tracks.track import Track
 
 BODY = 1
@@ -83,6 +94,52 @@ def motion_of(data: mujoco.MjData) -> Motion:
     rot_w = data.xmat[BODY].reshape(1, 3, 3).copy()
     pos_w, velocity = data.qpos[None, :3].copy(), data.qvel[None].copy()
     return Motion(pos_w, rot_w, velocity[:, :3], velocity[:, 3:])
+
+
+class OneTrial:
+    """The trial of one vehicle, whose state the caller holds as `MjData`, by the judge's rules."""
+
+    progress: Progress
+    """Progress of the trial, a batch of one."""
+
+    def __init__(self, track: Track, vehicle: Vehicle, dt: float, rules: Rules) -> None:
+        """Compile the model of `vehicle` on `track`, for physics steps of `dt` [s]."""
+        self.model = compile_model(track, vehicle, dt, layout_of([track]).solids)
+        self.rules, self._dt, self._start = rules, dt, start_state(track)
+        gates = Gates(*(np.asarray(field)[None] for field in track.scene.gates))
+        self.course = Course(gates, np.array([gates.center_w.shape[1]], np.int32))
+
+    def put_at_start(self, data: mujoco.MjData) -> Motion:
+        """Put the vehicle at the start, and return its state; `data` has just been reset."""
+        data.qpos[:], data.qvel[:] = self._start, 0.0
+        mujoco.mj_step1(self.model, data)
+        motion = motion_of(data)
+        self.progress = start_progress(motion.pos_w)
+        return motion
+
+    def move(self, data: mujoco.MjData, motion: Motion, wrench: Wrench) -> None:
+        """Make one physics step from `motion`, and judge the state after it.
+
+        An invalid force or torque ends the trial without a step.
+        """
+        diverged = ~is_wrench(self.rules, wrench)
+        if not diverged[0]:
+            data.qfrc_applied[:3] = to_world(motion.rot_w, wrench.force_b)[0]
+            data.qfrc_applied[3:] = wrench.torque_b[0]
+            mujoco.mj_step2(self.model, data)
+            diverged = has_diverged(self.rules, motion_of(data))
+        self.progress = self.progress._replace(step=self.progress.step + np.int32(1))
+        if not diverged[0]:
+            mujoco.mj_step1(self.model, data)
+        self.judge(data, diverged)
+
+    def judge(self, data: mujoco.MjData, diverged: np.ndarray) -> None:
+        """Update the progress (gates, collision, time, ...) by the judge's rules."""
+        motion, contact = motion_of(data), np.array([data.ncon > 0])
+        with np.errstate(invalid="ignore", over="ignore"):
+            self.progress = judge_state(
+                self.rules, self.progress, self.course, self._dt, motion, contact, diverged
+            )
 
 
 def contact_name(model: mujoco.MjModel, data: mujoco.MjData) -> str:

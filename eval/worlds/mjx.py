@@ -24,7 +24,7 @@ from eval.quadrotor.autopilot import AutopilotState, autopilot_step, make_autopi
 from eval.quadrotor.model import compile_quadrotor
 from eval.quadrotor.plant import Motion, uses_noise
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds import Rows
+from eval.worlds import Rows, rows_of
 from eval.worlds.collision import NEAR_STEPS, box_distances, near_solids
 from eval.worlds.engine import start_state
 from eval.worlds.slots import IDLE, GustDraws, Layout, empty_course, pad_gates
@@ -49,7 +49,7 @@ from tracks.formats.mujoco_scene import GROUND
 from tracks.geometry.camera import Camera, cast_rays_b, nearest
 from tracks.geometry.depth import depth_image
 from tracks.geometry.rotation import quat_to_rot, to_world
-from tracks.geometry.scene import Array, Scene, pad, stack
+from tracks.geometry.scene import Array, Scene, counts, pad, stack
 from tracks.track import Track
 
 with contextlib.redirect_stdout(io.StringIO()):  # the import prints a list of missing packages
@@ -337,12 +337,8 @@ class MjxWorld:
 
     def _rows(self, due: Array, state: SlotStates, rotor_speed: Array) -> Rows:
         """Return the rows of the flight logs, for the slots in `due` (N,) bool."""
-        command = state.loops.command
-        return Rows(
-            due, state.progress.step * self.dt, state.qpos[:, :3], state.qpos[:, 3:],
-            state.qvel[:, :3], state.qvel[:, 3:], command.thrust, command.rate_b, rotor_speed,
-            state.progress.gates,
-        )  # fmt: skip
+        qpos, qvel, loops, progress = state
+        return rows_of(due, progress, self.dt, qpos, qvel, loops.command, rotor_speed)
 
 
 @jax.jit
@@ -375,14 +371,11 @@ def _motion(qpos: Array, qvel: Array) -> Motion:
 
 def _solid_names(track: Track, layout: Layout) -> list[str]:
     """Return a name for every column of `box_distances` on the padded scene."""
-    names, remaining = [], list(track.names)
-    scene = track.scene
-    kinds = (scene.boxes, scene.cylinders, scene.capsules, scene.spheres)
-    for solids, padded_count in zip(kinds, layout.solids, strict=False):
-        count = len(solids[0])
+    names, remaining, present = [], list(track.names), counts(track.scene)
+    for count, padded_count in zip(present[:4], layout.solids, strict=False):
         names += remaining[:count] + ["parked"] * (padded_count - count)
         remaining = remaining[count:]
     for mesh, size in zip(remaining, track.mesh_sizes, strict=True):
         names += [mesh] * size
-    names += ["parked"] * (layout.solids.triangles - len(scene.triangles))
+    names += ["parked"] * (layout.solids.triangles - present.triangles)
     return [*names, GROUND]

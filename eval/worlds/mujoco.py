@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from eval.quadrotor.autopilot import AutopilotState, autopilot_step
 from eval.quadrotor.plant import Motion, Wrench
 from eval.worlds.scene_slots import TO_CONTACTS, SceneSlots
 from eval.worlds.trial import is_wrench
@@ -19,17 +18,6 @@ class MujocoWorld(SceneSlots):
 
     name = "mujoco"
     integrator = "euler"
-
-    def _control(
-        self,
-        motion: Motion,
-        action_b: np.ndarray,
-        gate_w: np.ndarray,
-        step: np.ndarray,
-        noise: np.ndarray | None,
-    ) -> tuple[AutopilotState, Wrench]:
-        """Return the autopilot's state, and the force and torque on the body."""
-        return autopilot_step(self._autopilot, self._loops, motion, action_b, gate_w, step, noise)
 
     def _move(self, flying: np.ndarray, motion: Motion, push: Wrench) -> np.ndarray:
         """Let MuJoCo move the bodies under the force and torque `push`."""

@@ -19,7 +19,7 @@ from eval.sensors.sensors_file import PERFECT, SensorSet
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import REFERENCE
 from eval.worlds.engine import DepthCamera, compile_model, contact_name, motion_of, start_state
-from eval.worlds.slots import gust_draws, layout_of
+from eval.worlds.slots import GustDraws, layout_of
 from eval.worlds.trial import Rules, TrialResult, TrialSpec
 from policies.observation import observe, view_of
 from policies.policy import Policy
@@ -62,11 +62,9 @@ def fly_trial(
     data.qpos[:] = start_state(track)
     mujoco.mj_step1(model, data)  # contacts of the first state
     gates, count = track.scene.gates, len(track.scene.gates.center_w)
-    draws = np.zeros((1, 3))
-    if uses_noise(autopilot.plant):
-        draws = gust_draws(trial, round(rules.time_limit_s / dt) + 2)
+    gusts = GustDraws(trial) if uses_noise(autopilot.plant) else None
     camera, policy_memory = DepthCamera(spec.camera), policy.start(rows)
-    loops = start_autopilot(autopilot, motion_of(data), draws[:1] if len(draws) > 1 else None)
+    loops = start_autopilot(autopilot, motion_of(data), gusts and gusts.at(0, 1))
     sensors = None
     if view_models(sensor_set.models):
         sensors = Sensors(sensor_set, 1, spec.rate_hz, spec.camera)
@@ -136,7 +134,7 @@ def fly_trial(
                 break
 
         # Fly one step.
-        gust_draw = draws[None, step + 1] if len(draws) > 1 else None
+        gust_draw = gusts and gusts.at(step + 1, 1)
         loops, wrench = autopilot_step(
             autopilot, loops, motion, action_b, gate_w, np.array([step]), gust_draw
         )

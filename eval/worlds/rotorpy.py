@@ -24,14 +24,28 @@ from eval.quadrotor.stepper import rotor_command
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import rotorpy_vehicle
 from eval.worlds.scene_slots import TO_CONTACTS, SceneSlots
-from eval.worlds.slots import Layout
-from eval.worlds.trial import Rules
-from policies.spec import ActionSpec
-from tracks.geometry.camera import Camera
 from tracks.geometry.rotation import quat_to_rot, to_local
 
 XYZW = [1, 2, 3, 0]
 """Indices of x, y, z and w in a quaternion wxyz; RotorPy's are xyzw."""
+
+
+def rotorpy() -> Any:
+    """Return RotorPy's module of multirotors.
+
+    Raises:
+        ValueError: where RotorPy, or a package that its batched part needs, is not installed; the
+            message has the command that installs it.
+    """
+    try:
+        for package in ("torchdiffeq", "roma"):  # needed by RotorPy's batched part
+            importlib.import_module(package)
+        return importlib.import_module("rotorpy.vehicles.multirotor")
+    except ModuleNotFoundError as error:
+        raise ValueError(
+            f"world 'rotorpy' needs the package {error.name!r}: "
+            "pip install 'diffracing-suite[rotorpy]'"
+        ) from error
 
 
 class StepInput(NamedTuple):
@@ -53,33 +67,16 @@ class RotorpyWorld(SceneSlots):
     cost = 6.0
     """Computing time of a trial relative to MuJoCo's."""
 
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        camera: Camera,
-        layout: Layout,
-        rules: Rules,
-        slots: int,
-        threads: int = 1,
-        action: ActionSpec | None = None,
-    ) -> None:
+    def __init__(self, vehicle: Vehicle, *arguments: Any, **settings: Any) -> None:
         """Make the world; the arguments are those of `SceneSlots`.
 
         Raises:
             ValueError: where RotorPy is not installed.
         """
-        super().__init__(vehicle, camera, layout, rules, slots, threads, action)
-        self._multirotor = Multirotor(vehicle, self.dt, slots)
+        super().__init__(vehicle, *arguments, **settings)
+        self._multirotor = Multirotor(vehicle, self.dt, self.slots)
 
-    @staticmethod
-    def check() -> None:
-        """Check that RotorPy is installed and usable.
-
-        Raises:
-            ValueError: where it is not installed; the message has the command that installs it.
-        """
-        rotorpy()
-
+    check = staticmethod(rotorpy)
     differences = staticmethod(rotorpy_vehicle.differences)
     nearest = staticmethod(rotorpy_vehicle.as_flown)
 
@@ -200,20 +197,3 @@ def _in_doubles() -> Iterator[None]:
             yield
     finally:
         torch.set_default_dtype(dtype_before)
-
-
-def rotorpy() -> Any:
-    """Return RotorPy's module of multirotors.
-
-    Raises:
-        ValueError: where RotorPy, or a package that its batched part needs, is not installed.
-    """
-    try:
-        for package in ("torchdiffeq", "roma"):  # needed by RotorPy's batched part
-            importlib.import_module(package)
-        return importlib.import_module("rotorpy.vehicles.multirotor")
-    except ModuleNotFoundError as error:
-        raise ValueError(
-            f"world 'rotorpy' needs the package {error.name!r}: "
-            "pip install 'diffracing-suite[rotorpy]'"
-        ) from error

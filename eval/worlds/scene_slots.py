@@ -16,10 +16,10 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from eval.quadrotor.autopilot import AutopilotState, make_autopilot, start_autopilot
+from eval.quadrotor.autopilot import AutopilotState, autopilot_step, make_autopilot, start_autopilot
 from eval.quadrotor.plant import MAX_DELAY, Motion, make_plant, uses_noise
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds import Rows
+from eval.worlds import Rows, rows_of
 from eval.worlds.engine import BODY, DepthCamera, compile_model, contact_name, start_state
 from eval.worlds.slots import IDLE, GustDraws, Layout, empty_course, pad_gates
 from eval.worlds.trial import (
@@ -52,7 +52,8 @@ _NOTHING = int(mujoco.mjtStage.mjSTAGE_NONE)
 class SceneSlots(ABC):
     """A `World` without dynamics, computed in NumPy over all slots, except for contacts.
 
-    Subclasses define `_control` (the autopilot's output) and `_move` (the motion of the bodies).
+    Subclasses define `_move` (the motion of the bodies), and may replace `_control` (what the
+    autopilot gives to it).
     """
 
     name: str
@@ -213,7 +214,6 @@ class SceneSlots(ABC):
                 depth[row] = np.minimum(depth[row], meshes)
         return depth
 
-    @abstractmethod
     def _control(
         self,
         motion: Motion,
@@ -224,8 +224,10 @@ class SceneSlots(ABC):
     ) -> tuple[AutopilotState, Any]:
         """Return the autopilot's state after a physics step, and its output for `_move`.
 
-        The arguments are those of `eval.quadrotor.autopilot.autopilot_step`, for all slots.
+        The arguments are those of `eval.quadrotor.autopilot.autopilot_step`, for all slots, and
+        the output is its force and torque on the body.
         """
+        return autopilot_step(self._autopilot, self._loops, motion, action_b, gate_w, step, noise)
 
     @abstractmethod
     def _move(self, flying: np.ndarray, motion: Motion, push: Any) -> np.ndarray:
@@ -278,19 +280,5 @@ class SceneSlots(ABC):
         """Return the rows of the flight logs at this step; [] if no slot is `due` (N,) bool."""
         if not due.any():
             return []
-        loops = self._loops
-        qpos, qvel = self._qpos.copy(), self._qvel.copy()
-        return [
-            Rows(
-                due,
-                self._progress.step * self.dt,
-                qpos[:, :3],
-                qpos[:, 3:],
-                qvel[:, :3],
-                qvel[:, 3:],
-                loops.command.thrust,
-                loops.command.rate_b,
-                rotor_speed,
-                self._progress.gates,
-            )
-        ]
+        joint, command = (self._qpos.copy(), self._qvel.copy()), self._loops.command
+        return [rows_of(due, self._progress, self.dt, *joint, command, rotor_speed)]

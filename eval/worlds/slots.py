@@ -98,9 +98,9 @@ def generator_of(trial: TrialSpec, use: int, part: str = "") -> np.random.Genera
 
 
 class GustDraws:
-    """Random draws for a trial's gusts, equal to `gust_draws`, but generated during the flight.
+    """Standard normal draws for a trial's gusts, generated during the flight.
 
-    The draws of one hour at 10 kHz would need 0.9 GB at once.
+    The trial determines them. The draws of one hour at 10 kHz would need 0.9 GB at once.
     """
 
     def __init__(self, trial: TrialSpec) -> None:
@@ -125,8 +125,3 @@ class GustDraws:
             self._rows = np.concatenate([self._rows[passed:], new_rows])
             self._first += passed
         return self._rows[step - self._first :][:count]
-
-
-def gust_draws(trial: TrialSpec, steps: int) -> np.ndarray:
-    """Return standard normal draws (steps, 3) for a trial's gusts; the trial determines them."""
-    return generator_of(trial, GUSTS).standard_normal((steps, 3))

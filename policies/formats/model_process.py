@@ -27,6 +27,7 @@ import numpy as np
 
 from policies.formats.model_server import KINDS, data_bytes
 from policies.spec import NoAnswer, PolicyError
+from tracks.common.work.processes import end_process
 
 LOAD_S = 60.0
 """Time limit to start, load and optimise the model [s]."""
@@ -103,7 +104,7 @@ class ModelProcess:
             # Ctrl-C reaches all processes of a session; this process decides when the model ends.
             start_new_session=True,
         )
-        self._end = weakref.finalize(self, _end, self._process)
+        self._end = weakref.finalize(self, end_process, self._process)
         for pipe in (self._process.stdin, self._process.stdout):
             assert pipe is not None
             os.set_blocking(pipe.fileno(), False)
@@ -222,12 +223,3 @@ def _how_it_ended(process: subprocess.Popen[bytes]) -> str:
     except subprocess.TimeoutExpired:
         return "its answer is not valid"
     return f"it ended by {signal.Signals(-code).name}" if code < 0 else f"it ended with {code}"
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process and close its pipes."""
-    process.kill()
-    for pipe in (process.stdin, process.stdout):
-        if pipe is not None:
-            pipe.close()
-    process.wait()

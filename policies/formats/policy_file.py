@@ -7,7 +7,7 @@ match measured ones. A policy is stored with its `PolicySpec` (rate, camera, sca
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from policies.formats.checkpoint import (
     load_arrays,
     save_arrays,
 )
-from policies.formats.spec_json import spec_from_json, spec_to_json
+from policies.formats.spec_json import spec_from_json
 from policies.spec import PolicyError, PolicySpec, check_network
 
 POLICY, DELTA = "policy", "delta"
@@ -67,7 +67,7 @@ def save_policy(
     """
     stored_contract = contract.contract_of(spec, (spec.hidden_size,)).to_json()
     extra = {
-        "spec": spec_to_json(spec),
+        "spec": asdict(spec),
         contract.KEY: stored_contract,
         "training": dict(training or {}),
     }

@@ -21,11 +21,6 @@ from tracks.input.ranges import shown
 from tracks.input.reading import InputError, parse_json
 
 
-def spec_to_json(spec: PolicySpec) -> dict[str, Any]:
-    """Return a spec as a dict of JSON values, nested as the dataclasses are."""
-    return dataclasses.asdict(spec)
-
-
 def spec_from_json(data: Any, where: str) -> PolicySpec:
     """Return the spec that `data` describes; missing keys take their defaults.
 
@@ -70,7 +65,7 @@ def embed(spec: PolicySpec, name: str, seed: int | None) -> str:
     """Return the JSON text for the key `KEY`: provenance, name, spec and contract."""
     entries = {
         "name": name,
-        "spec": spec_to_json(spec),
+        "spec": dataclasses.asdict(spec),
         contract.KEY: contract.contract_of(spec).to_json(),
     }
     return to_json({**stamp(SCHEMA, seed), **entries})

@@ -18,15 +18,4 @@ def names() -> list[str]:
 
 def locate(name_or_path: str | Path) -> Path:
     """Return a shipped policy's folder for its name; any other text is returned as a path."""
-    return folder(str(name_or_path)) if str(name_or_path) in names() else Path(name_or_path)
-
-
-def folder(name: str) -> Path:
-    """Return the checkpoint's folder of a shipped policy.
-
-    Raises:
-        KeyError: where no shipped policy has that name.
-    """
-    if name not in names():
-        raise KeyError(name)
-    return _HERE / name
+    return (_HERE if str(name_or_path) in names() else Path()) / name_or_path

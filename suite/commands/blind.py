@@ -132,11 +132,11 @@ def _strengths(console: Console) -> dict[str, Any]:
 
 def _plan(config: Config, console: Console) -> dict[str, Any]:
     """Print flights that separate `config.effects`, and return the flights for --json."""
-    from eval.effects import find_effect
+    from eval.effects import EFFECTS
     from suite.diagnose.plan import plan_for, separations_of
     from tracks.common.files import plain
 
-    names = [find_effect(name).name for name in config.effects]
+    names = [EFFECTS.find(name).name for name in config.effects]
     if len(names) < 2:
         raise ValueError(f"--effects {names}: give at least two names of effects to separate")
     for entry in separations_of(names):

@@ -32,7 +32,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for a name that is not in the catalogue.
     """
-    from eval.effects import EFFECTS, find_effect
+    from eval.effects import EFFECTS
     from eval.effects.interface import bound_value
     from eval.quadrotor.vehicle_file import load_vehicle
 
@@ -41,7 +41,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         for effect in EFFECTS.values():
             console.say(f"{effect.name:<{width}}  {effect.summary}")
         return {"effects": {name: _facts(effect) for name, effect in EFFECTS.items()}}
-    effect = find_effect(config.name)
+    effect = EFFECTS.find(config.name)
     console.say(f"{effect.name}: {effect.summary}")
     console.say(f"  {effect.equation}")
     console.say(f"  source: {effect.source}")

@@ -65,7 +65,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             raise ValueError(
                 "--vehicle is missing: the vehicle file to start from, or a shipped name"
             )
-        check_no_input(out, [config.vehicle], "--out")
+        check_no_input(out, [config.vehicle])
         inputs = (config.flights, config.vehicle, out, config.leave)
         result = identify_files(*inputs, console, config.accept)
         console.say(f"driven by {MODEL_INPUTS[result['drive']]}")

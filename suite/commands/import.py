@@ -123,7 +123,7 @@ def _check(config: Config) -> None:
         raise ValueError(f"--motor-poles {config.motor_poles}: the number of magnets is even")
     if config.pose_map is not None and config.pose is None:
         raise ValueError("--pose-map describes the file of --pose, which is not given")
-    check_no_input(config.out, [config.file, config.pose], "--out")
+    check_no_input(config.out, [config.file, config.pose])
 
 
 def _largest_finite(speed: Any) -> float | None:

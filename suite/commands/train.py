@@ -143,7 +143,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if config.init_from is not None:
         # The trained policy goes to out/policy, which must not be the one to start from.
         start, trained = locate(config.init_from) / CONFIG, config.out / "policy" / CONFIG
-        check_no_input(trained, [start], "--out")
+        check_no_input(trained, [start])
         params = load_start_params(config.init_from, phase_configs(resolved)[0].spec)
     if config.delta is not None:
         stored = load_delta(config.delta)

@@ -40,7 +40,7 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     """
     out = config.out
     refuse_other_run(out, config)
-    check_no_input(out / "vehicle.toml", [config.vehicle], "--out")
+    check_no_input(out / "vehicle.toml", [config.vehicle])
     vehicle = load_vehicle(config.vehicle)
     refuse_own_motion(vehicle)
     # Read the files, and check the logs for faults of interfaces.

@@ -119,7 +119,7 @@ def _check_outputs(files: Sequence[Path], out: Path) -> None:
     """Refuse flights whose correction in `out` would overwrite a flight or another correction."""
     names: dict[str, Path] = {}
     for file in files:
-        check_no_input(out / file.name, files, "--out")
+        check_no_input(out / file.name, files)
         if file.name in names:
             raise ValueError(
                 f"{names[file.name]} and {file}: both would be written to {out / file.name}; "

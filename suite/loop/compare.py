@@ -15,8 +15,7 @@ import numpy as np
 from eval.judging.statistics import (
     Interval,
     PairedDifference,
-    bootstrap_mean,
-    bootstrap_median,
+    bootstrap,
     paired_success,
     wilson,
 )
@@ -39,7 +38,9 @@ class Difference(NamedTuple):
     against: str
     """Name of the policy whose rate is subtracted."""
     success: Interval
+    """The difference with Newcombe's paired interval."""
     p_value: float
+    """p-value of the difference."""
 
 
 class PolicyResult(NamedTuple):
@@ -92,8 +93,8 @@ def policy_results(
                     f"{track} {level}": success_rate(success[indices])
                     for (track, level), indices in cells.items()
                 },
-                gates=bootstrap_mean(np.array([row.gates_passed for row in rows]), seed),
-                v_mean=bootstrap_median(np.array([row.v_mean for row in rows]), seed),
+                gates=bootstrap(np.array([row.gates_passed for row in rows]), seed, np.mean),
+                v_mean=bootstrap(np.array([row.v_mean for row in rows]), seed),
                 differences=[
                     Difference(reference, Interval(*pair[:3]), pair.p_value)
                     for reference, pair in pairs

@@ -21,8 +21,7 @@ import jax.numpy as jnp
 
 from eval import sensors
 from eval.sensors import SENSORS, scale_model, view_models
-from eval.sensors.draws import keyed_draws
-from eval.sensors.interface import product, rotation_since
+from eval.sensors.interface import keyed_draws, product, rotation_since
 from policies.networks import delta_network, network
 from policies.observation import Observation, View, observe
 from suite.train import losses

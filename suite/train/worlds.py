@@ -17,8 +17,7 @@ import jax
 import numpy as np
 
 from eval.sensors import SENSORS, view_models
-from eval.sensors.draws import blank_draws, draw
-from eval.sensors.interface import Draws
+from eval.sensors.interface import Draws, blank_draws, draw
 from suite.train.config import TrainConfig
 from suite.train.dynamics import interface as dynamics
 from suite.train.dynamics import point_mass
@@ -85,7 +84,7 @@ def _clearance(track: Track, point_w: np.ndarray) -> float:
     """
     # The boxes of a scene begin with the bars of the gates' frames, which are left out.
     bars = track.scene.gates.opening_g.shape[0] * track.scene.gates.opening_g.shape[1]
-    spheres = dict(bounds(track.scene))
+    spheres = bounds(track.scene)
     spheres["boxes"] = Bounds(*(field[bars:] for field in spheres["boxes"]))
     offset_w = np.concatenate([ball.center_w for ball in spheres.values()]) - point_w
     radius = np.concatenate([ball.radius for ball in spheres.values()])

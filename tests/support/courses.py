@@ -4,7 +4,7 @@ import numpy as np
 
 from eval.judging.judge import JudgeOptions, fly
 from eval.worlds.trial import TrialSpec
-from tracks.geometry.scene import Boxes, Gates, Scene, Spheres, no_rods
+from tracks.geometry.scene import Boxes, Gates, Rods, Scene, Spheres
 from tracks.track import Track
 
 IN_CONTACT = """
@@ -36,8 +36,9 @@ def straight(distances=(2.0, 4.0), wall_at=None, height=1.5, name="straight"):
         np.tile(np.eye(3), (len(walls), 1, 1)),
         np.tile([0.05, 1.0, 1.0], (len(walls), 1)),
     )
-    spheres = Spheres(np.zeros((0, 3)), np.zeros(0))
-    scene = Scene(gates, boxes, no_rods(), no_rods(), spheres, np.zeros((0, 3, 3)))
+    none = np.zeros((0, 3)), np.zeros(0)
+    rods, spheres = Rods(none[0], *none, none[1]), Spheres(*none)
+    scene = Scene(gates, boxes, rods, rods, spheres, np.zeros((0, 3, 3)))
     names = ("the wall",) * len(walls)
     return Track(name, 0, 0, 0.0, scene, np.array([0.0, 0.0, height]), 0.0, names)
 

@@ -17,8 +17,8 @@ def reproduce(tmp_path, name, *args):
 def another_racer(folder, seed):
     """Write a policy to `folder` that flies as race-paper does and is another to every digest."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / WEIGHTS).write_bytes((shipped.folder("race-paper") / WEIGHTS).read_bytes())
-    config = json.loads((shipped.folder("race-paper") / CONFIG).read_text())
+    (folder / WEIGHTS).write_bytes((shipped.locate("race-paper") / WEIGHTS).read_bytes())
+    config = json.loads((shipped.locate("race-paper") / CONFIG).read_text())
     (folder / CONFIG).write_text(json.dumps({**config, "seed": seed}))
 
 

@@ -176,21 +176,19 @@ def check_place(path: str | os.PathLike[str]) -> None:
 
 
 def check_no_input(
-    path: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str] | None], option: str
+    path: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str] | None]
 ) -> None:
-    """Refuse to overwrite an input file.
-
-    Inputs that are not files are ignored. `option` sets the output `path`.
+    """Refuse to overwrite an input file by the output `path`; inputs that are no files are ignored.
 
     Raises:
-        ValueError: naming the file, and the option to change.
+        ValueError: naming the file, and the option --out.
     """
     for input_path in inputs:
         if input_path and os.path.exists(path) and os.path.exists(input_path):
             if os.path.samefile(input_path, path):
                 raise ValueError(
-                    f"{option}: {os.fspath(path)} is also an input and would be overwritten; give "
-                    f"another {option}"
+                    f"--out: {os.fspath(path)} is also an input and would be overwritten; give "
+                    "another --out"
                 )
 
 

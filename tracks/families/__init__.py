@@ -9,7 +9,6 @@ a random generator. Another package adds one with an entry point of the group
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -18,11 +17,6 @@ from tracks.families import judged, random
 from tracks.families.layout import GATE_COUNT, Layout
 from tracks.geometry.scene import Counts, counts
 from tracks.track import Track
-
-
-def _registration_error(name: str, make: Any) -> str | None:
-    return None if callable(make) else f"{make!r}; must be a function (d, rng) -> Layout"
-
 
 FAMILIES: Registry[Callable[[float, np.random.Generator], Layout]] = Registry(
     "track family",
@@ -33,7 +27,7 @@ FAMILIES: Registry[Callable[[float, np.random.Generator], Layout]] = Registry(
         "ellipse": judged.ellipse,
         "random": random.make,
     },
-    _registration_error,
+    lambda _, make: None if callable(make) else f"{make!r}; must be a function (d, rng) -> Layout",
 )
 """Name of a family -> function that draws its tracks."""
 JUDGED = ("zigzag", "circular", "ellipse")

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tracks.geometry.gates import frame_boxes, square_gates
+from tracks.geometry.gates import square_gates, with_frames
 from tracks.geometry.obstacles import Obstacles, PerStretch, Site, keep_clear, scatter
-from tracks.geometry.scene import Boxes, Gates, Scene
+from tracks.geometry.scene import Gates, Scene
 
 GATE_COUNT = 8
 """Number of gates of a generated track."""
@@ -100,8 +100,7 @@ def counts_per_stretch(
 
 def build(gates: Gates, start_pos_w: np.ndarray, obstacles: Obstacles) -> Layout:
     """Return the layout of gates, start and obstacles; the start faces gate 0."""
-    frames = frame_boxes(gates)
-    boxes = Boxes(*(np.concatenate(pair) for pair in zip(frames, obstacles.boxes, strict=True)))
+    boxes, frame_names = with_frames(gates, obstacles.boxes)
     scene = Scene(
         gates,
         boxes,
@@ -110,8 +109,6 @@ def build(gates: Gates, start_pos_w: np.ndarray, obstacles: Obstacles) -> Layout
         obstacles.spheres,
         np.zeros((0, 3, 3)),
     )
-    bars = gates.opening_g.shape[-2]
-    frame_names = (f"gate {i} frame" for i in range(len(gates.center_w)) for _ in range(bars))
     ahead = gates.center_w[0] - start_pos_w
     return Layout(
         scene, start_pos_w, float(np.arctan2(ahead[1], ahead[0])), (*frame_names, *obstacles.names)

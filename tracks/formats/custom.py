@@ -17,7 +17,7 @@ import numpy as np
 from tracks.common.toml_table import REQUIRED, Table, read_toml
 from tracks.formats.convex_parts import thickness
 from tracks.formats.mesh_reader import load_convex_parts
-from tracks.geometry.gates import frame_boxes, rectangle, regular_polygon
+from tracks.geometry.gates import rectangle, regular_polygon, with_frames
 from tracks.geometry.rotation import quat_to_rot
 from tracks.geometry.scene import Boxes, Gates, Rods, Scene, Spheres
 from tracks.track import Track
@@ -76,13 +76,10 @@ def load_track(path: str | os.PathLike[str]) -> Track:
     meshes, mesh_names = _meshes(top, names)
     top.close()
 
-    frames = frame_boxes(gates)
-    bars = gates.opening_g.shape[1]
-    frame_names = [f"gate {i} frame" for i in range(len(gate_tables)) for _ in range(bars)]
-    solids = Boxes(*_columns(boxes, [(3,), (3, 3), (3,)]))
+    all_boxes, frame_names = with_frames(gates, Boxes(*_columns(boxes, [(3,), (3, 3), (3,)])))
     scene = Scene(
         gates,
-        Boxes(*(np.concatenate(pair) for pair in zip(frames, solids, strict=True))),
+        all_boxes,
         Rods(*_columns(cylinders, [(3,), (3,), (), ()])),
         Rods(*_columns(capsules, [(3,), (3,), (), ()])),
         Spheres(*_columns(spheres, [(3,), ()])),

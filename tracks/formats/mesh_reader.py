@@ -8,7 +8,6 @@ was not used for a while.
 from __future__ import annotations
 
 import atexit
-import contextlib
 import functools
 import json
 import os
@@ -23,6 +22,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from tracks.common.work.processes import end_process
 from tracks.input.reading import MESH_BYTES, check_file
 
 KINDS = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf")
@@ -79,18 +79,8 @@ def _process() -> subprocess.Popen[bytes]:
         stderr=subprocess.DEVNULL,
         start_new_session=True,  # Ctrl-C must reach only this process
     )
-    atexit.register(_end, process)
+    atexit.register(end_process, process)
     return process
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process and close its pipes."""
-    process.kill()
-    for pipe in (process.stdin, process.stdout):
-        if pipe is not None:
-            with contextlib.suppress(BrokenPipeError):  # unsent data is discarded
-                pipe.close()
-    process.wait()
 
 
 def _request(paths: list[str], names: str) -> tuple[dict[str, Any], bytes]:
@@ -100,7 +90,7 @@ def _request(paths: list[str], names: str) -> tuple[dict[str, Any], bytes]:
         ValueError: where the process does not answer in time, or ends.
     """
     if _process().poll() is not None:
-        _end(_process())
+        end_process(_process())
         _process.cache_clear()
     process = _process()
     timer = threading.Timer(READ_S, process.kill)

@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from tracks.geometry.scene import Counts, Scene, pad
+from tracks.geometry.scene import Counts, Scene, counts, pad
 
 GROUND = "ground"
 """Name of the ground's geom."""
@@ -54,9 +54,7 @@ def add_scene(
         ValueError: where the scene has more solids of a kind than `pad_to`, or names and solids
             do not match in number.
     """
-    solid_counts = [
-        len(kind[0]) for kind in (scene.boxes, scene.cylinders, scene.capsules, scene.spheres)
-    ]
+    solid_counts = counts(scene)[:4]
     if sum(mesh_sizes) != len(scene.triangles):
         raise ValueError(
             f"mesh_sizes add up to {sum(mesh_sizes)}, the scene has {len(scene.triangles)} "
@@ -99,7 +97,7 @@ def add_scene(
 class _Names:
     """Returns a unique geom name for each solid of a kind, called in order."""
 
-    def __init__(self, names: tuple[str, ...], solid_counts: list[int]) -> None:
+    def __init__(self, names: tuple[str, ...], solid_counts: tuple[int, ...]) -> None:
         self._names = names
         self._counts = solid_counts
         self._first = np.concatenate([[0], np.cumsum(solid_counts)])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from tracks.geometry.cull import nearest_solids
@@ -150,15 +151,8 @@ def nearest_obstacle(
     """
     if limits is not None:
         scene = nearest_solids(scene, point_w[:, point_w.shape[1] // 2], limits)
-    spread = type(scene)(*(_with_points_axis(part) for part in scene))
+    spread = jax.tree.map(lambda array: array[:, None], scene)  # an axis for the points
     distance, away = distances(spread, point_w)
     nearest_index = distance.argmin(-1)[..., None]
     nearest = jnp.take_along_axis(distance, nearest_index, axis=-1)[..., 0]
     return nearest, jnp.take_along_axis(away, nearest_index[..., None], axis=-2)[..., 0, :]
-
-
-def _with_points_axis(part: Array) -> Array:
-    """Insert an axis of length 1 for the points after the batch axis."""
-    if isinstance(part, tuple):
-        return type(part)(*(array[:, None] for array in part))
-    return part[:, None]

@@ -27,38 +27,25 @@ class Bounds(NamedTuple):
     """(..., N) radii [m]."""
 
 
-def bounds(scene: Scene) -> list[tuple[str, Bounds]]:
+def bounds(scene: Scene) -> dict[str, Bounds]:
     """Return the bounding spheres of every kind, under its field's name in `Scene`.
 
     Takes numpy and JAX arrays, with any leading batch shape.
     """
-    half = scene.boxes.half_size
+    boxes, cylinders, capsules, spheres = scene[1:5]
+    half = boxes.half_size
     xp = half.__array_namespace__()
-    rods = [
-        (
-            name,
-            Bounds(
-                rod.center_w,
-                xp.hypot(rod.radius, rod.half_length) if flat else rod.radius + rod.half_length,
-            ),
-        )
-        for name, rod, flat in (
-            ("cylinders", scene.cylinders, True),
-            ("capsules", scene.capsules, False),
-        )
-    ]
-    return [
-        ("boxes", Bounds(scene.boxes.center_w, xp.sqrt((half * half).sum(-1)))),
-        *rods,
-        ("spheres", Bounds(scene.spheres.center_w, scene.spheres.radius)),
-    ]
+    return {
+        "boxes": Bounds(boxes.center_w, xp.sqrt((half * half).sum(-1))),
+        "cylinders": Bounds(cylinders.center_w, xp.hypot(cylinders.radius, cylinders.half_length)),
+        "capsules": Bounds(capsules.center_w, capsules.radius + capsules.half_length),
+        "spheres": Bounds(spheres.center_w, spheres.radius),
+    }
 
 
 def _gather(solids: Any, index: Array) -> Any:
-    def pick(array: Array) -> Array:
-        return jax.vmap(lambda rows, i: rows[i])(array, index)
-
-    return jax.tree.map(pick, solids)
+    gather = jax.vmap(lambda rows, i: rows[i])
+    return jax.tree.map(lambda array: gather(array, index), solids)
 
 
 def keep_best(scene: Scene, scores: dict[str, Array], limits: Counts) -> Scene:
@@ -74,7 +61,7 @@ def keep_best(scene: Scene, scores: dict[str, Array], limits: Counts) -> Scene:
 def nearest_solids(scene: Scene, pos_w: Array, limits: Counts) -> Scene:
     """Return the scene with the solids whose bounding spheres are nearest to pos_w (B, 3) [m]."""
     scores = {}
-    for name, ball in bounds(scene):
+    for name, ball in bounds(scene).items():
         away = ball.center_w - pos_w[:, None]
         scores[name] = jnp.sqrt((away * away).sum(-1)) - ball.radius
     return keep_best(scene, scores, limits)
@@ -100,7 +87,7 @@ def visible_solids(
     reach = range_m * jnp.linalg.norm(rays_b, axis=-1).max()
     axis_w = rot_w @ axis_b
     scores = {}
-    for name, ball in bounds(scene):
+    for name, ball in bounds(scene).items():
         away = ball.center_w - pos_w[:, None]
         squared = (away * away).sum(-1)
         along = (away * axis_w[:, None]).sum(-1)

@@ -8,18 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from tracks.geometry.rotation import yaw_rotation
 from tracks.geometry.scene import PARKED_Z, Boxes, Gates
-
-
-def yaw_rotation(yaw: np.ndarray | float) -> np.ndarray:
-    """Return rotations about world z by `yaw` (...) [rad], local to world, (..., 3, 3)."""
-    yaw = np.asarray(yaw, float)
-    rot = np.zeros((*yaw.shape, 3, 3))
-    rot[..., 0, 0] = rot[..., 1, 1] = np.cos(yaw)
-    rot[..., 1, 0] = np.sin(yaw)
-    rot[..., 0, 1] = -rot[..., 1, 0]
-    rot[..., 2, 2] = 1.0
-    return rot
 
 
 def rectangle(width: np.ndarray | float, height: np.ndarray | float) -> np.ndarray:
@@ -99,6 +89,14 @@ def frame_boxes(gates: Gates) -> Boxes:
     return Boxes(
         center_w.reshape(count, 3), rot_w.reshape(count, 3, 3), half_size.reshape(count, 3)
     )
+
+
+def with_frames(gates: Gates, boxes: Boxes) -> tuple[Boxes, list[str]]:
+    """Return the bars of the gates' frames followed by `boxes`, and the names of the bars."""
+    parts = zip(frame_boxes(gates), boxes, strict=True)
+    count, bars = gates.opening_g.shape[:2]
+    names = [f"gate {i} frame" for i in range(count) for _ in range(bars)]
+    return Boxes(*(np.concatenate(pair) for pair in parts)), names
 
 
 def _corner_extensions(

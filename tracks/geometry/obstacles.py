@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tracks.geometry.gates import yaw_rotation
-from tracks.geometry.rotation import quat_to_rot
+from tracks.geometry.rotation import quat_to_rot, yaw_rotation
 from tracks.geometry.scene import Boxes, Gates, Rods, Spheres
 
 BOX, CYLINDER, CAPSULE, SPHERE = range(4)

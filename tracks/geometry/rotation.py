@@ -38,6 +38,14 @@ def cross(a: Array, b: Array) -> Array:
     return parts[0].__array_namespace__().stack(parts, axis=-1)
 
 
+def yaw_rotation(yaw: Array) -> Array:
+    """Return the rotation matrices (..., 3, 3) about z by `yaw` (...,) [rad]."""
+    xp = yaw.__array_namespace__()
+    cos, sin, zero = xp.cos(yaw), xp.sin(yaw), xp.zeros_like(yaw)
+    rows = ((cos, -sin, zero), (sin, cos, zero), (zero, zero, zero + 1.0))
+    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
 def quat_to_rot(quat_wxyz: Array) -> Array:
     """Return the rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
     xp = quat_wxyz.__array_namespace__()

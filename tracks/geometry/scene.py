@@ -15,6 +15,13 @@ Array = Any  # numpy.ndarray or jax.Array: the geometry functions take both
 
 PARKED_Z = -1000.0
 """Height of padding solids [m], so far below the ground that they never matter."""
+_PARKED = {
+    "center_w": [0.0, 0.0, PARKED_Z], "rot_w": np.eye(3), "axis_w": [0.0, 0.0, 1.0],
+    "half_size": [1e-3] * 3, "radius": 1e-3, "half_length": 1e-3,
+}  # fmt: skip
+"""Field of a kind of solid -> its value for a padding solid."""
+_PARKED_TRIANGLE = [[0.0, 0.0, PARKED_Z], [1e-3, 0.0, PARKED_Z], [0.0, 1e-3, PARKED_Z]]
+"""Corners of a padding triangle [m]."""
 
 
 class Gates(NamedTuple):
@@ -94,35 +101,10 @@ class Counts(NamedTuple):
     triangles: int = 0
 
 
-def no_rods() -> Rods:
-    """Return an empty set of cylinders or capsules."""
-    return Rods(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
-
-
 def counts(scene: Scene) -> Counts:
     """Return the numbers of solids of each kind in `scene` (not batched)."""
-    return Counts(
-        len(scene.boxes.center_w),
-        len(scene.cylinders.radius),
-        len(scene.capsules.radius),
-        len(scene.spheres.radius),
-        len(scene.triangles),
-    )
-
-
-def _parked(n: int) -> np.ndarray:
-    return np.tile([0.0, 0.0, PARKED_Z], (n, 1))
-
-
-def _pad_rods(rods: Rods, n: int) -> Rods:
-    """Return `rods` padded with parked rods to `n` rods."""
-    missing = n - len(rods.radius)
-    return Rods(
-        np.concatenate([rods.center_w, _parked(missing)]),
-        np.concatenate([rods.axis_w, np.tile([0.0, 0.0, 1.0], (missing, 1))]),
-        np.concatenate([rods.radius, np.full(missing, 1e-3)]),
-        np.concatenate([rods.half_length, np.full(missing, 1e-3)]),
-    )
+    solids = (part[0] for part in scene[1:5])
+    return Counts(*map(len, (*solids, scene.triangles)))
 
 
 def pad(scene: Scene, to: Counts) -> Scene:
@@ -137,28 +119,16 @@ def pad(scene: Scene, to: Counts) -> Scene:
             raise ValueError(
                 f"scene has {n} {kind}, more than the {limit} it is padded to; pad to more"
             )
-    missing = to.boxes - present.boxes
-    boxes = Boxes(
-        np.concatenate([scene.boxes.center_w, _parked(missing)]),
-        np.concatenate([scene.boxes.rot_w, np.tile(np.eye(3), (missing, 1, 1))]),
-        np.concatenate([scene.boxes.half_size, np.full((missing, 3), 1e-3)]),
-    )
-    missing = to.spheres - present.spheres
-    spheres = Spheres(
-        np.concatenate([scene.spheres.center_w, _parked(missing)]),
-        np.concatenate([scene.spheres.radius, np.full(missing, 1e-3)]),
-    )
-    missing = to.triangles - present.triangles
-    corner = np.array([[0.0, 0.0, 0.0], [1e-3, 0.0, 0.0], [0.0, 1e-3, 0.0]]) + _parked(1)
-    triangles = np.concatenate([scene.triangles, np.tile(corner, (missing, 1, 1))])
-    return Scene(
-        scene.gates,
-        boxes,
-        _pad_rods(scene.cylinders, to.cylinders),
-        _pad_rods(scene.capsules, to.capsules),
-        spheres,
-        triangles,
-    )
+    padded = {}
+    for kind, n, limit in zip(Counts._fields[:4], present, to, strict=False):
+        solids = getattr(scene, kind)
+        fields = []
+        for name, array in solids._asdict().items():
+            parked = np.tile(_PARKED[name], (limit - n, *[1] * (array.ndim - 1)))
+            fields.append(np.concatenate([array, parked]))
+        padded[kind] = type(solids)(*fields)
+    triangles = np.tile(_PARKED_TRIANGLE, (to.triangles - present.triangles, 1, 1))
+    return scene._replace(**padded, triangles=np.concatenate([scene.triangles, triangles]))
 
 
 def stack(scenes: list[Scene], to: Counts, dtype: Any = np.float32) -> Scene:

@@ -108,7 +108,8 @@ def _some_images(tiles: Tiles, scene: Scene, pos_w: np.ndarray, rot_w: np.ndarra
     # Axes of each camera in the world, (N, 3, 3), without matmul: see `tracks.geometry.rotation`.
     axes_w = (rot_w[:, :, :, None] * tiles.axes_b).sum(-2)
     depth = np.full((len(pos_w) * rows * columns, side * side), camera.range_m)
-    for (name, ball), cast in zip(bounds(scene), (_box, _cylinder, _capsule, _sphere), strict=True):
+    casts = (_box, _cylinder, _capsule, _sphere)
+    for (name, ball), cast in zip(bounds(scene).items(), casts, strict=True):
         frame, number, rank = _in_view(tiles, ball, pos_w, axes_w)
         solids = take(getattr(scene, name), (frame, number))
         shape = _shape(solids, pos_w[frame], axes_w[frame])

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from eval.quadrotor.loops import betaflight, crazyflie, px4
-from eval.quadrotor.loops.filters import layout_of
+from eval.quadrotor.loops.filters import Request, layout_of
 from eval.vehicles.vehicle import MotorMap, Vehicle, command_of_thrust
 from tracks.geometry.scene import Array
 
@@ -84,5 +84,6 @@ def update(
     rotor_thrust = xp.maximum(0.25 * force_z, 0.0)
     throttle = xp.clip(command_of_thrust(loop.thrust, rotor_thrust), 0.0, 1.0)
     module = _MODULES[type(loop.gains)]
-    memory, command = module.update(loop.gains, memory, throttle, rate_cmd_b, rate_b, dt, scale)
+    request = Request(throttle, rate_cmd_b, rate_b, dt, scale)
+    memory, command = module.update(loop.gains, memory, request)
     return memory, first * command + second * command**2

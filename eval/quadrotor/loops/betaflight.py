@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.quadrotor.loops.filters import PT3_SCALE, Layout, pick, pt1
+from eval.quadrotor.loops.filters import PT3_SCALE, Layout, Request, pick, pt1
 from eval.quadrotor.mixer import largest, least
 from tracks.geometry.scene import Array
 
@@ -169,19 +169,9 @@ def start(shape: tuple[int, ...], xp: Any) -> State:
     return State(scalar, two, two, three, vector, vector, xp.zeros((*shape, 1)), scalar)
 
 
-def update(
-    gain: Gains,
-    state: State,
-    throttle: Array,
-    rate_cmd_b: Array,
-    rate_b: Array,
-    dt: Array,
-    scale: Array,
-) -> tuple[State, Array]:
-    """Return the state after an update and the motor commands (..., 4).
-
-    The arguments are those of `crazyflie.update`.
-    """
+def update(gain: Gains, state: State, request: Request) -> tuple[State, Array]:
+    """Return the state after an update and the motor commands (..., 4) from 0 to 1."""
+    throttle, rate_cmd_b, rate_b, dt, scale = request
     xp = rate_b.__array_namespace__()
     started = state.started
     gyro = _chain(started, state.gyro, DEG * rate_b, gain.gyro_hz, dt)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.quadrotor.loops.filters import Layout, Pair, butterworth, pick
+from eval.quadrotor.loops.filters import Layout, Pair, Request, butterworth, pick
 from eval.quadrotor.mixer import largest
 from tracks.geometry.scene import Array
 
@@ -102,26 +102,9 @@ def start(shape: tuple[int, ...], xp: Any) -> State:
     return State(xp.zeros(shape), zeros, zeros, Pair(zeros, zeros))
 
 
-def update(
-    gain: Gains,
-    state: State,
-    throttle: Array,
-    rate_cmd_b: Array,
-    rate_b: Array,
-    dt: Array,
-    scale: Array,
-) -> tuple[State, Array]:
-    """Return the state after an update and the motor commands (..., 4) from 0 to 1.
-
-    Args:
-        gain: the loop's constants.
-        state: state before the update.
-        throttle: (...,) motor command without roll, pitch and yaw, from 0 to 1.
-        rate_cmd_b: (..., 3) commanded body rates [rad/s].
-        rate_b: (..., 3) current body rates [rad/s].
-        dt: time since the last update [s].
-        scale: (..., 3) factor on the outputs, by the effect `rate_gain`.
-    """
+def update(gain: Gains, state: State, request: Request) -> tuple[State, Array]:
+    """Return the state after an update and the motor commands (..., 4) from 0 to 1."""
+    throttle, rate_cmd_b, rate_b, dt, scale = request
     xp = rate_b.__array_namespace__()
     setpoint, rate = DEG * rate_cmd_b, DEG * rate_b
     error = setpoint - rate

@@ -17,6 +17,21 @@ PT3_SCALE = 1.961459177
 1 / sqrt(2^(1/3) - 1)."""
 
 
+class Request(NamedTuple):
+    """Inputs of an update of a firmware's rate loop."""
+
+    throttle: Array
+    """(...,) motor command without roll, pitch and yaw, from 0 to 1."""
+    rate_cmd_b: Array
+    """(..., 3) commanded body rates [rad/s]."""
+    rate_b: Array
+    """(..., 3) current body rates [rad/s]."""
+    dt: Array
+    """Time since the last update [s]."""
+    scale: Array
+    """(..., 3) factor on the outputs, by the effect `rate_gain`."""
+
+
 class Pair(NamedTuple):
     """State of a second-order filter in direct form II: its last two inner values."""
 
@@ -46,10 +61,8 @@ def butterworth(memory: Pair, value: Array, cutoff_hz: Array, dt: Array) -> tupl
     inputs are `dt` apart [s].
     """
     xp = value.__array_namespace__()
-    enabled = (cutoff_hz > 0.0) & (cutoff_hz * dt < 0.5)
-    warped = xp.tan(xp.pi * xp.where(enabled, cutoff_hz * dt, 0.25))
+    enabled, warped, a0 = _prewarped(xp, cutoff_hz, dt)
     # Coefficients of the transfer function in z, divided by a0.
-    a0 = 1.0 + 2.0**0.5 * warped + warped**2
     gain = warped**2 / a0
     a1 = 2.0 * (warped**2 - 1.0) / a0
     a2 = (1.0 - 2.0**0.5 * warped + warped**2) / a0
@@ -58,12 +71,16 @@ def butterworth(memory: Pair, value: Array, cutoff_hz: Array, dt: Array) -> tupl
     return Pair(inner, memory.first), xp.where(enabled, out, value)
 
 
-def settled(value: Array, cutoff_hz: Array, dt: Array) -> Pair:
-    """Return the state of `butterworth` after a long time with the constant input `value`."""
-    xp = value.__array_namespace__()
+def _prewarped(xp: Any, cutoff_hz: Array, dt: Array) -> tuple[Array, Array, Array]:
+    """Return whether `butterworth` is enabled, its prewarped cutoff, and its coefficient a0."""
     enabled = (cutoff_hz > 0.0) & (cutoff_hz * dt < 0.5)
     warped = xp.tan(xp.pi * xp.where(enabled, cutoff_hz * dt, 0.25))
-    a0 = 1.0 + 2.0**0.5 * warped + warped**2
+    return enabled, warped, 1.0 + 2.0**0.5 * warped + warped**2
+
+
+def settled(value: Array, cutoff_hz: Array, dt: Array) -> Pair:
+    """Return the state of `butterworth` after a long time with the constant input `value`."""
+    _, warped, a0 = _prewarped(value.__array_namespace__(), cutoff_hz, dt)
     # In equilibrium inner (1 + a1 + a2) = value, and the sum is 4 warped^2 / a0.
     inner = value * a0 / (4.0 * warped**2)
     return Pair(inner, inner)

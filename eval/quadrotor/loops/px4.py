@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.quadrotor.loops.filters import Layout, Pair, butterworth, pick, pt1, settled
+from eval.quadrotor.loops.filters import Layout, Pair, Request, butterworth, pick, pt1, settled
 from eval.quadrotor.mixer import largest, least
 from tracks.geometry.scene import Array
 
@@ -132,19 +132,9 @@ def start(shape: tuple[int, ...], xp: Any) -> State:
     return State(xp.zeros(shape), zeros, zeros, gyro, zeros, xp.zeros((*shape, 1)), zeros)
 
 
-def update(
-    gain: Gains,
-    state: State,
-    throttle: Array,
-    rate_cmd_b: Array,
-    rate_b: Array,
-    dt: Array,
-    scale: Array,
-) -> tuple[State, Array]:
-    """Return the state after an update and the motor commands (..., 4).
-
-    The arguments are those of `crazyflie.update`.
-    """
+def update(gain: Gains, state: State, request: Request) -> tuple[State, Array]:
+    """Return the state after an update and the motor commands (..., 4) from 0 to 1."""
+    throttle, rate_cmd_b, rate_b, dt, scale = request
     xp = rate_b.__array_namespace__()
     initial = settled(rate_b, gain.gyro_cutoff_hz, dt)
     gyro = Pair(*(pick(state.started, a, b) for a, b in zip(initial, state.gyro, strict=True)))

@@ -15,17 +15,24 @@ w = gyro - bias_w, means over dt:
 
 The matrix that an update solves is 6 x 6 for any number of corners, because H has nonzero columns
 for dp and dtheta only. The first axis of all arrays is the drone.
+
+With delayed observations the filter's state is one delay in the past. A buffer holds the IMU
+samples of the last delay. The filter uses each sample when it leaves the buffer, so an observation
+that arrives one delay late updates the state of its own time, and the covariance is that of a
+filter without delay. The buffered samples then propagate that state to the present. This is the
+delayed fusion horizon of PX4's EKF2; Khosravian et al. 2015, "Recursive attitude estimation in the
+presence of delayed measurements", compare such predictors.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+from eval.effects.interface import GRAVITY
+from tracks.common.masks import select
 from tracks.geometry.rotation import cross, exp_rot, to_local, to_world
 from tracks.geometry.scene import Array
 
-GRAVITY = 9.81
-"""Gravity [m/s^2]."""
 SIZE = 15
 """Size of the error state: position, velocity, attitude, accelerometer bias, gyro bias."""
 
@@ -41,29 +48,6 @@ class ImuNoise(NamedTuple):
     """Random walk of the accelerometer's bias [m/s^3/sqrt(Hz)]."""
     gyro_walk: Array
     """Random walk of the gyro's bias [rad/s^2/sqrt(Hz)]."""
-
-
-class FilterSettings(NamedTuple):
-    """Settings of a state estimator that feeds a policy: of the filter and of gate detections."""
-
-    corner_sigma: float
-    """Noise of a corner in the image, along each axis, standard deviation [pixel]."""
-    width: float
-    """Width of the image that covers the camera's field of view [pixel]."""
-    frame_hz: float
-    """Frames per second [Hz]."""
-    dropout: float
-    """Share of the frames without a gate detection."""
-    dropout_s: float
-    """Mean duration of a gap without detections [s]."""
-    delay_s: float
-    """Delay from a frame to the filter [s]."""
-    range_m: float
-    """Corners further away are not detected [m]."""
-    start_sigma: Array
-    """(15,) standard deviations of the error at the start, in the order of the error state."""
-    imu: ImuNoise
-    """The IMU's errors as assumed by the filter."""
 
 
 class FilterState(NamedTuple):
@@ -239,27 +223,6 @@ def _corrected(state: FilterState, error: Array, covariance: Array) -> FilterSta
     )
 
 
-def error_of(state: FilterState, truth: FilterState) -> Array:
-    """Return the error of the state (N, 15): truth minus estimate, in the order of the error state.
-
-    The attitude error is the axis times the sine of the angle, in body axes. The covariance in
-    `truth` is not used.
-    """
-    xp = state.pos_w.__array_namespace__()
-    relative = xp.matmul(xp.matrix_transpose(state.rot_w), truth.rot_w)
-    sine_b = 0.5 * xp.stack(
-        [
-            relative[:, 2, 1] - relative[:, 1, 2],
-            relative[:, 0, 2] - relative[:, 2, 0],
-            relative[:, 1, 0] - relative[:, 0, 1],
-        ],
-        axis=-1,
-    )
-    parts = [truth.pos_w - state.pos_w, truth.vel_w - state.vel_w, sine_b]
-    parts += [truth.acc_bias_b - state.acc_bias_b, truth.gyro_bias_b - state.gyro_bias_b]
-    return xp.concatenate(parts, axis=-1)
-
-
 def _skew(vector: Array) -> Array:
     """Return the matrices (..., 3, 3) with [a]x b = a x b."""
     xp = vector.__array_namespace__()
@@ -270,3 +233,49 @@ def _skew(vector: Array) -> Array:
 def _blocks(rows: list[list[Array]]) -> Array:
     xp = rows[0][0].__array_namespace__()
     return xp.concatenate([xp.concatenate(row, axis=-1) for row in rows], axis=-2)
+
+
+class Delayed(NamedTuple):
+    """Filters of N drones, and their buffered IMU samples."""
+
+    state: FilterState
+    """The state one delay ago."""
+    buffer: Array
+    """(N, L, 7) the last L IMU samples, oldest first: gyro [rad/s], specific force [m/s^2] and
+    duration [s], which is 0 before the flight began."""
+
+
+def start_delayed(state: FilterState, samples: int) -> Delayed:
+    """Return filters that start from `state`, with a delay of `samples` IMU samples."""
+    xp = state.pos_w.__array_namespace__()
+    return Delayed(state, xp.zeros((state.pos_w.shape[0], samples, 7)))
+
+
+def step(
+    filters: Delayed, gyro_b: Array, acc_b: Array, dt: Array, flew: Array, noise: ImuNoise
+) -> Delayed:
+    """Return the filters after a new IMU sample; see `predict`.
+
+    Args:
+        filters: the filters before.
+        gyro_b: (N, 3) measured body rates [rad/s].
+        acc_b: (N, 3) measured specific force [m/s^2].
+        dt: (N,) duration of the sample [s].
+        flew: (N,) bool, drones that have a new sample; the others do not change.
+        noise: noise of the IMU.
+    """
+    xp = gyro_b.__array_namespace__()
+    new_sample = xp.concatenate([gyro_b, acc_b, dt[:, None]], axis=-1)[:, None]
+    buffer_and_new = xp.concatenate([filters.buffer, new_sample], axis=1)
+    oldest = buffer_and_new[:, 0]
+    state = predict(filters.state, oldest[:, :3], oldest[:, 3:6], oldest[:, 6], noise)
+    return select(flew, Delayed(state, buffer_and_new[:, 1:]), filters)
+
+
+def current_state(filters: Delayed) -> FilterState:
+    """Return the current nominal states, with the covariance of the delayed horizon."""
+    state = filters.state
+    for index in range(filters.buffer.shape[1]):
+        sample = filters.buffer[:, index]
+        state = move(state, sample[:, :3], sample[:, 3:6], sample[:, 6])
+    return state

@@ -204,15 +204,15 @@ def _c_string(text: str) -> str:
     return " \\\n".join(f'    "{piece}"' for piece in pieces)
 
 
-def tanh_polynomials(terms: int = TANH_TERMS) -> tuple[list[float], list[float]]:
+def tanh_polynomials() -> tuple[list[float], list[float]]:
     """Return p and q, lowest power first, of tanh(x) = x p(x^2) / q(x^2).
 
-    Lambert 1768: tanh x = x / (1 + x^2 / (3 + x^2 / (5 + ...))), cut after `terms` terms. The
+    Lambert 1768: tanh x = x / (1 + x^2 / (3 + x^2 / (5 + ...))), cut after `TANH_TERMS` terms. The
     fraction is computed from the innermost term outwards. If v / p is the value of a term and
     s = x^2, the term outside it is (2k + 1) + s / (v / p) = ((2k + 1) v + s p) / v.
     """
-    value, previous = [Fraction(2 * terms - 1)], [Fraction(1)]
-    for k in range(terms - 2, -1, -1):
+    value, previous = [Fraction(2 * TANH_TERMS - 1)], [Fraction(1)]
+    for k in range(TANH_TERMS - 2, -1, -1):
         shifted = [Fraction(0), *previous]
         size = max(len(value), len(shifted))
         padded_value = [*value, *[Fraction(0)] * (size - len(value))]

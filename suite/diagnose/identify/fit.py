@@ -305,9 +305,11 @@ def _covariance(
     """Return the covariance (P, P) of all numbers; `free` are the indices of the fitted ones."""
     unknowns = evidence.unknowns
     total, names = len(unknowns), [unknown.name for unknown in unknowns]
-    if not free:
-        return np.diag([unknown.max_half_width**2 for unknown in unknowns])
     fixed = [names.index(name) for name in known.names]
+    if not free:
+        covariance = np.diag([unknown.max_half_width**2 for unknown in unknowns])
+        covariance[np.ix_(fixed, fixed)] = known.covariance
+        return covariance
     others = [k for k in range(total) if k not in fixed]
     equations = evidence.linearise(at).equations
     prior = np.array([0.0 if k in free else 1.0 / unknowns[k].max_half_width ** 2 for k in others])

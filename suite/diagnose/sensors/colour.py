@@ -119,7 +119,7 @@ def _mean_variance(ratio: float) -> float:
 
 
 class _Variograms(NamedTuple):
-    """Variograms of B stretches at L lags."""
+    """Variograms of B stretches at L lags, and with one more column the variance about the mean."""
 
     value: np.ndarray
     """(B, L) half the mean squared difference of errors at each lag."""
@@ -135,7 +135,7 @@ def fit_colour(flights: Sequence[Series]) -> Coloured | None:
     """Fit size, autocorrelation and drift; None if the flights have less than two stretches."""
     step_s = max(flight.step_s for flight in flights)
     lag_s = np.linspace(step_s, max(SHORT_S, step_s), SHORT_LAGS)
-    variograms = _variograms(flights, lag_s)
+    variograms = _variograms(flights, lag_s, about_mean=True)
     if variograms is None:
         return None
     drift = _drift(flights) if any(flight.speed.any() for flight in flights) else ZERO
@@ -181,19 +181,18 @@ def _noise(
     """Fit the noise in addition to a given random walk.
 
     The fast process is used only if its share is significant. `lag_s` (L,) are the lags of the
-    variograms [s]; `walk` is the variance of the random walk for each metre.
+    variograms [s], whose last column is the variance about the mean; `walk` is the variance of the
+    random walk for each metre.
 
     Returns:
         The parameters log v, f, log (T_f / T) and log T (4,), and the half-widths of their
         intervals.
     """
     duration_s = float(np.mean([flight.duration_s for flight in flights]))
-    about_mean = _variograms(flights, None)
-    assert about_mean is not None
+    measured = variograms.value
     # The variance is the variogram's limit at long lags. It counts as much as all short lags.
-    measured = np.concatenate([variograms.value, about_mean.value], axis=1)
-    weight = np.concatenate([variograms.weight, SHORT_LAGS * about_mean.weight], axis=1)
-    size = float((about_mean.weight * about_mean.value).sum()) + 1e-300
+    weight = variograms.weight * np.append(np.ones(SHORT_LAGS), SHORT_LAGS)
+    size = float((variograms.weight[:, -1] * measured[:, -1]).sum()) + 1e-300
 
     def model(theta: np.ndarray) -> np.ndarray:
         """Return the modelled variogram (B, L), then the variance about the flight's mean."""
@@ -261,21 +260,22 @@ def _drift(flights: Sequence[Series]) -> Interval:
     return Interval(*(float(v) for v in np.sqrt([power, max(power - half, 0.0), high])))
 
 
-def _variograms(flights: Sequence[Series], lag_s: np.ndarray | None) -> _Variograms | None:
+def _variograms(
+    flights: Sequence[Series], lag_s: np.ndarray, about_mean: bool = False
+) -> _Variograms | None:
     """Return the variograms of all stretches at the lags (L,); None for less than two stretches.
 
-    If `lag_s` is None, the value of a stretch is the mean square of its errors about the mean of
-    its flight, and L is 1.
+    With `about_mean` there is one more column: the mean square of the errors of each stretch about
+    the mean of its flight. A stretch without a pair of rows, such as one row, is left out.
     """
     values, counts, speeds, flight_of = [], [], [], []
     for number, flight in enumerate(flights):
         stretch = stretches(len(flight.value), flight.step_s)
         size = stretch[-1] + 1
-        if lag_s is None:
-            squares = [(flight.value - np.nanmean(flight.value)) ** 2]
-        else:
-            lags = np.rint(lag_s / flight.step_s).astype(int)
-            squares = [0.5 * (flight.value[k:] - flight.value[:-k]) ** 2 for k in lags]
+        lags = np.rint(lag_s / flight.step_s).astype(int)
+        squares = [0.5 * (flight.value[k:] - flight.value[:-k]) ** 2 for k in lags]
+        if about_mean:
+            squares += [(flight.value - np.nanmean(flight.value)) ** 2]
         # Sum the squares and count them, by stretch, for each lag.
         totals, pairs = [], []
         for square in squares:
@@ -284,7 +284,7 @@ def _variograms(flights: Sequence[Series], lag_s: np.ndarray | None) -> _Variogr
             totals.append(np.bincount(where, square[good], size))
             pairs.append(np.bincount(where, minlength=size))
         total, count = np.stack(totals, axis=1), np.stack(pairs, axis=1)
-        used = count.any(axis=1)
+        used = count[:, : len(lags)].any(axis=1)
         values.append((total / np.maximum(count, 1))[used])
         counts.append(count[used])
         known = np.isfinite(flight.speed)

@@ -51,7 +51,7 @@ def export(
 
     check_formats(formats, dtype)
     if "c" in formats:
-        check_no_input(out / CARD, [shipped.locate(policy) / CARD], "--out")
+        check_no_input(out / CARD, [shipped.locate(policy) / CARD])
     name, checkpoint = exported_checkpoint(policy)
     files = [(*file_names(name, each), *[CARD] * (each == "c")) for each in formats]
     _record_source(policy, out, files, checkpoint.seed)

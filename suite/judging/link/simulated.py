@@ -15,24 +15,12 @@ from eval.quadrotor.autopilot import make_autopilot, start_autopilot
 from eval.quadrotor.plant import Command, Motion, uses_noise
 from eval.quadrotor.stepper import Inputs, plant_step
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds.engine import DepthCamera, compile_model, contact_name, motion_of, start_state
-from eval.worlds.slots import gust_draws, layout_of
-from eval.worlds.trial import (
-    FLYING,
-    Course,
-    Rules,
-    TrialResult,
-    TrialSpec,
-    has_diverged,
-    is_wrench,
-    judge_state,
-    result_columns,
-    start_progress,
-)
+from eval.worlds.engine import DepthCamera, OneTrial, contact_name, motion_of
+from eval.worlds.slots import GustDraws
+from eval.worlds.trial import FLYING, Rules, TrialResult, TrialSpec, result_columns
 from suite.judging.link.messages import SetPoint, State, Wire, image_packets
 from tracks.geometry.camera import Camera
-from tracks.geometry.rotation import to_local, to_world
-from tracks.geometry.scene import Gates
+from tracks.geometry.rotation import to_local
 from tracks.track import Track
 
 LOST_S = 0.2
@@ -61,25 +49,14 @@ class SimulatedVehicle:
         The seed of `trial` determines the gusts. `image_hz` is the rate of the images [Hz].
         """
         self._vehicle, self._wire, self._trial = vehicle, wire, trial
-        self._rules = rules or Rules()
         self._autopilot = make_autopilot(vehicle)
         self.dt = self._autopilot.dt
-        # The scene in MuJoCo.
-        self._model = compile_model(track, vehicle, self.dt, layout_of([track]).solids)
-        self._data = mujoco.MjData(self._model)
-        self._data.qpos[:] = start_state(track)
-        mujoco.mj_step1(self._model, self._data)
-        self._draws = None
-        if uses_noise(self._autopilot.plant):
-            self._draws = gust_draws(trial, round(self._rules.time_limit_s / self.dt) + 2)
-        motion = motion_of(self._data)
-        first = None if self._draws is None else self._draws[:1]
+        self._judged = OneTrial(track, vehicle, self.dt, rules or Rules())
+        self._data = mujoco.MjData(self._judged.model)
+        motion = self._judged.put_at_start(self._data)
+        self._gusts = GustDraws(trial) if uses_noise(self._autopilot.plant) else None
+        first = self._gusts and self._gusts.at(0, 1)
         self._plant = start_autopilot(self._autopilot, motion, first).plant
-        # The judging, as a batch of one trial.
-        gates = track.scene.gates
-        count = np.array([len(gates.center_w)], np.int32)
-        self._course = Course(Gates(*(x[None] for x in gates)), count)
-        self._progress = start_progress(motion.pos_w)
         self._eye, self._steps_an_image = DepthCamera(camera), 1 / (image_hz * self.dt)
         self._command: Command | None = None
         self._command_step = self._ticks = 0
@@ -89,7 +66,7 @@ class SimulatedVehicle:
     @property
     def over(self) -> bool:
         """Whether the trial has ended."""
-        return int(self._progress.ended[0]) != FLYING
+        return int(self._judged.progress.ended[0]) != FLYING
 
     @property
     def begun(self) -> bool:
@@ -117,7 +94,7 @@ class SimulatedVehicle:
                 limit = np.array(self._vehicle.controller.rate_max)
                 rate_b = np.clip(message.rate_b, -limit, limit)
                 self._command = Command(np.array([thrust]), rate_b[None])
-                self._command_step = int(self._progress.step[0])
+                self._command_step = int(self._judged.progress.step[0])
         motion = motion_of(self._data)
         sent = self._measurements(motion, self.time_s if clock_s is None else clock_s)
         self._ticks += 1
@@ -129,7 +106,8 @@ class SimulatedVehicle:
         """Return the datagrams of the image and the state that are due at this step."""
         sent = []
         if self._ticks >= round(self.images * self._steps_an_image):
-            depth = self._eye.image(self._model, self._data, motion.pos_w[0], motion.rot_w[0])
+            pose = motion.pos_w[0], motion.rot_w[0]
+            depth = self._eye.image(self._judged.model, self._data, *pose)
             packets = image_packets(depth, self._eye.camera.range_m)
             sent += [self._wire.encode(packet) for packet in packets]
             self.images += 1
@@ -141,10 +119,10 @@ class SimulatedVehicle:
 
     def _fly(self, motion: Motion, command: Command) -> None:
         """Make one physics step with the command; brake if the command is too old."""
-        step = int(self._progress.step[0])
+        step = int(self._judged.progress.step[0])
         if (step - self._command_step) * self.dt > LOST_S:
             command = self._brake_command(motion)
-        noise = None if self._draws is None else self._draws[None, step + 1]
+        noise = self._gusts and self._gusts.at(step + 1, 1)
         plant, wrench = plant_step(
             self._autopilot.plant,
             self._plant,
@@ -153,19 +131,7 @@ class SimulatedVehicle:
             np.array([step * self.dt]),
         )
         self._plant = plant
-        # An invalid force or torque ends the trial without a step.
-        invalid = ~is_wrench(self._rules, wrench)
-        if not invalid[0]:
-            self._data.qfrc_applied[:3] = to_world(motion.rot_w, wrench.force_b)[0]
-            self._data.qfrc_applied[3:] = wrench.torque_b[0]
-            mujoco.mj_step2(self._model, self._data)
-            mujoco.mj_step1(self._model, self._data)
-        self._progress = self._progress._replace(step=self._progress.step + 1)
-        after, contact = motion_of(self._data), np.array([self._data.ncon > 0])
-        diverged = invalid | has_diverged(self._rules, after)
-        self._progress = judge_state(
-            self._rules, self._progress, self._course, self.dt, after, contact, diverged
-        )
+        self._judged.move(self._data, motion, wrench)
 
     def _brake_command(self, motion: Motion) -> Command:
         """Return the command that decelerates to hover, with the present heading."""
@@ -176,7 +142,7 @@ class SimulatedVehicle:
 
     def result(self, policy: str) -> TrialResult:
         """Return the trial's result so far; an unfinished one counts as a timeout."""
-        columns = result_columns(self._progress, 0, self.dt)
+        columns = result_columns(self._judged.progress, 0, self.dt)
         is_collision = columns["ended_by"] == "collision"
         return TrialResult(
             *self._trial,
@@ -184,7 +150,7 @@ class SimulatedVehicle:
             policy=policy,
             vehicle=self._vehicle.name,
             world="link",
-            collided_with=contact_name(self._model, self._data) if is_collision else None,
+            collided_with=contact_name(self._judged.model, self._data) if is_collision else None,
             bad_actions=0,
             limited_actions=0,
             late_actions=0,

@@ -149,7 +149,7 @@ def rows(due, time_s):
 
 
 def test_slots_and_fields_do_not_mix_and_a_decision_is_flagged_once():
-    recorder = Recorder(2, depth=True)
+    recorder = Recorder(2, True, np.zeros(3), "acceleration")
     action_b, depth_m = np.arange(6.0).reshape(2, 3), np.arange(8.0).reshape(2, 2, 2)
     recorder.add(rows([True, True], [0.0, 0.5]))
     recorder.decided(np.array([1]), action_b, depth_m)
@@ -171,7 +171,7 @@ def test_slots_and_fields_do_not_mix_and_a_decision_is_flagged_once():
 
 
 def test_the_next_trial_of_a_slot_begins_with_nothing():
-    recorder = Recorder(2, depth=False)
+    recorder = Recorder(2, False, np.zeros(3), "acceleration")
     recorder.decided(np.array([0]), np.ones((2, 3)), np.zeros((2, 2, 2)))
     recorder.add(rows([True, True], [0.0, 0.0]))
     recorder.start(0)

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from eval.judging import filtered, judge
+from eval.judging import judge, sensors
 from eval.judging import judge as module
-from eval.judging.filtered import Filtered, inertial
 from eval.judging.judge import JudgeOptions, fly
-from eval.judging.sensors import Sensors
+from eval.judging.sensors import Filtered, Sensors, inertial
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.sensors.filter.kalman import error_of, update_gate
+from eval.sensors.filter.kalman import update_gate
+from eval.sensors.interface import rotation_since
 from eval.sensors.sensors_file import PERFECT, load_sensors, scale_sensors, sensor_set
 from eval.worlds.trial import Rules, TrialSpec
 from policies.observation import View
@@ -145,8 +145,8 @@ def filtered_flights(wanted, trials, monkeypatch, slots=40, seconds=1.6):
             past.append(View(*self._truth))
             if len(past) > 1:
                 state, (pos_w, rot_w, vel_w, *_) = self.filters.state, past[-2]
-                true = state._replace(pos_w=pos_w, rot_w=rot_w, vel_w=vel_w)
-                error = error_of(state, true)[:, :9, None]
+                turned_b = rotation_since(rot_w, state.rot_w)
+                error = np.hstack([pos_w - state.pos_w, vel_w - state.vel_w, turned_b])[..., None]
                 covariance = state.covariance[:, :9, :9]
                 value = (error * np.linalg.solve(covariance, error)).sum((1, 2))
                 found.append(np.where(flying, value, np.nan))
@@ -168,7 +168,7 @@ def test_nees_is_within_its_bounds_if_the_corners_variance_is_right(
     def sure(state, corners, variance, camera_b):
         return update_gate(state, corners, believed * variance, camera_b)
 
-    monkeypatch.setattr(filtered, "update_gate", sure)
+    monkeypatch.setattr(sensors, "update_gate", sure)
     # From a second after the start on.
     late = filtered_flights(filtering(delay=DELAY_S), TWO_TRACKS[:trials], monkeypatch)[1][30:]
     flying = np.isfinite(late).sum(axis=1)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eval.judging.statistics import (
-    bootstrap_median,
+    bootstrap,
     expected_largest,
     mcnemar_exact,
     paired_bootstrap,
@@ -65,17 +65,17 @@ def test_mcnemar(b, c, p):
 def test_bootstrap_covers_the_true_median():
     rng = np.random.default_rng(0)
     draws = rng.exponential(size=(200, 60))
-    intervals = [bootstrap_median(row, seed=i, resamples=500) for i, row in enumerate(draws)]
+    intervals = [bootstrap(row, seed=i, resamples=500) for i, row in enumerate(draws)]
     covered = np.mean([low <= np.log(2) <= high for _, low, high in intervals])
     assert 0.9 <= covered <= 0.99
 
 
 def test_bootstrap_repeats_and_has_no_value_without_trials():
     values = np.arange(9.0) ** 2
-    assert bootstrap_median(values, 3) == bootstrap_median(values, 3)
-    assert bootstrap_median(values, 3) != bootstrap_median(values[::2], 3)
-    assert bootstrap_median(values).value == 16
-    assert np.isnan(bootstrap_median(np.array([]))).all()
+    assert bootstrap(values, 3) == bootstrap(values, 3)
+    assert bootstrap(values, 3) != bootstrap(values[::2], 3)
+    assert bootstrap(values).value == 16
+    assert np.isnan(bootstrap(np.array([]))).all()
 
 
 def test_paired_bootstrap_is_of_the_differences():

@@ -9,7 +9,7 @@ import pytest
 
 from eval.quadrotor import loops
 from eval.quadrotor.loops import betaflight, crazyflie, px4
-from eval.quadrotor.loops.filters import Pair, butterworth, layout_of, pt1, settled
+from eval.quadrotor.loops.filters import Pair, Request, butterworth, layout_of, pt1, settled
 from eval.quadrotor.plant import Command, make_plant
 from eval.quadrotor.stepper import Inputs, hover_state, rollout, step
 from eval.quadrotor.vehicle_file import load_vehicle, parse_vehicle, vehicle_table
@@ -29,7 +29,8 @@ def look(loop, state, throttle, wanted, rate=STILL, settings=None, layout=LAYOUT
     """Return state and motors after one step of 2 ms; a state of None is that of the start."""
     state = loop.start((), np) if state is None else state
     gains, given = loop.gains(settings or DEFAULTS[loop], layout), (wanted, rate)
-    return loop.update(gains, state, np.asarray(throttle), *map(np.array, given), 0.002, np.ones(3))
+    request = Request(np.asarray(throttle), *map(np.array, given), 0.002, np.ones(3))
+    return loop.update(gains, state, request)
 
 
 def test_two_looks_of_betaflight_by_hand():

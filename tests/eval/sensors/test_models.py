@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 from eval import sensors
 from eval.effects.interface import as_arrays
 from eval.sensors import SENSORS, view_models
-from eval.sensors.draws import blank_draws
 from eval.sensors.gate_map import GATES
-from eval.sensors.interface import Draws, Inertial, Moment, markov_step
+from eval.sensors.interface import Draws, Inertial, Moment, blank_draws, markov_step
 from eval.sensors.sensors_file import load_sensors, sensor_set
 from policies.observation import View
 from tracks.geometry.camera import Camera

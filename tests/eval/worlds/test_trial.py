@@ -7,7 +7,7 @@ import pytest
 
 from eval.quadrotor.plant import Motion, Wrench
 from eval.worlds import slots, trial
-from eval.worlds.slots import GUSTS_AT_ONCE, GustDraws, gust_draws, layout_of
+from eval.worlds.slots import GUSTS_AT_ONCE, GustDraws, layout_of
 from tests.support.courses import straight
 from tracks.geometry.scene import Gates
 
@@ -94,22 +94,27 @@ def test_a_track_with_meshes_is_a_group_of_its_own():
     assert slots.slot_groups([], {}) == []
 
 
+def gusts(trial, count):
+    return GustDraws(trial).at(0, count)
+
+
 def test_a_trials_random_numbers_are_its_own_for_each_use():
-    np.testing.assert_array_equal(gust_draws(TRIAL, 5), gust_draws(TRIAL, 9)[:5])
+    np.testing.assert_array_equal(gusts(TRIAL, 5), gusts(TRIAL, 9)[:5])
     others = TRIAL._replace(seed=8), TRIAL._replace(difficulty=4), TRIAL._replace(track="circular")
     for other in others:
-        assert (gust_draws(other, 5) != gust_draws(TRIAL, 5)).all()
+        assert (gusts(other, 5) != gusts(TRIAL, 5)).all()
     here, there = (TRIAL._replace(track=f"{way}own.toml") for way in ("", "./courses/"))
-    np.testing.assert_array_equal(gust_draws(here, 5), gust_draws(there, 5))
-    assert slots.generator_of(TRIAL, slots.SENSED).standard_normal() != gust_draws(TRIAL, 1)[0, 0]
+    np.testing.assert_array_equal(gusts(here, 5), gusts(there, 5))
+    assert slots.generator_of(TRIAL, slots.SENSED).standard_normal() != gusts(TRIAL, 1)[0, 0]
 
 
 def test_gusts_are_drawn_as_the_flight_goes_on():
-    gusts, whole = GustDraws(TRIAL), gust_draws(TRIAL, 4 * GUSTS_AT_ONCE)
+    drawn, rng = GustDraws(TRIAL), slots.generator_of(TRIAL, slots.GUSTS)
+    whole = rng.standard_normal((4 * GUSTS_AT_ONCE, 3))
     last = GUSTS_AT_ONCE - 1
     for step, count in ((0, 1), (1, 5), (last, 3), (3 * last, 2 * last), (2, 4)):
         wanted = whole[step : step + count]
-        np.testing.assert_array_equal(gusts.at(step, count)[: len(wanted)], wanted)
+        np.testing.assert_array_equal(drawn.at(step, count)[: len(wanted)], wanted)
     kept = GustDraws(TRIAL)
     for step in range(0, 100 * GUSTS_AT_ONCE, 50):
         kept.at(step, 60)

@@ -11,8 +11,8 @@ import pytest
 from eval.effects.slung_load import SlungLoad
 from eval.judging.judge import JudgeOptions, Record, fly
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.worlds import mujoco as mujoco_world
 from eval.worlds import reference as reference_world
+from eval.worlds import scene_slots
 from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
 from tests.support.courses import fly_on, straight
@@ -21,7 +21,7 @@ from tests.support.vehicles import PLAIN, with_effects, with_lag
 from tracks.families import make_track
 from tracks.geometry.camera import Camera
 
-VEHICLE = load_vehicle(Path(mujoco_world.__file__).parent.parent / "vehicles" / "reference.toml")
+VEHICLE = load_vehicle(Path(scene_slots.__file__).parent.parent / "vehicles" / "reference.toml")
 WORLDS = ["mujoco", "reference"]
 RULES = Rules()
 
@@ -86,7 +86,7 @@ def test_a_gate_crossed_outside_its_opening_does_not_count(world):
 
 def with_forces(world, change, monkeypatch):
     """Let `change` make another wrench of that which acts at a step."""
-    module = {"mujoco": mujoco_world, "reference": reference_world}[world]
+    module = {"mujoco": scene_slots, "reference": reference_world}[world]
     original = module.autopilot_step
 
     def step_of(autopilot, state, motion, action_b, gate_w, step, noise=None):

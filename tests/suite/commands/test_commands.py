@@ -102,7 +102,7 @@ def test_sensors_that_change_nothing_in_a_training_are_refused(tmp_path):
 def test_training_goes_on_from_a_policy_by_its_name_and_does_not_write_over_it(
     tmp_path, capsys, monkeypatch
 ):
-    assert checkpoint_folder("race-paper", "--init-from") == shipped.folder("race-paper")
+    assert checkpoint_folder("race-paper", "--init-from") == shipped.locate("race-paper")
     said = refused(capsys, "train --init-from rac --out", tmp_path / "run")
     assert "--init-from rac: " in said and "a shipped policy's name (race, race-paper" in said
     assert not (tmp_path / "run").exists()
@@ -112,7 +112,7 @@ def test_training_goes_on_from_a_policy_by_its_name_and_does_not_write_over_it(
     first = "phases.1.spec.rate_hz=20"
     run(f"train --init-from race --set {first} --out", tmp_path / "run")
     assert rates == [20.0], "of the first phase"
-    own = shutil.copytree(shipped.folder("race-paper"), tmp_path / "policy")
+    own = shutil.copytree(shipped.locate("race-paper"), tmp_path / "policy")
     said = refused(capsys, "train --out", tmp_path, "--init-from", own)
     assert "config.json is also an input and would be overwritten" in said
 

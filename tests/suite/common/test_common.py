@@ -33,7 +33,7 @@ from suite.judging.requests import Collection, Evaluation
 from suite.judging.trials import parse_levels, parse_tracks
 from tracks.common.grid import Cell, Grid
 from tracks.common.work import core_shares
-from tracks.geometry.scene import Boxes, Counts, Gates, Scene, Spheres, no_rods, pad
+from tracks.geometry.scene import Boxes, Counts, Gates, Rods, Scene, Spheres, pad
 
 GRID = Grid(
     "Speeds",
@@ -118,8 +118,8 @@ def _pad_one_box(to_boxes, center_w):
     none = np.zeros((0, 3))
     gates = Gates(none, np.zeros((0, 3, 3)), np.zeros((0, 4, 2)), np.zeros(0), np.zeros(0))
     boxes = Boxes(np.array([center_w]), np.zeros((1, 3, 3)), np.ones((1, 3)))
-    spheres = Spheres(none, np.zeros(0))
-    scene = Scene(gates, boxes, no_rods(), no_rods(), spheres, np.zeros((0, 3, 3)))
+    rods, spheres = Rods(none, none, np.zeros(0), np.zeros(0)), Spheres(none, np.zeros(0))
+    scene = Scene(gates, boxes, rods, rods, spheres, np.zeros((0, 3, 3)))
     return pad(scene, Counts(to_boxes, 0, 0, 0))
 
 

@@ -58,7 +58,7 @@ def test_policies_have_the_name_of_their_run_or_are_told_apart_and_none_flies_tw
     assert policy_labels(names, ["last", "last", "c"]) == names
     with pytest.raises(ValueError, match="given twice"):
         policy_labels(["a", "a"], ["a", "a"])
-    shutil.copytree(shipped.folder("race-small"), tmp_path / "mine" / "policy")
+    shutil.copytree(shipped.locate("race-small"), tmp_path / "mine" / "policy")
     assert load_policy(tmp_path / "mine" / "policy").name == "mine"
 
 
@@ -263,7 +263,7 @@ def test_a_policy_that_came_as_content_keeps_its_name_and_is_the_same_without_it
     folder = tmp_path / "my.policy"
     folder.mkdir()
     for name in ("config.json", "weights.safetensors", "card.md"):
-        (folder / name).write_bytes((shipped.folder("race-paper") / name).read_bytes())
+        (folder / name).write_bytes((shipped.locate("race-paper") / name).read_bytes())
     content = PolicyContent.of(folder)
     assert [name for name, _ in content.files] == ["config.json", "weights.safetensors"]
     packed, expected = pack(content), answers(load_policy(folder))

@@ -129,7 +129,7 @@ def test_a_folder_called_like_something_shipped_makes_no_other_loop(tmp_path, mo
         (tmp_path / name).mkdir()
     assert loop_by_content(hidden_loop()) == begun
     (tmp_path / "racer5").rmdir()
-    shutil.copytree(shipped.folder("race-paper"), tmp_path / "mine")
+    shutil.copytree(shipped.locate("race-paper"), tmp_path / "mine")
     save_vehicle(load_vehicle("racer5"), tmp_path / "racer5")
     own = loop_by_content(hidden_loop(policy="mine"))
     assert own.digests == begun.digests

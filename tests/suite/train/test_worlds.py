@@ -24,8 +24,7 @@ from tracks.families import FAMILIES, MAX_COUNTS, make_track
 from tracks.geometry.camera import Camera, pixel_rays_b
 from tracks.geometry.clearance import nearest_obstacle
 from tracks.geometry.depth import depth_image
-from tracks.geometry.gates import yaw_rotation
-from tracks.geometry.rotation import exp_rot
+from tracks.geometry.rotation import exp_rot, yaw_rotation
 from tracks.geometry.scene import stack
 
 

@@ -299,11 +299,11 @@ def test_a_place_is_tried_before_the_work_and_left_as_it_was(tmp_path):
 
 def test_a_file_that_is_read_is_refused_as_one_to_write_by_whatever_name(tmp_path):
     given, link = tmp_path / "a.toml", tmp_path / "b.toml"
-    files.check_no_input(given, [given, None, "", "reference"], "--out")
+    files.check_no_input(given, [given, None, "", "reference"])
     given.write_text("x")
     link.symlink_to(given)
-    files.check_no_input(given, [None, "", "reference", tmp_path / "none.toml"], "--out")
-    files.check_no_input(tmp_path / "new.toml", [given], "--out")
+    files.check_no_input(given, [None, "", "reference", tmp_path / "none.toml"])
+    files.check_no_input(tmp_path / "new.toml", [given])
     for path in (given, link, tmp_path / "." / "a.toml"):
         with pytest.raises(ValueError, match="--out: .* is also an input .* give another --out"):
-            files.check_no_input(path, [given], "--out")
+            files.check_no_input(path, [given])

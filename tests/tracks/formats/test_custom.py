@@ -370,7 +370,7 @@ def test_a_reader_that_hangs_or_dies_is_named_and_replaced(tmp_path, monkeypatch
     with monkeypatch.context() as patch:
         patch.setattr(mesh_reader, "READ_S", 0.5 if "sleep" in program else 60.0)
         patch.setattr(mesh_reader, "_PROGRAM", program)
-        mesh_reader._end(mesh_reader._process())
+        mesh_reader.end_process(mesh_reader._process())
         with pytest.raises(ValueError, match=f"it.obj: .*{said}"):
             load_convex_parts([tmp_path / "it.obj"])
     assert len(load_convex_parts([tmp_path / "it.obj"])[0][0]) == 12

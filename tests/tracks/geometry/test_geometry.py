@@ -12,8 +12,16 @@ from tracks.families import make_track
 from tracks.geometry.camera import Camera, cast_rays_b, nearest, optical_axis_b, pixel_rays_b
 from tracks.geometry.crossing import crossing, is_inside, is_near
 from tracks.geometry.field import attractive_field, magnetic_field
-from tracks.geometry.gates import frame_boxes, rectangle, regular_polygon, yaw_rotation
-from tracks.geometry.rotation import cross, exp_rot, quat_to_rot, rot_to_quat, to_local, to_world
+from tracks.geometry.gates import frame_boxes, rectangle, regular_polygon
+from tracks.geometry.rotation import (
+    cross,
+    exp_rot,
+    quat_to_rot,
+    rot_to_quat,
+    to_local,
+    to_world,
+    yaw_rotation,
+)
 from tracks.geometry.scene import PARKED_Z, Gates, counts, pad, stack
 
 

@@ -29,8 +29,8 @@ _PROTOCOLS = ("tcp", "tls", "ws", "wss")
 """Protocols of a cluster's address."""
 
 
-def read_workers(text: str | None, option: str = "--workers") -> Workers | None:
-    """Return the value of `option`, None where it was not given.
+def read_workers(text: str | None) -> Workers | None:
+    """Return the value of the option `--workers`, None where it was not given.
 
     Raises:
         ValueError: where it is neither a number of processes nor an address.
@@ -45,7 +45,7 @@ def read_workers(text: str | None, option: str = "--workers") -> Workers | None:
     if known and host and port.isascii() and port.isdigit():
         return f"{protocol or 'tcp'}://{location}"
     raise ValueError(
-        f"{option} is {text[:80]!r}; allowed is 1 to {MOST}, processes of this machine, or the "
+        f"--workers is {text[:80]!r}; allowed is 1 to {MOST}, processes of this machine, or the "
         "address of a cluster's scheduler such as tcp://10.0.0.1:8786"
     )
 

@@ -10,7 +10,6 @@ would divide among threads.
 from __future__ import annotations
 
 import os
-from collections.abc import MutableMapping
 
 VARIABLE = "NPROC"
 """Environment variable that XLA reads when JAX first lists its devices."""
@@ -18,16 +17,13 @@ LEAST, MOST = 2, 4096
 """Least number of threads that the suite sets, and largest number that the variable may have."""
 
 
-def set_threads(environment: MutableMapping[str, str] | None = None) -> None:
+def set_threads() -> None:
     """Set XLA's threads to the number of cores, and at least two, unless the variable is set.
-
-    The environment (by default that of this process) is changed in place.
 
     Raises:
         ValueError: where the variable is set to an invalid value.
     """
-    variables = os.environ if environment is None else environment
-    setting = variables.setdefault(VARIABLE, str(_default_threads()))
+    setting = os.environ.setdefault(VARIABLE, str(_default_threads()))
     # XLA would end the process without a useful message.
     if not (setting.isascii() and setting.isdigit() and 1 <= int(setting[:5]) <= MOST):
         raise ValueError(
@@ -36,29 +32,25 @@ def set_threads(environment: MutableMapping[str, str] | None = None) -> None:
         )
 
 
-def share_threads(environment: MutableMapping[str, str] | None = None) -> None:
+def share_threads() -> None:
     """Limit the threads to this process's share of the cores, after `set_threads`."""
-    variables = os.environ if environment is None else environment
-    variables[VARIABLE] = str(min(threads(variables), _default_threads()))
+    os.environ[VARIABLE] = str(min(threads(), _default_threads()))
 
 
-def threads(environment: MutableMapping[str, str] | None = None) -> int:
+def threads() -> int:
     """Return the number of XLA's threads."""
-    variables = os.environ if environment is None else environment
-    return int(variables.get(VARIABLE) or usable_cores())
+    return int(os.environ.get(VARIABLE) or usable_cores())
 
 
-def one_thread_a_product(environment: MutableMapping[str, str] | None = None) -> None:
+def one_thread_a_product() -> None:
     """Set numpy's and scipy's matrix products to one thread, unless a variable is set.
 
     The suite computes many small products. On free cores, threads do not make them faster. On busy
     cores, threads wait for each other ten to a hundred times as long as a product takes. Call this
-    function before numpy is imported, because numpy reads the setting then. The environment is
-    changed in place.
+    function before numpy is imported, because numpy reads the setting then.
     """
-    variables = os.environ if environment is None else environment
-    if not {"OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"} & set(variables):
-        variables["OPENBLAS_NUM_THREADS"] = "1"
+    if not {"OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"} & set(os.environ):
+        os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 
 def _default_threads() -> int:

@@ -13,13 +13,13 @@ from eval.sensors.filter.kalman import (
     Corners,
     FilterState,
     ImuNoise,
-    error_of,
     move,
     predict,
     project,
     start,
     update_gate,
 )
+from eval.sensors.interface import rotation_since
 from tracks.geometry.rotation import exp_rot
 
 FLIGHTS, IMU_HZ, FRAME_EVERY = 100, 100.0, 5
@@ -96,12 +96,19 @@ def flown(steps: int, believed: Believed = RIGHT, seed: int = 0) -> np.ndarray:
     return np.array(found)
 
 
+def error_of(state, truth):
+    """Return truth minus estimate (N, 15), the attitude's as axis times sine."""
+    turned_b = rotation_since(truth.rot_w, state.rot_w)
+    biases = (truth.acc_bias_b - state.acc_bias_b, truth.gyro_bias_b - state.gyro_bias_b)
+    return np.hstack([truth.pos_w - state.pos_w, truth.vel_w - state.vel_w, turned_b, *biases])
+
+
 def nees(state, truth):
     """Return the normalised estimation error squared (N,), chi-squared with 15 degrees of freedom.
 
     See Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2.
     """
-    error = np.asarray(error_of(state, truth))
+    error = error_of(state, truth)
     return np.einsum("nk,nk->n", error, np.linalg.solve(state.covariance, error[..., None])[..., 0])
 
 

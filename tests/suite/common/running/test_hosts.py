@@ -191,7 +191,7 @@ FILES = ("table.md", "trials.parquet")
 def flown(tmp_path_factory):
     """The policy by path, and its table as one process makes it."""
     folder = tmp_path_factory.mktemp("flown")
-    shutil.copytree(shipped.folder("race-paper"), folder / "mine")
+    shutil.copytree(shipped.locate("race-paper"), folder / "mine")
     args = ["eval", "--policy", str(folder / "mine"), *TRIALS]
     assert cli.main([*args, "--workers", "1", "--out", str(folder / "one")]) == 0
     return args, folder / "one"

@@ -172,18 +172,17 @@ def test_the_correlation_of_logs_with_other_rates_is_compared_at_equal_lags():
 SD, LASTS_S, DRIFT, SPEED, SPAN_S, ROWS = 0.03, 0.2, 0.05, 3.0, 60.0, 600
 
 
-def exact(flights, lag_s):
-    """Return two stretches with the expected variogram; None: variance about a flight's mean.
+def exact(flights, lag_s, about_mean=False):
+    """Return two stretches with the expected variogram, and the variance about a flight's mean.
 
     The noise decays with `LASTS_S` (its mean: Taylor 1921). A walk W(t) of the variance d a second
     has the variogram d l / 2, and about its mean over D the variance d D / 6.
     """
     per_s, ratio = DRIFT**2 * SPEED, LASTS_S / SPAN_S
-    if lag_s is None:
+    value = SD**2 * (1.0 - np.exp(-lag_s / LASTS_S)) + 0.5 * per_s * lag_s
+    if about_mean:
         of_mean = 2.0 * ratio * (1.0 - ratio * (1.0 - np.exp(-1.0 / ratio)))
-        value = np.array([SD**2 * (1.0 - of_mean) + per_s * SPAN_S / 6.0])
-    else:
-        value = SD**2 * (1.0 - np.exp(-lag_s / LASTS_S)) + 0.5 * per_s * lag_s
+        value = np.append(value, SD**2 * (1.0 - of_mean) + per_s * SPAN_S / 6.0)
     half = np.full((2, len(value)), 0.5)
     return colour._Variograms(2.0 * half * value, half, np.full((2, 1), SPEED), np.arange(2))
 
@@ -196,6 +195,13 @@ def test_a_drift_and_the_noise_around_it_have_their_true_sizes(monkeypatch):
     fitted = found.noise.value, found.lasts_s.value, found.drift.value
     # At the shortest lag of the drift's fit, 2 s, exp(-10) of the noise is still correlated.
     assert fitted == pytest.approx((SD, LASTS_S, DRIFT), rel=1e-3)
+
+
+def test_one_row_after_the_last_whole_stretch_is_left_out():
+    noise = np.random.default_rng(2).normal(size=2001)
+    found = [fit_colour([Series(noise[:n], np.zeros(n), 0.02)] * 2) for n in (2000, 2001)]
+    assert found[0] and found[1]
+    assert found[1].noise.value == pytest.approx(found[0].noise.value, rel=0.01)
 
 
 def test_a_drift_of_flights_is_significant_and_within_its_interval():

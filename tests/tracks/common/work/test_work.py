@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 import pytest
 
-from eval.effects import find_effect
+from eval.effects import EFFECTS
 from eval.logs.columns import FlightLogError
 from suite.cli import main
 from suite.common.errors import explain
@@ -52,7 +52,7 @@ class Stubborn(ValueError):
 
 def test_an_error_travels_with_where_it_came_up():
     with pytest.raises(ValueError) as caught:
-        find_effect("linear_dragg")
+        EFFECTS.find("linear_dragg")
     there = unpack(pack(failure(caught.value)))
     elsewhere = there._replace(
         root="/opt/suite", traceback=there.traceback.replace(there.root, "/opt/suite")
@@ -74,20 +74,21 @@ def test_a_read_only_table_travels_and_a_function_without_a_name_says_what_to_do
 @pytest.mark.parametrize(("cores", "wanted"), [(1, "2"), (2, "2"), (16, "16")])
 def test_a_thread_a_core_at_least_two_and_no_more_than_a_share_needs(cores, wanted, monkeypatch):
     monkeypatch.setattr(threads, "usable_cores", lambda: cores)
-    own, asked, many = {}, {"NPROC": "1"}, {"NPROC": "99"}
-    set_threads(own)
-    set_threads(asked)
-    assert own == {"NPROC": wanted} and asked == {"NPROC": "1"}
-    assert threads.threads(own) == int(wanted) and threads.threads({}) == cores
-    for environment, share in ((asked, "1"), (many, wanted)):
-        share_threads(environment)
-        assert environment == {"NPROC": share}
+    asked, many = {"NPROC": "1"}, {"NPROC": "99"}
+    calls = [(set_threads, {}, wanted), (set_threads, asked, "1"), (share_threads, asked, "1")]
+    for change, environment, found in [*calls, (share_threads, many, wanted)]:
+        monkeypatch.setattr(os, "environ", environment)
+        change()
+        assert environment == {"NPROC": found} and threads.threads() == int(found)
+    monkeypatch.setattr(os, "environ", {})
+    assert threads.threads() == cores
 
 
 @pytest.mark.parametrize("text", ["", "0", "-1", "two", "1e3", "4097", "9" * 5000, "٣"])
-def test_what_is_no_number_is_refused_before_xla_ends_the_process(text):
+def test_what_is_no_number_is_refused_before_xla_ends_the_process(text, monkeypatch):
+    monkeypatch.setattr(os, "environ", {"NPROC": text})
     with pytest.raises(ValueError, match=r"^NPROC is '.{0,40}' in the environment; allowed is 1"):
-        set_threads({"NPROC": text})
+        set_threads()
 
 
 GRADIENT = """
@@ -135,11 +136,11 @@ def test_processes_that_share_no_lock_are_refused_by_its_place(monkeypatch):
 
 
 def test_a_command_gives_numpy_one_thread_and_leaves_a_users_setting(monkeypatch):
-    own = {"OMP_NUM_THREADS": "3"}
-    one_thread_a_product(own)
-    assert own == {"OMP_NUM_THREADS": "3"}
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "")
     monkeypatch.delenv("OPENBLAS_NUM_THREADS")
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    one_thread_a_product()
+    assert "OPENBLAS_NUM_THREADS" not in os.environ
+    monkeypatch.delenv("OMP_NUM_THREADS")
     assert main(["effects"]) == 0
     assert os.environ["OPENBLAS_NUM_THREADS"] == "1"

@@ -1,4 +1,4 @@
-"""Effects of the air on the rotors: inflow, forward flight, blade flapping and ground effect.
+"""Effects of the air on the rotors, and of the rotors' angular momentum on the body.
 
 In all equations v_b is the velocity relative to the air in body axes, Omega_i the speed of a rotor,
 and e3 the unit vector along body z.
@@ -18,12 +18,6 @@ class Inflow(NamedTuple):
     """(...,) k: thrust that a rotor loses, per climb speed and rotor speed [N s^2/(m rad)]."""
 
 
-def inflow_thrust(values: Inflow, flow: Flow, thrust: Array) -> Array:
-    """Return the thrusts (..., 4) [N], each reduced by k Omega_i v_b . e3."""
-    climb = flow.air_vel_b[..., 2]
-    return thrust - per_axis(values.coefficient * climb) * flow.rotor_speed
-
-
 INFLOW = Effect(
     name="inflow",
     summary="Thrust decreases in a climb and increases in a descent",
@@ -35,7 +29,9 @@ INFLOW = Effect(
             "coefficient", "N s^2/(m rad)", neutral=0.0, low=0.0, high=1e-3, typical=(3e-5, 1.2e-4)
         ),
     ),
-    thrust=inflow_thrust,
+    thrust=lambda values, flow, thrust: (
+        thrust - per_axis(values.coefficient * flow.air_vel_b[..., 2]) * flow.rotor_speed
+    ),
 )
 
 
@@ -72,11 +68,6 @@ class BladeFlapping(NamedTuple):
     """(...,) k: torque per airspeed and sum of the rotor speeds [N s^2/rad]."""
 
 
-def blade_flapping_torque(values: BladeFlapping, flow: Flow) -> Array:
-    """Return k (sum Omega_i) (v_b x e3) (..., 3) [N m]."""
-    return per_axis(values.coefficient * flow.rotor_speed.sum(axis=-1)) * cross_e3(flow.air_vel_b)
-
-
 BLADE_FLAPPING = Effect(
     name="blade_flapping",
     summary="The rotors tilt away from the airflow and pitch the body up",
@@ -88,7 +79,9 @@ BLADE_FLAPPING = Effect(
             "coefficient", "N s^2/rad", neutral=0.0, low=-1e-5, high=1e-5, typical=(1e-7, 1e-6)
         ),
     ),
-    torque=blade_flapping_torque,
+    torque=lambda values, flow: (
+        per_axis(values.coefficient * flow.rotor_speed.sum(axis=-1)) * cross_e3(flow.air_vel_b)
+    ),
 )
 
 
@@ -139,4 +132,59 @@ GROUND_EFFECT = Effect(
         ),
     ),
     thrust=ground_effect_thrust,
+)
+
+
+class RotorGyroscopic(NamedTuple):
+    """Values of `rotor_gyroscopic`."""
+
+    rotor_inertia: Array
+    """(...,) J_r: inertia of one rotor about its axis [kg m^2]."""
+
+
+def rotor_gyroscopic_torque(values: RotorGyroscopic, flow: Flow) -> Array:
+    """Return -J_r (sum s_i Omega_i) (w x e3) (..., 3) [N m], without the torque of spinning up."""
+    net_spin = (flow.spin * flow.rotor_speed).sum(axis=-1)
+    return -per_axis(values.rotor_inertia * net_spin) * cross_e3(flow.rate_b)
+
+
+ROTOR_GYROSCOPIC = Effect(
+    name="rotor_gyroscopic",
+    summary="The rotors' angular momentum turns with the body",
+    equation="tau_b += -J_r (sum s_i Omega_i) (w x e3)",
+    source="Mahony, Kumar and Corke 2012",
+    values=RotorGyroscopic,
+    parameters=(
+        Parameter("rotor_inertia", "kg m^2", neutral=0.0, low=0.0, high=1e-3, typical=(5e-6, 5e-5)),
+    ),
+    torque=rotor_gyroscopic_torque,
+)
+
+
+class RotorSpinUp(NamedTuple):
+    """Values of `rotor_spin_up`."""
+
+    rotor_inertia: Array
+    """(...,) J_r: inertia of one rotor with its motor's bell, about its axis [kg m^2]."""
+
+
+def rotor_spin_up_torque(values: RotorSpinUp, flow: Flow) -> Array:
+    """Return -J_r (sum s_i dOmega_i/dt) e3 (..., 3) [N m]; 0 where dOmega_i/dt is unknown."""
+    if flow.rotor_acc is None:
+        return 0.0 * flow.rate_b
+    net = (flow.spin * flow.rotor_acc).sum(axis=-1)
+    return along_z(-values.rotor_inertia * net)
+
+
+ROTOR_SPIN_UP = Effect(
+    name="rotor_spin_up",
+    summary="The body is turned by rotors that spin up or down",
+    equation="tau_b += -J_r (sum s_i dOmega_i/dt) e3",
+    source="Mahony, Kumar and Corke 2012",
+    values=RotorSpinUp,
+    parameters=(
+        Parameter("rotor_inertia", "kg m^2", neutral=0.0, low=0.0, high=1e-3, typical=(2e-6, 2e-5)),
+    ),
+    torque=rotor_spin_up_torque,
+    rotor_acc=True,
 )
