@@ -26,11 +26,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         OSError: if the folder cannot be written.
     """
-    from suite.diagnose.example.real import real_files
     from tracks.common.files import replacing_file
 
     config.out.mkdir(parents=True, exist_ok=True)
-    contents = real_files() if config.real else _simulated_files()
+    contents = _real_files() if config.real else _simulated_files()
     for name, content in contents.items():
         # The commands of the README read the files of this folder.
         content = content.replace(b"FOLDER", str(config.out).encode()) if ".md" in name else content
@@ -44,6 +43,24 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         vehicle = config.out / "vehicle.toml"
         console.say(f"next: suite diagnose {config.out} --vehicle {vehicle} --out runs/example")
     return {"folder": str(config.out), "files": names}
+
+
+def _real_files() -> dict[str, bytes]:
+    """Return the real logs, their mapping and their licence, uncompressed, by file name.
+
+    README.md next to them states their source, licence and changes; every copy has it.
+    """
+    import lzma
+    from importlib.resources import files
+
+    mapping = "nanobench.toml"
+    contents = {mapping: files("eval.importers.mappings").joinpath(mapping).read_bytes()}
+    for source in files("suite.diagnose.example.real").iterdir():
+        if source.name.endswith((".csv.xz", ".yaml", ".md", "LICENSE")):
+            data = source.read_bytes()
+            is_packed = source.name.endswith(".xz")
+            contents[source.name.removesuffix(".xz")] = lzma.decompress(data) if is_packed else data
+    return contents
 
 
 def _simulated_files() -> dict[str, bytes]:

@@ -110,17 +110,17 @@ def _diagnose(given: DiagnosisInput, makers: Sequence[SourceMaker], seed: int) -
             verdict = verdict._replace(label="partly")
         else:
             verdict = verdict_on(unique, bool(tested), limits)
-    for finding in unique:
-        for named in finding.names:
-            large = implausible(finding.source.space, finding.theta, named.candidate, limits)
-            warnings += [
-                f"implausible: {words}, over three times the usual size" for words in large
-            ]
+    warnings += [
+        f"implausible: {words}, over three times the usual size"
+        for finding in unique
+        for named in finding.names
+        for words in implausible(finding.source.space, finding.theta, named.candidate, limits)
+    ]
     return Diagnosis(
         verdict=verdict,
         findings=unique,
+        tested=tested,
         flights=flights,
-        nominal=given.vehicle,
         vehicle=with_names(given.vehicle, unique, tested),
         references=tuple(log.name for log in given.references),
         warnings=warnings,
@@ -147,12 +147,12 @@ class Diagnosis:
     verdict: Verdict
     findings: tuple[Finding, ...]
     """One finding for each source, in the order of the sources."""
+    tested: tuple[TestedEffect, ...]
+    """The effects that separate tests named."""
     flights: SourceSet
     """The sources of evidence from these flights."""
-    nominal: Vehicle
-    """The vehicle that the simulation used."""
     vehicle: Vehicle
-    """The nominal vehicle with the named effects."""
+    """The vehicle that the simulation used, with the named effects."""
     references: tuple[str, ...]
     """Names of the flights before a change, if one was searched for."""
     warnings: list[str]
@@ -160,11 +160,6 @@ class Diagnosis:
     """Duration of the diagnosis [s]."""
     seed: int
     """Seed of all random draws."""
-
-    @property
-    def label(self) -> str:
-        """The verdict in a word: no_gap, named, partly or unknown."""
-        return self.verdict.label
 
     @property
     def main(self) -> Finding:
@@ -176,22 +171,11 @@ class Diagnosis:
         """Every named effect, with its finding."""
         return [(finding, named) for finding in self.findings for named in finding.names]
 
-    @property
-    def tested(self) -> tuple[TestedEffect, ...]:
-        """The effects that separate tests named."""
-        return tested_in(self.findings, self.flights)
-
-    @property
-    def limits(self) -> Thresholds:
-        """Thresholds of all steps."""
-        return self.main.source.limits
-
 
 def main_of(findings: Sequence[Finding]) -> Finding:
-    """Return the main finding.
+    """Return a finding with names, or any if none has; of these, the best explainable one.
 
-    Findings with named effects come first. Among equals it is the one of whose error a black box
-    explains most.
+    That is the one of whose error a black box explains most.
     """
     return max(findings, key=lambda one: (bool(one.names), one.remaining.explainable))
 

@@ -22,9 +22,6 @@ from tracks.input.reading import read_json
 
 RATE_HZ = 100.0
 """Rate of the set points [Hz]."""
-SECOND_DIRECTION = 2.1
-"""Rotation about z of the second flight of each trajectory [rad]. Each trajectory is flown twice,
-so that one flight can be held out."""
 MEASURES = {
     "motor": "Log the rotor speeds as well.",
     "voltage": "Log the battery's voltage as well.",
@@ -45,10 +42,11 @@ def trajectories_for(result: Mapping[str, Any]) -> tuple[list[Trajectory], list[
             trajectories += plan_for(names)
             words += [advice(effect["name"], rival) for rival in effect["alternatives"]]
             words += [MEASURES[key] for entry in separations_of(names) for key in entry.measure]
+    # Each trajectory is flown twice, so that one flight can be held out; the second is rotated.
     flights = [
         flight
         for trajectory in dict.fromkeys(trajectories)
-        for flight in (trajectory, replace(trajectory, direction=SECOND_DIRECTION))
+        for flight in (trajectory, replace(trajectory, direction=2.1))
     ]
     return flights, list(dict.fromkeys(words))
 

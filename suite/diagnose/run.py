@@ -18,7 +18,7 @@ from suite.diagnose.estimate.parameters import refuse_own_motion
 from suite.diagnose.identify.run import is_identified
 from suite.diagnose.plan import remove_plan, trajectories_for, write_plan
 from suite.diagnose.report.charts import write_rollouts
-from suite.diagnose.report.diagnosis_json import actuators_json, diagnosis_json
+from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.sources.rollout_source import rollouts_of
 from suite.diagnose.thresholds import THRESHOLDS
@@ -69,17 +69,17 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     result: dict[str, Any] = diagnosis_json(diagnosis)
     # Some options need rollouts. `flown` has them, and is None if only force and torque were used.
     flown, files = rollouts_of(diagnosis.main), {"vehicle.toml", "diagnosis.json"}
+    rollouts = flown.simulated(diagnosis.main.search) if flown else None
     if flown is None:
         wanted = {"--drive": config.drive != "auto", "--integrator": config.integrator != "auto"}
         unused = [flag for flag, is_given in wanted.items() if is_given]
         warnings += [f"{flag} needs rollouts, which these flights do not allow" for flag in unused]
     result["warnings"] = [*warnings, *result["warnings"]]
-    if flown is not None:
-        result["actuators"] = actuators_json(
-            actuator_mismatches(flown.logs, flown.vehicle, flown.limits)
-        )
+    if flown and rollouts:
+        mismatches = actuator_mismatches(flown.logs, flown.vehicle, flown.limits)
+        result["actuators"] = [mismatch._asdict() for mismatch in mismatches]
         if not config.no_recording:
-            write_rollouts(out / "recording.rrd", flown, diagnosis.main.search)
+            write_rollouts(out / "recording.rrd", flown, rollouts)
             files.add("recording.rrd")
     if config.plan:
         result["plan"] = write_plan(out / "plan", *trajectories_for(result))
@@ -93,7 +93,7 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     header = f"{vehicle.name} with the effects that suite diagnose named: {names}"
     save_vehicle(diagnosis.vehicle, out / "vehicle.toml", header)
     toml = (out / "vehicle.toml").read_text(encoding="utf-8")
-    write_text(out / "report.html", html(page(diagnosis, result, toml, files)))
+    write_text(out / "report.html", html(page(diagnosis, result, toml, files, rollouts)))
     for warning in result["warnings"][shown_count:]:
         console.note(f"warning: {warning}")
     # Remove what only an earlier diagnosis in this folder has written.

@@ -32,28 +32,16 @@ class Thresholds:
     """Largest RMS difference of measured rotor speeds and those by the nominal rate loop, relative
     to the standard deviation of the measured ones. Above it another controller flew, and the
     measured rotor speeds are the input."""
-    speed_mean_s: float = 0.1
-    """Rotor speeds are compared as means over this time, to average noise [s]."""
     still_speed: float = 10.0
     """Smaller changes and errors of rotor speeds are ignored [rad/s]."""
     lag_settled_s: float = 0.2
     """Time that is left out of the comparison of rotor speeds after the first row and after each
     hole, until the effect of the unknown initial speeds has decayed [s]."""
-    longest_lag_s: float = 0.15
-    """Longest time constant of the rotors in the fit [s]."""
     lag_followed_share: float = 0.99
     """Least share of the rotor speeds' variance that commands and a lag must explain. If speeds
     change little, noise of the rates in the commanded speeds resembles a lag."""
     lag_closed_share: float = 0.25
     """Least share by which another lag lowers the squared error that the vehicle's own lag has."""
-    lag_least_flights: int = 3
-    """Least number of flights that must show the lag."""
-    longest_delay_s: float = 0.06
-    """Longest delay of commands in the fit [s]."""
-    delays_tried: int = 9
-    """Number of delays up to the longest that are tried before the best is refined."""
-    actuator_flight_s: float = 60.0
-    """Longest flight time for the comparison of rotor speeds [s]."""
     held_out_share: float = 0.2
     """Share of the flights that is held out; at least one flight is."""
     lone_fitted_share: float = 0.7
@@ -69,9 +57,8 @@ class Thresholds:
     """Degree of the polynomial that is subtracted from a window before noise is modelled as
     coloured (correlated in time): errors of the start state resemble coloured noise."""
     colour_gain: float = 3.0
-    """Least rise of the log-likelihood to model noise as coloured, not white."""
-    drift_gain: float = 3.0
-    """Least rise of the log-likelihood to include a drift (error of the model) in the noise."""
+    """Least rise of the log-likelihood to model noise as coloured, not white, and to include a
+    drift (error of the model) in it."""
     colour_aside: float = 3.0
     """Largest difference between the row times of a window and the median row times of all windows,
     in rows. Windows with a larger one are left out of the noise model."""
@@ -108,8 +95,6 @@ class Thresholds:
     """Number of parts of the windows in cross-validation; each part is left out once."""
     strong_gain: float = 50.0
     """Gain that noise never reaches; candidates nearly as good as the best are then real, too."""
-    alike_share: float = 0.5
-    """Share of the best gain from which a group of columns explains about as much as the best."""
     few_windows: int = 12
     """Least number of windows for a permutation test. The signs of fewer windows have too few
     permutations for a p-value of `name_p_value`."""
@@ -123,7 +108,8 @@ class Thresholds:
     short_list: int = 5
     """Number of candidates that are fitted with the nonlinear model at each step of the search."""
     near_share: float = 0.5
-    """Least linear gain of these candidates, as a share of the best candidate's."""
+    """Share of the best gain from which a candidate explains about as much as the best; least
+    linear gain of these candidates."""
     rival_chi2: float = 9.0
     """An alternative ("rival") is a candidate whose chi-square is less than this above the named
     effect's (three sigma)."""
@@ -171,7 +157,8 @@ class Thresholds:
     least_view_s: float = 1.0
     """Least flight time to fit, and least flight time to hold out, for force and torque [s]."""
     least_flights: int = 3
-    """Least number of flights from which the spread of trims between flights is estimated."""
+    """Least number of flights from which the spread of trims or rotor lags between flights is
+    estimated."""
     longest_memory: int = 40
     """Largest time difference in the autocorrelation of a view's errors, in windows of the view."""
     least_fast_share: float = 0.5
@@ -217,11 +204,6 @@ class Thresholds:
     """Probability of a false name of a change, over all candidates and views."""
     change_draws: int = 9999
     """Number of draws of the null of a change, for all candidates together."""
-    swing_periods_s: tuple[float, float] = (0.6, 3.5)
-    """Periods at which a swing (an oscillating force, as of a load on a line) is searched for:
-    those of pendulums of 0.1 to 3 m [s]."""
-    swing_p_value: float = 0.001
-    """Probability of a false peak in the spectrum of the force residual, over all periods."""
     swing_share: float = 0.15
     """Least share of the force residual's power that oscillates at the period of the peak."""
     swing_driven: float = 0.5
@@ -230,11 +212,6 @@ class Thresholds:
     view_block_s: float = 2.0
     """Length of stretches whose errors count as independent in a view [s]."""
 
-    bootstrap_draws: int = 1000
-    """Number of draws for the 95 % interval of a gap."""
-    bootstrap_block: int = 4
-    """Neighbouring rollouts that a bootstrap draws together, since they overlap; of few rollouts a
-    quarter."""
     gap_stride_s: float = 0.25
     """Time between the starts of the rollouts that measure the gap [s]."""
     refuting_chi2: float = 25.0
@@ -245,23 +222,9 @@ class Thresholds:
     least_next_to_rest: float = 0.5
     """Least fall of the held-out squared error by a name, as a share of the residual above the
     noise, if that residual is significant."""
-    cells: int = 4
-    """Number of grid points along x and along y for a residual force that depends on position."""
-    pieces: int = 5
-    """Number of straight pieces of a residual force or torque that depends on one quantity."""
-    thrust_reversal: float = 10.0
-    """Rate of change of thrust above which only its sign counts [m/s^3]."""
-    colours_s: tuple[float, ...] = (0.3, 0.03)
-    """Correlation times of the tested random disturbances, as of gusts and of rotors [s]."""
-    disturbance_quantiles: tuple[float, ...] = (0.9, 0.5, 0.1)
-    """Quantiles of the information over all independent directions of a disturbance. They set the
-    sizes of disturbance that are tested."""
-    informed_share: float = 1e-9
-    """Directions with less than this share of the largest information are left out."""
-    noise_error: float = 0.02
-    """Relative uncertainty of the measured noise power."""
     shape_p_value: float = 0.001
-    """Largest p-value with which a function of the state counts as structure in the residual."""
+    """Largest p-value with which a function of the state, or a swing (an oscillating force) of any
+    period, counts as structure in the residual."""
     colour_p_value: float = 1e-4
     """Largest p-value with which a smooth disturbance along an axis counts as structure."""
     structure: float = 1.15
@@ -274,10 +237,6 @@ class Thresholds:
     Errors of unknown rotor speeds alone may reach 1.3."""
     unexplained_share: float = 0.7
     """Largest remaining share of the gap for the verdict `partly`; above it, it is `unknown`."""
-    wind_lengths_m: tuple[float, float, int] = (0.5, 40.0, 25)
-    """Shortest and longest length scale of turbulence that is tried [m], and number of values."""
-    wind_intensities: tuple[float, float, int] = (0.02, 8.0, 121)
-    """Least and largest intensity of turbulence that is tried [m/s], and number of values."""
     wind_ratio: float = 10.0
     """Least rise of the log-likelihood by wind, compared with no wind."""
     wind_rival_ratio: float = 8.0

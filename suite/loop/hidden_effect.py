@@ -23,13 +23,13 @@ from suite.common import curve
 from suite.common.charts import curves_chart
 from suite.common.report import Links, Picture, Section
 from suite.delta.run import errors_grid
-from suite.diagnose.report.summary import components, grid
+from suite.diagnose.report.summary import components
 from suite.loop.compare import BEFORE, PolicyResult, points, significance
 from suite.loop.config import EXACT_SIMULATORS, LoopConfig
 from suite.loop.variants import COLOURS, DeltaModel, Findings, Loop, ShownPolicy, Variant
 from suite.loop.work import named_effects, read_diagnosis
 from tracks.common.files import to_json
-from tracks.common.grid import Grid, markdown
+from tracks.common.grid import Grid, markdown, table
 
 NOMINAL, CONTROL, DELTA, NAMED, BOTH = "nominal", "control", "delta", "named", "both"
 LABELS = {
@@ -131,7 +131,7 @@ def _diagnosis_section(config: LoopConfig, diagnosis: Mapping[str, Any]) -> Sect
             f"Verdict: {diagnosis['verdict']}. The gap (rollout error over the error of noise "
             f"alone) on held-out flights is {gap['before']:.2f} before, {gap['after']:.2f} after; "
             f"{gap['noise_floor']:.2g} is the noise floor.",
-            grid("", headers, rows),
+            table(headers, rows),
             *describe_hidden(config),
             Links([("diagnosis/report.html", "the diagnosis's own report")]),
         ],

@@ -43,6 +43,9 @@ def with_lag(vehicle, time_constant):
     return replace(vehicle, rotors=replace(vehicle.rotors, time_constant=time_constant))
 
 
+LAGGED = with_lag(PLAIN, 0.03)
+
+
 def at_rest(height=1.0):
     """Return a level body at rest."""
     return Motion(np.array([0.0, 0.0, height]), np.eye(3), np.zeros(3), np.zeros(3))

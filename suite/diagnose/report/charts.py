@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from eval.logs.flight_log import FlightLog
 from eval.view.comparison import ComparedFlight, Simulation, States, write_comparison
 from suite.common.charts import plain_axes, png, titled
 from suite.diagnose.data.windows import FlightWindows, take
 from suite.diagnose.report.summary import superscripts
-from suite.diagnose.search.evaluation import SearchResult
-from suite.diagnose.sources.rollout_source import RolloutSource
+from suite.diagnose.sources.rollout_source import Rollouts, RolloutSource
 from suite.diagnose.sources.source import Series
 from tracks.geometry.rotation import exp_rot, rot_to_quat
 
@@ -50,35 +48,29 @@ def series_chart(series: Series) -> bytes:
     return png(figure)
 
 
-def write_rollouts(path: Path, flown: RolloutSource, found: SearchResult) -> Path:
-    """Write held-out flights, measured and simulated in rollouts of 1 s, as a recording (.rrd).
+def write_rollouts(path: Path, flown: RolloutSource, rollouts: Rollouts) -> Path:
+    """Write held-out flights, measured and simulated in `rollouts`, as a recording (.rrd).
 
     Raises:
         OSError: if the file cannot be written; no partial file remains.
     """
-    windows, simulated = flown.simulated(found)
+    windows, simulated = rollouts
     flights = []
     for number in np.unique(windows.flight):
         rows = np.flatnonzero(windows.flight == number)
         simulations = []
         for label, residual in simulated.items():
-            rollouts = [_rollout(take(windows, row), residual[row]) for row in rows]
-            paths, errors = [], []
-            for states, error in filter(None, rollouts):  # without those that diverged
-                paths.append(states)
-                errors.append(error)
+            parts = (_rollout(take(windows, row), residual[row]) for row in rows)
+            kept = [part for part in parts if part]  # without those that diverged
+            paths, errors = [states for states, _ in kept], [error for _, error in kept]
             simulations.append(Simulation(label, paths, errors))
         log = flown.logs[int(number)]
-        flights.append(ComparedFlight(log.name, _measured(log, flown.since_s), simulations))
+        time_s = log.time_s - log.time_s[0]
+        is_held = time_s >= flown.since_s - 1e-6
+        fields = (time_s, log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b)
+        measured = States(*(field[is_held] for field in fields))
+        flights.append(ComparedFlight(log.name, measured, simulations))
     return write_comparison(path, flights, flown.vehicle.body.half_size)
-
-
-def _measured(log: FlightLog, first_s: float) -> States:
-    """Return the measured state of a flight from `first_s` on."""
-    time_s = log.time_s - log.time_s[0]
-    rows = time_s >= first_s - 1e-6
-    fields = (time_s, log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b)
-    return States(*(field[rows] for field in fields))
 
 
 def _rollout(window: FlightWindows, residual: np.ndarray) -> tuple[States, np.ndarray] | None:

@@ -14,23 +14,19 @@ from suite.diagnose.plan import advice
 from suite.diagnose.report.summary import headline, short_name
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.source import Finding
-from suite.diagnose.verdict.actuators import ActuatorMismatch
 from suite.diagnose.verdict.gap import EffectSize, remaining_share
-
-NO_EFFECT = "that no effect of the catalogue explains"
-"""Reason of a remaining error that has structure."""
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the entries of diagnosis.json on the named effects and the gap."""
     # The control is a wrong effect, for comparison; a swing is an oscillating force.
-    main, control, limits = diagnosis.main, diagnosis.main.control, diagnosis.limits
-    swings = [one.remaining.swing for one in diagnosis.findings if one.remaining.swing]
-    swing = swings[0] if swings else None
+    main, control, limits = diagnosis.main, diagnosis.main.control, diagnosis.main.source.limits
+    swings = (one.remaining.swing for one in diagnosis.findings)
+    swing = next(filter(None, swings), None)
     named = [effect for _, effect in diagnosis.named]
     pairs = [(effect.candidate.name, rival) for effect in named for rival in effect.rivals]
     entries: dict[str, Any] = {
-        "verdict": diagnosis.label,
+        "verdict": diagnosis.verdict.label,
         "effects": effects_json(diagnosis),
         "negligible": [
             {"name": name, "size": size._asdict(), "relevant": False}
@@ -48,13 +44,25 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         and {
             "effect": control[0],
             "after": control[1].rms,
-            "after_ci95": control[1].ci95(diagnosis.seed, limits),
+            "after_ci95": control[1].ci95(diagnosis.seed),
         },
         "unexplained": {
             "share": remaining_share(main.before, main.after) if named or diagnosis.tested else 1.0,
             "judged": diagnosis.verdict.share_left,
             "where": diagnosis.verdict.where,
-            "above_noise": above_noise(diagnosis),
+            "above_noise": [
+                {
+                    "view": one.source.name,
+                    "error": one.after.rms,
+                    "noise_floor": one.after.floor,
+                    "unit": one.source.unit,
+                    "reason": "that no effect of the catalogue explains"
+                    if one.remaining.structured
+                    else one.remaining.reason,
+                }
+                for one in diagnosis.findings
+                if one.after.rms > limits.above_noise * one.after.floor
+            ],
             "swing": swing and {"period_s": swing.period_s, "length_m": swing.length_m},
             **main.remaining.details,
         },
@@ -64,33 +72,14 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     return {"headline": headline(entries), **entries}
 
 
-def above_noise(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Return an entry for each source whose remaining error is clearly above the noise floor."""
-    return [
-        {
-            "view": one.source.name,
-            "error": one.after.rms,
-            "noise_floor": one.after.floor,
-            "unit": one.source.unit,
-            "reason": NO_EFFECT if one.remaining.structured else one.remaining.reason,
-        }
-        for one in diagnosis.findings
-        if one.after.rms > diagnosis.limits.above_noise * one.after.floor
-    ]
-
-
 def not_examined(diagnosis: Diagnosis) -> list[str]:
     """Return the parts of the dynamics that no source tests: `force`, `torque`, `rate loop`.
 
     The rate loop is tested if effects that need commands as the model's input are candidates.
     """
     views = {one.source.name for one in diagnosis.findings}
-    tried = {
-        effect
-        for one in diagnosis.findings
-        for candidate in one.source.candidates
-        for effect in effects_in(candidate.name)
-    }
+    names = [candidate.name for one in diagnosis.findings for candidate in one.source.candidates]
+    tried = {effect for name in names for effect in effects_in(name)}
     parts = [] if "whole" in views else [name for name in ("force", "torque") if name not in views]
     by_command = any("command" in EFFECTS[name].needs for name in tried if name in EFFECTS)
     return [*parts, *([] if by_command else ["rate loop"])]
@@ -98,7 +87,7 @@ def not_examined(diagnosis: Diagnosis) -> list[str]:
 
 def gap_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the gap of the main finding, and the channels of all findings."""
-    main, seed, limits = diagnosis.main, diagnosis.seed, diagnosis.limits
+    main = diagnosis.main
     return {
         "measure": main.source.measure,
         "of": main.source.subject,
@@ -116,8 +105,8 @@ def gap_json(diagnosis: Diagnosis) -> dict[str, Any]:
             if one.before.offset > 0.0
         },
         "model_error": main.source.model_error(main.search),
-        "before_ci95": main.before.ci95(seed, limits),
-        "after_ci95": main.after.ci95(seed, limits),
+        "before_ci95": main.before.ci95(diagnosis.seed),
+        "after_ci95": main.after.ci95(diagnosis.seed),
         "horizon_s": main.source.horizon_s,
         "channels": {
             group: {
@@ -179,17 +168,16 @@ def _undecided(finding: Finding, names: Sequence[NamedEffect]) -> list[int]:
 
     The flights then do not decide which motor has the effect.
     """
+    name, space = names[0].candidate.name, finding.source.space
     fitted = {index for named in names for index in named.candidate.indices}
-    space, largest_rise = finding.source.space, finding.source.limits.rival_chi2
-
-    def fits_as_well(index: int) -> bool:
-        label = f"{space.entries[index].effect} {_motor_number(space, index)}"
-        return any(named.worse_by.get(label, np.inf) <= largest_rise for named in names)
-
+    rises = [rise for named in names for rise in named.worse_by.items()]
+    close = {label for label, rise in rises if rise <= finding.source.limits.rival_chi2}
     return [
         index
         for index, entry in enumerate(space.entries)
-        if entry.effect == names[0].candidate.name and index not in fitted and fits_as_well(index)
+        if entry.effect == name
+        and index not in fitted
+        and f"{name} {_motor_number(space, index)}" in close
     ]
 
 
@@ -214,6 +202,7 @@ def parameters_json(
         return value, [max(value - width, entry.low), min(value + width, entry.high)]
 
     entries: dict[str, Any] = {}
+    fitted = {(space.entries[i].parameter, space.entries[i].component): i for i in indices}
     for parameter in EFFECTS[name].parameters:
         # An effect of single motors: the motors' numbers, and a value for each. If only one motor
         # was named, the interval of its number covers the other motors that fit as well.
@@ -230,22 +219,12 @@ def parameters_json(
                 value, ci95 = (column[0] if is_single else list(column) for column in columns)
                 entries[key] = {"value": value, "unit": unit, "ci95": ci95}
             continue
-        by_component = {
-            space.entries[index].component: index
-            for index in indices
-            if space.entries[index].parameter == parameter.name
-        }
-        if not by_component:
-            continue
         # A vector has None for components that were not fitted.
-        if parameter.size:
-            parts = [
-                value_and_interval(by_component[k]) if k in by_component else (None, None)
-                for k in range(parameter.size)
-            ]
-            value, ci95 = map(list, zip(*parts, strict=True))
-        else:
-            value, ci95 = value_and_interval(by_component[None])
+        keys = [(parameter.name, k) for k in range(parameter.size)] or [(parameter.name, None)]
+        if not any(key in fitted for key in keys):
+            continue
+        parts = [value_and_interval(fitted[k]) if k in fitted else (None, None) for k in keys]
+        value, ci95 = map(list, zip(*parts, strict=True)) if parameter.size else parts[0]
         entries[parameter.name] = {"value": value, "unit": parameter.unit, "ci95": ci95}
     return entries
 
@@ -253,8 +232,3 @@ def parameters_json(
 def _motor_number(space: ParameterSpace, index: int) -> int:
     """Return the number (from 1) of the motor to which the parameter at `index` belongs."""
     return (space.entries[index].component or 0) + 1
-
-
-def actuators_json(mismatches: Sequence[ActuatorMismatch]) -> list[dict[str, Any]]:
-    """Return the entry `actuators`: measured rotor speeds compared with commanded ones."""
-    return [{**one._asdict(), "followed": one.followed} for one in mismatches]

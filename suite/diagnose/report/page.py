@@ -23,16 +23,13 @@ from suite.diagnose.report.sections import (
     rivals_section,
 )
 from suite.diagnose.report.summary import (
-    cells,
     components,
     figure,
-    grid,
     next_steps,
-    short_name,
     superscripts,
 )
-from suite.diagnose.sources.rollout_source import rollouts_of
-from tracks.common.grid import Cell, Grid
+from suite.diagnose.sources.rollout_source import Rollouts, rollouts_of
+from tracks.common.grid import Cell, Grid, table, table_of
 
 TITLES = {
     "no_gap": "no gap",
@@ -48,13 +45,6 @@ FILES = (
     ("plan/plan.json", "flights that separate effects which these flights do not"),
 )
 """Files next to the report, and their description."""
-LEAST_FLOOR = 1e-9
-"""Least noise floor, in any unit, of a channel that a log measured."""
-TOTALS = (
-    "Values are totals: they replace those of the vehicle file. Of the gap: the share that this "
-    "effect removes when it is added last. Chance gives a false name with a probability of at most "
-    "{chance:.1g}."
-)
 CHANNELS = (
     "RMS errors on held-out flights. Noise floor: the error by measurement noise alone (in "
     "rollouts, noise of the start and of the compared row). Errors of force and torque are "
@@ -65,17 +55,28 @@ CHANNELS = (
 )
 
 
-def page(diagnosis: Diagnosis, result: Mapping[str, Any], toml: str, files: set[str]) -> Report:
+def page(
+    diagnosis: Diagnosis,
+    result: Mapping[str, Any],
+    toml: str,
+    files: set[str],
+    rollouts: Rollouts | None = None,
+) -> Report:
     """Return the report of a diagnosis with the diagnosis.json `result` and vehicle file `toml`.
 
-    `files` are the paths of those of `FILES` that exist.
+    `files` are the paths of those of `FILES` that exist. `rollouts` are those for the chart, if
+    they were simulated before.
     """
-    gap, flown = result["gap"], rollouts_of(diagnosis.main)
+    gap, flown, main = result["gap"], rollouts_of(diagnosis.main), diagnosis.main
+    held = gap["held_out"]
+    # The values of a held-out stretch: measured, and simulated without and with the named effects.
+    series = flown.series(main.search, rollouts) if flown else main.source.series(main.search)
+    chart = [Picture(series_chart(series), series.caption)] if series else []
     after = f" → {figure(gap['after'])}" if result["effects"] else ""
     facts = {
         "gap on held-out flights": superscripts(f"{figure(gap['before'])}{after} {gap['unit']}"),
         "noise floor": f"{gap['noise_floor']:.3g}",
-        "held out": _few(gap["held_out"]),
+        "held out": ", ".join(held[:3]) + (f" and {len(held) - 3} more" if held[3:] else ""),
         "driven by": result["driven_by"],
     }
     if result["not_examined"]:
@@ -85,48 +86,27 @@ def page(diagnosis: Diagnosis, result: Mapping[str, Any], toml: str, files: set[
     details = [
         Section("Errors on held-out flights", [channels_grid(gap["channels"])]),
         *([logs_section(flown.logs), noise_section(diagnosis)] if flown else []),
-        *actuators_section(result),
+        *([actuators_section(result)] if result.get("actuators") else []),
         candidates_section(diagnosis),
         rivals_section(diagnosis, result),
         residual_section(result),
         evidence_section(diagnosis, result),
         agreement_section(diagnosis),
     ]
-    return Report(
-        title=f"Diagnosis: {TITLES[result['verdict']]}",
-        lead=result["headline"],
-        facts=facts,
-        sections=[
-            Section("What to do next", [Steps(next_steps(result))]),
-            *_measured(diagnosis),
-            *([Section("Warnings", result["warnings"])] if result["warnings"] else []),
-            *_findings(result.get("findings", ())),
-            *_answer(result),
-            _written(result, toml, files),
-            *(replace(section, folded=True) for section in details),
-        ],
-    )
+    sections = [
+        Section("What to do next", [Steps(next_steps(result))]),
+        Section("Measured and simulated", chart),
+        Section("Warnings", result["warnings"]),
+        _findings(result.get("findings", ())),
+        _answer(result),
+        _written(result, toml, files),
+    ]
+    shown = [section for section in sections if section.parts]
+    shown += [replace(section, folded=True) for section in details]
+    return Report(f"Diagnosis: {TITLES[result['verdict']]}", result["headline"], facts, shown)
 
 
-def _few(names: list[str]) -> str:
-    """Return up to three names, and the number of the others."""
-    short = [short_name(name) for name in names]
-    return ", ".join(short[:3]) + (f" and {len(short) - 3} more" if len(short) > 3 else "")
-
-
-def _measured(diagnosis: Diagnosis) -> list[Section]:
-    """Return a section with a chart of a held-out stretch, if there is one.
-
-    The chart has the measured values, and those simulated without and with the named effects.
-    """
-    main = diagnosis.main
-    series = main.source.series(main.search)
-    if series is None:
-        return []
-    return [Section("Measured and simulated", [Picture(series_chart(series), series.caption)])]
-
-
-def _findings(findings: Sequence[Mapping[str, Any]]) -> list[Section]:
+def _findings(findings: Sequence[Mapping[str, Any]]) -> Section:
     """Return a section on faults of the logs (such as wrong units), corrected or suspected."""
     keys = ("flight", "signal", "status", "fault", "evidence", "fix")
     rows = [
@@ -135,7 +115,7 @@ def _findings(findings: Sequence[Mapping[str, Any]]) -> list[Section]:
         if finding["status"] in ("corrected", "doubt")
     ]
     headers = ["log", *keys[1:]]
-    return [Section("Findings about the logs", [grid("", headers, rows)])] if rows else []
+    return Section("Findings about the logs", [table(headers, rows)] if rows else [])
 
 
 def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Grid:
@@ -147,26 +127,25 @@ def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Gr
     for group, values in channels.items():
         for channel, error in values.items():
             floor = error["noise_floor"]
-            if floor < LEAST_FLOOR:
+            if floor < 1e-9:  # in any unit; no log measured this channel
                 continue
             unit = f" [{UNITS[channel]}]" if channel in UNITS else ""
             tone = "good" if error["after"] < 1.2 * floor else ""
             # The channel, then errors (green if about as small as the noise), then the shares.
-            row = cells(group, f"{channel}{unit}", f"{error['before']:.4g}")
-            row += [Cell(f"{error['after']:.4g}", tone), *cells(f"{floor:.4g}")]
+            after = Cell(f"{error['after']:.4g}", tone)
+            row = [group, f"{channel}{unit}", f"{error['before']:.4g}", after, f"{floor:.4g}"]
             texts = ["" if error.get(k) is None else format(error[k], optional[k]) for k in shown]
-            rows.append([*row, *cells(*texts)])
+            rows.append([*row, *texts])
     headers = ["", "channel", "as given", "with the named effects", "noise floor"]
     headers += ["black box" if key == "explainable" else key for key in shown]
-    return Grid("", headers, rows, note=CHANNELS)
+    return table(headers, rows, note=CHANNELS)
 
 
-def _answer(result: Mapping[str, Any]) -> list[Section]:
+def _answer(result: Mapping[str, Any]) -> Section:
     """Return a section with the named effects, their equations and their parameters, if any."""
-    effects = result["effects"]
+    effects, title, rows = result["effects"], "The answer in numbers", []
     if not effects:
-        return []
-    rows = []
+        return Section(title, [])
     for effect in effects:
         removed = effect["gap_removed"]
         share = "exempt" if removed is None else f"{100 * removed:.0f} %"
@@ -181,8 +160,12 @@ def _answer(result: Mapping[str, Any]) -> list[Section]:
     headers = [
         "effect", "not distinguishable from", "view", "parameter", "total", "95 %", "of the gap"
     ]  # fmt: skip
-    note = TOTALS.format(chance=max(effect["p_value"] for effect in effects))
-    return [Section("The answer in numbers", [*words, grid("", headers, rows, note)])]
+    note = (
+        "Values are totals: they replace those of the vehicle file. Of the gap: the share that "
+        "this effect removes when it is added last. Chance gives a false name with a probability "
+        f"of at most {max(effect['p_value'] for effect in effects):.1g}."
+    )
+    return Section(title, [*words, table(headers, rows, note=note)])
 
 
 def _written(result: Mapping[str, Any], toml: str, files: set[str]) -> Section:
@@ -192,19 +175,17 @@ def _written(result: Mapping[str, Any], toml: str, files: set[str]) -> Section:
         words = "The vehicle file with the named effects, for every other command (--vehicle)."
     links = [(path, words) for path, words in FILES if path in files]
     parts: list[Part] = [words, Details("vehicle.toml", toml), Links(links)]
-    plan = result.get("plan")
-    if plan:
-        rows = [
-            (
-                flight["file"],
-                flight["trajectory"]["kind"],
-                f"{flight['trajectory']['duration_s']:g} s",
-                f"{flight['top_speed']:.1f} m/s",
-                f"{flight['top_acceleration']:.1f} m/s²",
-                " x ".join(f"{size:.1f}" for size in flight["room"]) + " m",
-            )
-            for flight in plan["flights"]
-        ]
-        headers = ["flight", "kind", "lasts", "speed", "acceleration", "needs"]
-        parts.append(grid("Flights to fly next", headers, rows, " ".join(plan["words"])))
+    if plan := result.get("plan"):
+        grid = table_of(
+            plan["flights"],
+            ("flight", lambda flight: flight["file"]),
+            ("kind", lambda flight: flight["trajectory"]["kind"]),
+            ("lasts", lambda flight: f"{flight['trajectory']['duration_s']:g} s"),
+            ("speed", lambda flight: f"{flight['top_speed']:.1f} m/s"),
+            ("acceleration", lambda flight: f"{flight['top_acceleration']:.1f} m/s²"),
+            ("needs", lambda flight: " x ".join(f"{s:.1f}" for s in flight["room"]) + " m"),
+            title="Flights to fly next",
+            note=" ".join(plan["words"]),
+        )
+        parts.append(grid)
     return Section("What was written", parts)

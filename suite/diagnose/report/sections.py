@@ -14,24 +14,20 @@ from eval.logs.flight_log import FlightLog
 from suite.common.report import Part, Section
 from suite.diagnose.data.windows import SLICES, UNITS
 from suite.diagnose.diagnose import Diagnosis
-from suite.diagnose.report.summary import cells, grid, remaining_words, short_name, superscripts
+from suite.diagnose.report.summary import remaining_words, short_name, superscripts
 from suite.diagnose.sources.rollout_source import of_rollouts
-from tracks.common.grid import Cell, Grid
+from tracks.common.grid import Cell, Grid, table, table_of
 
 SHOWN = 12
 """Largest number of logs in the table of logs."""
-RIVALS = 6
-"""Largest number of alternatives ("rivals") to each effect in the table of alternatives."""
 
 
 def logs_section(logs: Sequence[FlightLog]) -> Section:
     """Return a table of the logs."""
     headers = ["log", "lasts", "rows", "rate", "longest step", "incomplete", "top speed", "others"]
     others = len(logs) - SHOWN
-    rows = [_facts(log) for log in logs[:SHOWN]]
-    return Section(
-        "The logs", [grid("", headers, rows, f"And {others} more." if others > 0 else "")]
-    )
+    note = f"And {others} more." if others > 0 else ""
+    return Section("The logs", [table(headers, map(_facts, logs[:SHOWN]), note=note)])
 
 
 def _facts(log: FlightLog) -> tuple[str, ...]:
@@ -73,30 +69,24 @@ def noise_section(diagnosis: Diagnosis) -> Section:
         "slow part. Squared errors below are in units of it. If the gap does not exceed that of "
         "the noise, the verdict is no_gap."
     )
-    return Section("The measurement noise", [words, grid("", ["measured", "noise"], rows)])
+    return Section("The measurement noise", [words, table(["measured", "noise"], rows)])
 
 
-def actuators_section(result: Mapping[str, Any]) -> list[Section]:
-    """Return a section that compares measured and commanded rotor speeds.
-
-    The list is empty if the logs have no measured speeds.
-    """
-    if not result.get("actuators"):
-        return []
+def actuators_section(result: Mapping[str, Any]) -> Section:
+    """Return a section that compares measured and commanded rotor speeds."""
     words = (
         f"The input of the model is {result['driven_by']}. The flight controller and the motors "
         "cause the difference between commanded and measured rotor speeds, not the air. It shows "
         "integrators and filters that the nominal rate loop lacks."
     )
     grids = [_mismatch(mismatch) for mismatch in result["actuators"]]
-    return [Section("Actuators, apart from the air", [words, *grids])]
+    return Section("Actuators, apart from the air", [words, *grids])
 
 
 def _mismatch(mismatch: Mapping[str, Any]) -> Grid:
     """Return a table that compares measured rotor speeds with one kind of command."""
 
     def spread(pair: Sequence[float]) -> str:
-        """Return a mean and a standard deviation as text."""
         return f"{pair[0]:.2f} ± {pair[1]:.2f}"
 
     explained = f"{100 * max(mismatch['followed'], 0.0):.0f} % of the variance is explained"
@@ -112,7 +102,7 @@ def _mismatch(mismatch: Mapping[str, Any]) -> Grid:
         ("excess angular acceleration, x y z", f"{turn} rad/s²"),
     ]
     note = "± is the spread over the flights."
-    return grid(f"Compared with the {mismatch['commanded_by']}", ["", ""], rows, note)
+    return table(["", ""], rows, f"Compared with the {mismatch['commanded_by']}", note)
 
 
 LEAST_P = 0.0005
@@ -156,7 +146,7 @@ def candidates_section(diagnosis: Diagnosis) -> Section:
         if scores[0].chance > 0.0:
             words += f" By chance the best gain is above {scores[0].chance:.1f} once in 100."
         title = finding.source.name.capitalize()
-        parts.append(grid(title, ["effect", "gain", "p", ""], rows, words))
+        parts.append(table(["effect", "gain", "p", ""], rows, title, words))
     return Section("The candidates", parts)
 
 
@@ -165,32 +155,25 @@ def rivals_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section:
     rows = []
     for finding, named in diagnosis.named:
         ordered = sorted(named.worse_by.items(), key=lambda item: item[1])
-        for label, worse_by in ordered[:RIVALS]:
+        for label, worse_by in ordered[:6]:
             name = label.rstrip(" 1234")  # a label may end in a motor's number
             # Another motor is no other effect, so it is not among the rivals.
             is_motor = name == named.candidate.name
             fits_as_well = is_motor and worse_by <= finding.source.limits.rival_chi2
             is_open = fits_as_well or name in named.rivals
-            verdict = Cell("not separable", "bad") if is_open else Cell("ruled out")
-            rows.append([*cells(named.candidate.label, label, f"{worse_by:.1f}"), verdict])
+            verdict = Cell("not separable", "bad") if is_open else "ruled out"
+            rows.append((named.candidate.label, label, f"{worse_by:.1f}", verdict))
     headers = ["named", "alternative", "worse by", ""]
     note = (
         "Worse by: squared error in units of the noise, plus one for each fitted parameter; 9 is "
         "three standard errors. Effects without a row were too far off to be fitted."
     )
-    parts: list[Part] = [Grid("", headers, rows, note=note)] if rows else []
+    parts: list[Part] = [table(headers, rows, note=note)] if rows else []
     if not diagnosis.named:
         parts.append("Nothing was named, so there are no alternatives.")
     elif not result["separate_with"]:
         parts.append("No other effect explains the same flights as well.")
     return Section("Alternatives to the named effects", parts)
-
-
-ABOVE_NOISE = (
-    "The noise floor of force and torque contains the noise of the measured motion, but no errors "
-    "of rotor speeds or attitude. Such errors may cause what logged signals hardly predict."
-)
-"""Explanation of the table of errors above the noise floor."""
 
 
 def residual_section(result: Mapping[str, Any]) -> Section:
@@ -205,17 +188,19 @@ def residual_section(result: Mapping[str, Any]) -> Section:
         words = f"{share:.0f} % of the {of} remains. Unexplained: {where}."
     parts: list[Part] = [words]
     if remaining["above_noise"]:
-        rows = [
-            (
-                one["view"],
-                superscripts(f"{one['error']:.3g} {one['unit']}"),
-                f"{one['noise_floor']:.3g}",
-                f"an error {one['reason']}",
-            )
-            for one in remaining["above_noise"]
-        ]
-        headers = ["view", "remaining error", "noise floor", ""]
-        parts.append(grid("Errors above the noise floor", headers, rows, ABOVE_NOISE))
+        columns = (
+            ("view", lambda one: one["view"]),
+            ("remaining error", lambda one: superscripts(f"{one['error']:.3g} {one['unit']}")),
+            ("noise floor", lambda one: f"{one['noise_floor']:.3g}"),
+            ("", lambda one: f"an error {one['reason']}"),
+        )
+        title = "Errors above the noise floor"
+        note = (
+            "The noise floor of force and torque contains the noise of the measured motion, but no "
+            "errors of rotor speeds or attitude. Such errors may cause what logged signals hardly "
+            "predict."
+        )
+        parts.append(table_of(remaining["above_noise"], *columns, title=title, note=note))
     if remaining.get("shapes"):
         shapes = remaining["shapes"]
         rows = [(s["label"], f"{s['gain']:.1f}", f"{s['p_value']:.3f}") for s in shapes]
@@ -224,10 +209,10 @@ def residual_section(result: Mapping[str, Any]) -> Section:
             "on left-out stretches, and its p-value."
         )
         headers = ["remaining error as a", "gain", "p"]
-        parts.append(grid("Functions of the state", headers, rows, note))
+        parts.append(table(headers, rows, "Functions of the state", note))
         rows = [(axis, f"{p:.2g}") for axis, p in remaining["coloured"].items()]
         note = "P-value: probability that noise alone has as much energy in a smooth disturbance."
-        parts.append(grid("Random disturbances", ["axis", "p"], rows, note))
+        parts.append(table(["axis", "p"], rows, "Random disturbances", note))
     return Section("Remaining error", parts)
 
 
@@ -246,7 +231,7 @@ def evidence_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section
         gaps["with the named effects"] = main.after
     before, floor, rows = main.before.rms, main.before.floor, []
     for label, gap in gaps.items():
-        (low, high), removed = gap.ci95(diagnosis.seed, diagnosis.limits), ""
+        (low, high), removed = gap.ci95(diagnosis.seed), ""
         if gap.rms != before and before > floor:
             removed = f"{100 * (before - gap.rms) / (before - floor):.0f} %"
         rows.append((label, f"{gap.rms:.3f}", f"{low:.3f} to {high:.3f}", removed))
@@ -259,16 +244,7 @@ def evidence_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section
         "neither named nor an alternative, fitted to the same flights in the same way."
     )
     headers = ["vehicle", "gap", "95 %", "of the gap removed"]
-    return Section("The evidence", [words, grid("", headers, rows, note)])
-
-
-AGREEMENT = (
-    "The fall of the squared error of each flight (of a single flight: of each third) with "
-    "parameters that were fitted to the others, in units of independent noise. If force and torque "
-    "are compared, or if no effect explains the whole error, an effect is named only if all "
-    "flights but one agree."
-)
-"""Explanation of the table of flights."""
+    return Section("The evidence", [words, table(headers, rows, note=note)])
 
 
 def agreement_section(diagnosis: Diagnosis) -> Section:
@@ -278,9 +254,15 @@ def agreement_section(diagnosis: Diagnosis) -> Section:
         f"driven by {diagnosis.flights.driven_by}."
         for finding in diagnosis.findings
     ]
+    note = (
+        "The fall of the squared error of each flight (of a single flight: of each third) with "
+        "parameters that were fitted to the others, in units of independent noise. If force and "
+        "torque are compared, or if no effect explains the whole error, an effect is named only if "
+        "all flights but one agree."
+    )
     for finding, named in diagnosis.named:
         if named.gains:
             rows = [(f"{k + 1}", f"{gain:.1f}") for k, gain in enumerate(named.gains)]
             title = f"{finding.source.name}: {named.candidate.label}"
-            parts.append(grid(title, ["fitted flight or third", "gain"], rows, AGREEMENT))
+            parts.append(table(["fitted flight or third", "gain"], rows, title, note))
     return Section("Do the flights agree", [*parts, *diagnosis.flights.compares])

@@ -6,14 +6,13 @@ words.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from eval.effects import EFFECTS
 from suite.diagnose.verdict.gap import EffectSize
-from tracks.common.grid import Cell, Grid
 
 VERDICTS = {
     "no_gap": "Simulation and flights agree within the measurement noise.",
@@ -76,28 +75,19 @@ def figure(value: float) -> str:
 
 
 def answer(result: Mapping[str, Any]) -> str:
-    """Return the named effects, their sizes, and a sentence for the verdict."""
-    words = [_effect_words(effect) for effect in result["effects"]]
-    if words:
-        is_change = bool(result["reference"])
-        words.insert(
-            0, "Changed in the vehicle:" if is_change else "Wrong or missing in the vehicle file:"
-        )
-    words.append(_verdict_words(result))
-    if result["verdict"] == "no_gap" and result["negligible"]:
+    """Return the named effects, their sizes, the verdict, and the errors that it excludes."""
+    verdict, is_change = result["verdict"], bool(result["reference"])
+    effects = [_effect_words(effect) for effect in result["effects"]]
+    heading = "Changed in the vehicle:" if is_change else "Wrong or missing in the vehicle file:"
+    sentence, rest = (CHANGES if is_change else VERDICTS)[verdict], remaining_words(result)
+    if rest and (verdict == "named" or (verdict == "no_gap" and not is_change)):
+        agreed = sentence.removesuffix(".").removesuffix(" within the measurement noise")
+        sentence = f"{agreed}, except for {rest}."
+    words = [heading, *effects, sentence] if effects else [sentence]
+    if verdict == "no_gap" and result["negligible"]:
         names = ", ".join(entry["name"] for entry in result["negligible"])
         words.append(f"Significant but too small to matter: {names}.")
     return " ".join(words)
-
-
-def _verdict_words(result: Mapping[str, Any]) -> str:
-    """Return a sentence for the verdict, with the errors that it excludes."""
-    words = (CHANGES if result["reference"] else VERDICTS)[result["verdict"]]
-    rest, noise = remaining_words(result), " within the measurement noise"
-    is_no_change = bool(result["reference"]) and result["verdict"] == "no_gap"
-    if not rest or is_no_change or result["verdict"] not in ("no_gap", "named"):
-        return words
-    return f"{words.removesuffix('.').removesuffix(noise)}, except for {rest}."
 
 
 def remaining_words(result: Mapping[str, Any]) -> str:
@@ -123,46 +113,28 @@ def _effect_words(effect: Mapping[str, Any]) -> str:
 
 def next_steps(result: Mapping[str, Any]) -> list[str]:
     """Return advice on what to do after the verdict of a diagnosis.json, most useful first."""
-    use, search_for = USE, _search_for(result["unexplained"])
-    steps = {
-        "no_gap": [
+    verdict, is_change = result["verdict"], bool(result["reference"])
+    search_for = _search_for(result["unexplained"])
+    if verdict == "no_gap":
+        if is_change:
+            return [f"Keep the vehicle file that you use. {UNTESTED}"]
+        return [
             "Use the vehicle file as it is.",
             "If your task is faster than these flights, fly faster or turn harder, and repeat "
             "this.",
-        ],
-        "unknown": [
+        ]
+    if verdict == "unknown":
+        if is_change:
+            return [CHECK, "Look for what was changed on the vehicle.", *search_for]
+        return [
             CHECK,
             "suite identify wrote this vehicle file: repeat it if the vehicle has changed since."
             if result.get("identified")
             else "Run suite identify if the numbers of the vehicle file were never estimated.",
             *search_for,
             "Otherwise add an effect to the catalogue, or fit a correction with suite delta.",
-        ],
-    }
-    if result["reference"]:
-        use = f"{USE} It is your file with this change. {UNTESTED}"
-        steps["no_gap"] = [f"Keep the vehicle file that you use. {UNTESTED}"]
-        steps["unknown"] = [CHECK, "Look for what was changed on the vehicle.", *search_for]
-    separate = _separate(result)
-    return {
-        "named": [
-            use,
-            *separate,
-            "Or remove the cause on the vehicle, fly again and repeat this: expect no_gap.",
-        ],
-        "partly": [
-            f"{use} Its values are approximate; on held-out flights it is closer than your file.",
-            *separate,
-            CHECK,
-            *search_for,
-        ],
-        **steps,
-    }[result["verdict"]]
-
-
-def _separate(result: Mapping[str, Any]) -> list[str]:
-    """Return advice for each named effect that has alternatives."""
-    steps = []
+        ]
+    steps = [f"{USE} It is your file with this change. {UNTESTED}" if is_change else USE]
     for effect in result["effects"]:
         if effect["alternatives"]:
             names = ", ".join([effect["name"], *effect["alternatives"]])
@@ -173,7 +145,11 @@ def _separate(result: Mapping[str, Any]) -> list[str]:
                 f"or fly what separates {'; '.join(flights)}. suite diagnose --plan writes such "
                 "flights."
             )
-    return steps
+    if verdict == "named":
+        last = "Or remove the cause on the vehicle, fly again and repeat this: expect no_gap."
+        return [*steps, last]
+    steps[0] += " Its values are approximate; on held-out flights it is closer than your file."
+    return [*steps, CHECK, *search_for]
 
 
 def _search_for(unexplained: Mapping[str, Any]) -> list[str]:
@@ -198,8 +174,6 @@ def _search_for(unexplained: Mapping[str, Any]) -> list[str]:
 LEAST_SHOWN = 0.001
 """A smaller gap is printed as "less than" this value, in the unit of the gap (times the noise,
 m/s^2 or rad/s^2)."""
-NOT_IDENTIFIABLE = "not identifiable"
-"""Text in place of a value that these flights do not identify."""
 
 
 class Component(NamedTuple):
@@ -231,7 +205,7 @@ class Component(NamedTuple):
     def texts(self) -> tuple[str, str]:
         """Return value and interval as texts, with as many digits as the interval supports."""
         if self.value is None:
-            return NOT_IDENTIFIABLE, ""
+            return "not identifiable", ""
         if self.ci95 is None:
             return f"{self.value:.4g}", ""
         numbers = (self.value, *self.ci95)
@@ -259,11 +233,7 @@ def in_digits(number: float, interval: Sequence[float]) -> str:
 
 def components(effect: Mapping[str, Any]) -> list[Component]:
     """Return the components of a named `effect` in diagnosis.json, significant ones first."""
-    return sorted(_components(effect), key=lambda component: not component.is_significant)
-
-
-def _components(effect: Mapping[str, Any]) -> Iterator[Component]:
-    """Yield the components of a named effect in the order of its parameters."""
+    found = list[Component]()
     parameters = EFFECTS[effect["name"]].parameters if effect["name"] in EFFECTS else ()
     neutrals = {p.name: p.neutral for p in parameters if not callable(p.neutral)}
     by_motor = {p.name for p in parameters if p.one_at_a_time}
@@ -273,25 +243,17 @@ def _components(effect: Mapping[str, Any]) -> Iterator[Component]:
         if name == "index" and by_motor:
             # The numbers of the motors. Those of several motors are in the labels below instead.
             if not isinstance(value, list):
-                yield Component(name, "", value, None if span[0] == span[1] else span, None)
+                found.append(Component(name, "", value, None if span[0] == span[1] else span, None))
         elif not isinstance(value, list):
-            yield Component(name, unit, value, span, neutrals.get(name))
+            found.append(Component(name, unit, value, span, neutrals.get(name)))
         else:
             axes = "xyz" if len(value) <= 3 else range(1, len(value) + 1)
             if name in by_motor and isinstance(motors, list):
                 axes = motors
             for axis, number, pair in zip(axes, value, span or [None] * len(value), strict=False):
-                yield Component(f"{name} {axis}", unit, number, pair, neutrals.get(name))
-
-
-def cells(*texts: str) -> list[Cell]:
-    """Return a table row of cells without a colour."""
-    return [Cell(text) for text in texts]
-
-
-def grid(title: str, headers: Sequence[str], rows: Iterable[Sequence[str]], note: str = "") -> Grid:
-    """Return a table of plain texts."""
-    return Grid(title, headers, [cells(*row) for row in rows], note=note)
+                label, neutral = f"{name} {axis}", neutrals.get(name)
+                found.append(Component(label, unit, number, pair, neutral))
+    return sorted(found, key=lambda component: not component.is_significant)
 
 
 def short_name(name: str) -> str:

@@ -77,6 +77,8 @@ SHOWN = 4
 """Number of held-out flights in pictures and recordings."""
 ROUNDING_S = 1e-6
 """Start times that differ by less are equal [s]."""
+Rollouts = tuple[FlightWindows, dict[str, np.ndarray]]
+"""Windows, and their errors by label of the model; see `RolloutSource.simulated`."""
 SHAPES = 5
 """Largest number of shapes of the residual (functions of the state) in the report."""
 
@@ -220,16 +222,16 @@ class RolloutSource(Source):
         self, found: SearchResult, seed: int
     ) -> tuple[ResidualStructure, TestedEffect | None]:
         """Return the structure in the remaining error, and the wind that may cause it."""
-        evidence, limits, model = of_rollouts(found.last), self.limits, self.model
-        windows, whitening = evidence.trusted, evidence.whitening
-        equations = disturbance_equations(model, windows, whitening, found.estimate, limits)
+        evidence, limits = of_rollouts(found.last), self.limits
+        windows = evidence.trusted
+        equations = disturbance_equations(evidence, windows, found.estimate)
         fold = folds_of(windows.flight, windows.start_s, limits.folds)
-        residual = residual_structure(equations, fold, seed, limits)
+        residual = residual_structure(equations, fold, seed)
         wind = self._wind(found, equations, residual)
         is_significant = any(s.p_value <= limits.shape_p_value for s in residual.shapes)
         if self.coarser is not None and is_significant:
-            coarse = disturbance_equations(model, self.coarser, whitening, found.estimate, limits)
-            residual = beyond_model_error(residual, equations, coarse, self.coarser_share, limits)
+            coarse = disturbance_equations(evidence, self.coarser, found.estimate)
+            residual = beyond_model_error(residual, equations, coarse, self.coarser_share)
         return residual, wind
 
     def _wind(
@@ -239,7 +241,7 @@ class RolloutSource(Source):
         force_p_values = [p for axis, p in residual.coloured.items() if axis.startswith("force")]
         if not any(p <= self.limits.colour_p_value for p in force_p_values):
             return None
-        found_wind = find_turbulence(self.model, found.estimate.theta, equations, self.limits)
+        found_wind = find_turbulence(self.model, found.estimate.theta, equations)
         if found_wind is None:
             return None
         # Wind is not named if a force that is a simple function of the state explains more.
@@ -284,7 +286,7 @@ class RolloutSource(Source):
         share = np.where(is_raised, least / np.maximum(noise, TINY), 0.0)
         return float(min(share.max(), 1.0))
 
-    def simulated(self, found: SearchResult) -> tuple[FlightWindows, dict[str, np.ndarray]]:
+    def simulated(self, found: SearchResult) -> Rollouts:
         """Return 1 s windows of some held-out flights, and their errors by label of the model.
 
         The errors are measured - simulated (W, N, 19), with the vehicle file's parameters, and if
@@ -303,9 +305,9 @@ class RolloutSource(Source):
         named = {FITTED: errors(best)} if found.named else {}
         return windows, {GIVEN: errors(self.start.theta), **named}
 
-    def series(self, found: SearchResult) -> Series:
-        """Return a held-out flight along the axis with the clearest error, see `Source`."""
-        windows, simulated = self.simulated(found)
+    def series(self, found: SearchResult, rollouts: Rollouts | None = None) -> Series:
+        """Return a held-out flight along the axis with the clearest error in `rollouts`."""
+        windows, simulated = rollouts or self.simulated(found)
         rows = np.asarray(windows.flight) == windows.flight[0]
         groups = ("position", "velocity", "rates")
         channels = np.concatenate([np.r_[SLICES[group]] for group in groups])

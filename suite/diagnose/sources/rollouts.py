@@ -20,6 +20,7 @@ from suite.diagnose.data.sampling import own_spacing_s
 from suite.diagnose.data.steps import has_firmware_loop, rows_show_torque
 from suite.diagnose.data.whitening import block_of, make_whitening
 from suite.diagnose.data.windows import LENGTH_S, cut, take
+from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.evidence import Evaluation
@@ -37,11 +38,7 @@ from suite.diagnose.verdict.actuators import (
     integrator_of,
     rotors_are_input,
 )
-from suite.diagnose.verdict.model_error import (
-    commands_are_slow,
-    with_held_commands,
-    with_model_error,
-)
+from suite.diagnose.verdict.model_error import with_held_commands, with_model_error
 
 BASE_S, STRETCH_S = 5.0, 0.25
 """Estimated duration on two cores: fixed part, and for each stretch [s]."""
@@ -113,7 +110,8 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     coarser = take(windows_of(coarser=windows)[0], is_finite) if has_error else None
     all_windows, windows, linear = windows, take(windows, is_finite), take(linear, is_finite)
     if coarser is not None:
-        limits = with_model_error(model, start.theta, windows, linear, coarser, limits)
+        other = model.residual(Estimate(start.theta, linear.offset), coarser)
+        limits = with_model_error(windows, linear, other, limits)
     # See `RolloutSource.sizes` for these shares.
     dense = all(
         log.rotor_speed is None
@@ -121,9 +119,12 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
         for log in logs
     )
     coarser_share = 0.0 if coarser is None or not rotor_input else (0.5 if dense else 2.0)
-    if not rotor_input and commands_are_slow(logs, limits):
+    commands = [(log.time_s, log.rate_cmd_b) for log in logs if log.rate_cmd_b is not None]
+    are_slow = any(own_spacing_s(*command) > limits.command_spacing_s for command in commands)
+    if are_slow and not rotor_input:
         fewer = take(windows_of(fewer_commands=all_windows)[0], is_finite)
-        held = with_held_commands(model, start.theta, windows, linear, fewer, limits)
+        other = model.residual(Estimate(start.theta, linear.offset), fewer)
+        held = with_held_commands(windows, linear, other, limits)
         if held is not None:
             limits, coarser, coarser_share = held, fewer, 1.0
             warnings.append(LACKING)

@@ -143,7 +143,7 @@ class ViewSource(Source):
         offset = means_of(data.residual, data.flight)
         trim = limits.unexplained_trim * float(np.sqrt((offset**2).sum(axis=1).mean()))
         least = max(limits.relevance[0], min(trim, limits.unexplained_force))
-        if gap.energy_low95(seed, limits) < self._noise_power + least**2:
+        if gap.energy_low95(seed) < self._noise_power + least**2:
             return 0.0
         return float(np.sqrt(gap.energy.mean() - self._noise_power))
 

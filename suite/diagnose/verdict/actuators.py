@@ -27,6 +27,7 @@ from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.sampling import follow_lag, hold, interpolate, on_every_row
 from suite.diagnose.data.steps import has_firmware_loop, rotor_mixer, step_s
+from suite.diagnose.evidence.moments import means_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
@@ -70,21 +71,15 @@ class ActuatorMismatch(NamedTuple):
     turn: tuple[tuple[float, float], ...]
     """Mean and standard deviation of measured minus commanded angular acceleration, about body x,
     y and z each [rad/s^2]."""
-
-    @property
-    def followed(self) -> float:
-        """Share of the speeds' variance that the commands and the vehicle file's lag explain."""
-        return 1.0 - (self.rms / max(self.spread, 1e-9)) ** 2
-
-
-Commanded = Callable[[float], np.ndarray]
-"""Delay of the commands [s] -> (S, 4) rotor speeds that are commanded in each step [rad/s]."""
+    followed: float
+    """Share of the speeds' variance that the commands and the vehicle file's lag explain."""
 
 
 class _Stretch(NamedTuple):
     """N rows of a flight without a hole (a long time without a value)."""
 
-    commanded: Commanded
+    commanded: Callable[[float], np.ndarray]
+    """Delay of the commands [s] -> (S, 4) rotor speeds that are commanded in each step [rad/s]."""
     row: np.ndarray
     """(N,) number of the time step at whose start each measured row was taken."""
     measured: np.ndarray
@@ -99,16 +94,27 @@ def actuator_mismatches(
     Returned is one mismatch for each of the two comparisons that the logs allow. Logs without
     measured rotor speeds are ignored, and so are the effects of `vehicle`.
     """
-    mismatches = (_mismatch(commanded_by, logs, vehicle, limits) for commanded_by in COMMANDED)
+    mismatches = (_mismatch(source, logs, vehicle, limits) for source in (RATE_LOOP, LOGGED))
     return [mismatch for mismatch in mismatches if mismatch is not None]
 
 
-def _rate_loop_speeds(log: FlightLog, step_time_s: np.ndarray, plant: Plant) -> Commanded | None:
-    """Return the rotor speeds commanded by the rate loop of `plant` at the measured body rates.
+RATE_LOOP, LOGGED = "nominal rate loop", "logged motor commands"
+"""What commands rotor speeds: the rate loop at the measured body rates, or the log's commands."""
 
-    `step_time_s` (S,) are the starts of the time steps [s]. None where the log has no commands. The
-    plant is the model of the vehicle: its rotors, delays and rate loop.
+
+def _commanded(
+    commanded_by: str, log: FlightLog, step_time_s: np.ndarray, plant: Plant
+) -> Callable[[float], np.ndarray] | None:
+    """Return the commanded rotor speeds of `log`; None where it has no such commands.
+
+    `step_time_s` (S,) are the starts of the time steps [s]. The rate loop is that of `plant`, the
+    model of the vehicle.
     """
+    if commanded_by == LOGGED:
+        logged = log.rotor_speed_cmd
+        if logged is None:
+            return None
+        return lambda delay_s: hold(step_time_s - delay_s, log.time_s, logged)
     if log.thrust_cmd is None or log.rate_cmd_b is None:
         return None
     command = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
@@ -120,20 +126,6 @@ def _rate_loop_speeds(log: FlightLog, step_time_s: np.ndarray, plant: Plant) -> 
         return np.asarray(wanted_speed(plant, Command(delayed[:, 0], delayed[:, 1:]), rate_b))
 
     return commanded
-
-
-def _logged_speeds(log: FlightLog, step_time_s: np.ndarray, plant: Plant) -> Commanded | None:
-    """Return the rotor speeds that the log has as motor commands; None where it has none."""
-    del plant
-    command = log.rotor_speed_cmd
-    if command is None:
-        return None
-    return lambda delay_s: hold(step_time_s - delay_s, log.time_s, command)
-
-
-RATE_LOOP = "nominal rate loop"
-COMMANDED = {RATE_LOOP: _rate_loop_speeds, "logged motor commands": _logged_speeds}
-"""What commands rotor speeds, and the function that computes them."""
 
 
 def _stretches(
@@ -154,7 +146,7 @@ def _stretches(
         if time_s[-1] < 4.0 * limits.lag_settled_s:  # too short next to the time left out below
             continue
         step_time_s = log.time_s[rows[0]] + dt * np.arange(int(time_s[-1] / dt) + 1)
-        commanded = COMMANDED[commanded_by](log, step_time_s, plant)
+        commanded = _commanded(commanded_by, log, step_time_s, plant)
         if commanded is None or not np.isfinite(commanded(0.0)).all():
             continue
         step = np.round(time_s / dt).astype(int)
@@ -174,7 +166,7 @@ def _mismatch(
     dt, nominal_lag, stretches = step_s(vehicle), vehicle.rotors.time_constant, list[_Stretch]()
     plant = make_plant(vehicle, dt, {})
     for log in logs:
-        if sum(int(np.ptp(one.row)) for one in stretches) * dt < limits.actuator_flight_s:
+        if sum(int(np.ptp(one.row)) for one in stretches) * dt < 60.0:  # more adds little
             stretches += _stretches(log, plant, commanded_by, limits)
     if not stretches:
         return None
@@ -197,24 +189,22 @@ def _mismatch(
     def best_lag(delay: float) -> tuple[float, float]:
         """Return the mean squared error with the best lag, and that lag [s]."""
         cost = partial(squared_error, commanded(delay))
-        bounds, options = (0.0, limits.longest_lag_s), {"xatol": 1e-4}
-        best = minimize_scalar(cost, bounds=bounds, method="bounded", options=options)
+        best = minimize_scalar(cost, bounds=(0.0, 0.15), method="bounded", options={"xatol": 1e-4})
         return min((float(best.fun), float(best.x)), (cost(0.0), 0.0))
 
     # Best delay and lag together, and the best delay for the nominal lag.
-    delay, _ = _best_delay(lambda delay: best_lag(delay)[0], limits)
+    delay, _ = _best_delay(lambda delay: best_lag(delay)[0])
     _, time_constant = best_lag(delay)
-    _, nominal_error = _best_delay(
-        lambda delay: squared_error(commanded(delay), nominal_lag), limits
-    )
+    _, nominal_error = _best_delay(lambda delay: squared_error(commanded(delay), nominal_lag))
     nominal = lagged(commanded(0.0), nominal_lag)
     fitted = lagged(commanded(delay), time_constant)
     scale = scales(fitted)
     thrust, turn = wrench_difference(measured, nominal, vehicle)
+    rms, spread = _rms(measured - nominal), _rms(measured - measured.mean(axis=0))
     return ActuatorMismatch(
         commanded_by=commanded_by,
-        rms=_rms(measured - nominal),
-        spread=_rms(measured - measured.mean(axis=0)),
+        rms=rms,
+        spread=spread,
         time_constant=time_constant,
         delay=delay,
         scale=tuple(float(s) for s in scale),
@@ -222,14 +212,15 @@ def _mismatch(
         rms_own=float(np.sqrt(nominal_error)),
         thrust=(float(thrust.mean()), float(thrust.std())),
         turn=tuple((float(t.mean()), float(t.std())) for t in turn.T),
+        followed=1.0 - (rms / max(spread, 1e-9)) ** 2,
     )
 
 
-def _best_delay(cost: Callable[[float], float], limits: Thresholds) -> tuple[float, float]:
+def _best_delay(cost: Callable[[float], float]) -> tuple[float, float]:
     """Return the delay of the commands with the smallest `cost` [s], and that cost."""
-    grid = np.linspace(0.0, limits.longest_delay_s, limits.delays_tried)
+    grid = np.linspace(0.0, 0.06, 9)
     best_index = int(np.argmin([cost(delay) for delay in grid]))
-    bounds = (grid[max(best_index - 1, 0)], grid[min(best_index + 1, limits.delays_tried - 1)])
+    bounds = (grid[max(best_index - 1, 0)], grid[min(best_index + 1, len(grid) - 1)])
     options = {"xatol": 2e-4}
     refinement = minimize_scalar(cost, bounds=bounds, method="bounded", options=options)
     lowest, undelayed = float(refinement.fun), cost(0.0)
@@ -325,11 +316,10 @@ def flown_by_other_controller(
     for log in logs:
         for stretch in _stretches(log, plant, RATE_LOOP, limits):
             commanded = _at_rows(stretch.commanded(delay), stretch.row, dt, lag)
-            bin_of_row = (stretch.row * dt / limits.speed_mean_s).astype(int)
-            used_bins, bin_index = np.unique(bin_of_row, return_inverse=True)
-            sums = np.zeros((len(used_bins), 8))
-            np.add.at(sums, bin_index, np.concatenate([stretch.measured, commanded], axis=1))
-            measured, by_loop = np.split(sums / np.bincount(bin_index)[:, None], 2, axis=1)
+            # Means over 0.1 s average the noise.
+            bin_of_row = (stretch.row * dt / 0.1).astype(int)
+            both = np.concatenate([stretch.measured, commanded], axis=1)
+            measured, by_loop = np.split(means_of(both, bin_of_row), 2, axis=1)
             error += float(((measured - by_loop) ** 2).sum())
             variation += float(((measured - measured.mean(axis=0)) ** 2).sum())
             count += measured.size
@@ -363,7 +353,7 @@ def find_rotor_lag(
         for mismatch in by_flight
         if mismatch is not None and mismatch.rms_fitted**2 <= unexplained * mismatch.spread**2
     ]
-    if len(mismatches) < limits.lag_least_flights:
+    if len(mismatches) < limits.least_flights:
         return None
     lags = np.array([mismatch.time_constant for mismatch in mismatches])
     half_step = 0.5 * step_s(vehicle)
@@ -371,9 +361,8 @@ def find_rotor_lag(
     half_width = float(stats.t.ppf(0.975, len(lags) - 1)) * standard_error + half_step
     difference = float(abs(lags.mean() - known))
     nominal_error = sum(mismatch.rms_own**2 for mismatch in mismatches)
-    closed = 1.0 - sum(mismatch.rms_fitted**2 for mismatch in mismatches) / max(
-        nominal_error, 1e-12
-    )
+    fitted_error = sum(mismatch.rms_fitted**2 for mismatch in mismatches)
+    closed = 1.0 - fitted_error / max(nominal_error, 1e-12)
     t = (difference - half_step) / max(standard_error, 1e-9)
     p_value = float(2.0 * stats.t.sf(t, len(lags) - 1))
     if p_value > limits.name_p_value or closed < limits.lag_closed_share:

@@ -32,28 +32,17 @@ from suite.diagnose.evidence.evidence import flights_agree
 from suite.diagnose.evidence.rollout import Flown
 from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.evidence.views import ViewEvidence
-from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.actuators import TestedEffect
-from suite.diagnose.verdict.residual_structure import DisturbanceEquations
+from suite.diagnose.verdict.residual_structure import DisturbanceEquations, diagonalised
 
 STEP_HZ = 0.01
 """Step between the tested frequencies [Hz]."""
 BAND_HZ = (0.15, 3.0)
 """Frequency band of the spectra [Hz]."""
-CORNERS_HZ = (0.2, 0.5, 1.2)
-"""Corner frequencies of the smooth backgrounds that fall with frequency [Hz]."""
 WIDTHS = (0.03, 0.1)
 """Tested half widths of a peak, as shares of its frequency."""
 HANN_BINS = 1.5
 """Width of a spectral line after a Hann window, and of the correlation of bins [frequency bins]."""
-ROUNDS = 60
-"""Number of multiplicative updates in the fit of a spectrum."""
-LEAST_MEANS = 8
-"""Smallest number of mean accelerations in a flight that gives a spectrum."""
-LEAST_FILLED = 0.7
-"""Smallest share of the time grid that must have measurements for a spectrum."""
-LEAST_BINS = 12
-"""Least number of frequencies in a spectrum."""
 
 
 class Swing(NamedTuple):
@@ -102,25 +91,14 @@ def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
     """
     if not {0, 1} <= set(task.view.axes):
         return None
-    data = task.residuals(theta)
-    residual_b = [data.residual[data.flight == number] for number in range(len(task.flights))]
-    return find_swing(task.flights, residual_b, task.limits)
-
-
-def find_swing(
-    flights: Sequence[SmoothedFlight],
-    residual_b: Sequence[np.ndarray],
-    limits: Thresholds = THRESHOLDS,
-) -> Swing | None:
-    """Return the oscillation in the residual force of `flights`; None where there is none.
-
-    `residual_b` is that force of each flight, (M, 3) in body axes [m/s^2].
-    """
-    pairs = zip(flights, residual_b, strict=True)
-    spectra = [s for flight, residual in pairs if (s := _spectrum(flight, residual)) is not None]
+    data, limits = task.residuals(theta), task.limits
+    every = (
+        _spectrum(flight, data.residual[data.flight == k]) for k, flight in enumerate(task.flights)
+    )
+    spectra = [spectrum for spectrum in every if spectrum is not None]
     if not spectra:
         return None
-    shortest_s, longest_s = limits.swing_periods_s
+    shortest_s, longest_s = 0.6, 3.5  # periods of pendulums of 0.1 to 3 m
     frequency_hz = np.arange(1.0 / longest_s, 1.0 / shortest_s + STEP_HZ, STEP_HZ)
     gains, heights = zip(*(_peak_gains(s, frequency_hz) for s in spectra), strict=True)
     flight_gain = np.array(gains)  # (F, widths, frequencies)
@@ -135,7 +113,7 @@ def find_swing(
     centre_hz = float(frequency_hz[best])
     force_ratio, share = _peak_shares(spectra, centre_hz, [one[width, best] for one in heights])
     if (
-        p_value > limits.swing_p_value
+        p_value > limits.shape_p_value
         or share < limits.swing_share
         or force_ratio < limits.swing_driven
     ):
@@ -148,14 +126,17 @@ def find_swing(
 
 
 def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None:
-    """Return the spectrum of one flight; None where it is too short for one."""
+    """Return the spectrum of one flight; None where it is too short for one, or has many holes.
+
+    `residual_b` (M, 3) is its residual force in body axes [m/s^2].
+    """
     middle_s = flight.form.middle_s
-    if len(middle_s) < LEAST_MEANS:
+    if len(middle_s) < 8:
         return None
     step_s = float(np.median(np.diff(middle_s)))
     grid_index = np.round((middle_s - middle_s[0]) / step_s).astype(int)
     grid_size = int(grid_index[-1]) + 1
-    if grid_size * step_s * BAND_HZ[0] < 1.0 or len(middle_s) < LEAST_FILLED * grid_size:
+    if grid_size * step_s * BAND_HZ[0] < 1.0 or len(middle_s) < 0.7 * grid_size:
         return None
     rot_w = np.asarray(flight.rows.rot_w)[flight.form.middle_row]
     residual_w = (rot_w @ residual_b[..., None])[..., 0][:, :2]
@@ -163,13 +144,9 @@ def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None
     time = np.linspace(-1.0, 1.0, len(middle_s))
     # Subtracted first: forces that are constant, drift, or turn with the heading do not oscillate.
     zero, one = np.zeros_like(time), np.ones_like(time)
-    trend = np.stack(
-        [
-            np.stack([one, zero, time, zero, np.cos(yaw), -np.sin(yaw)], axis=1),
-            np.stack([zero, one, zero, time, np.sin(yaw), np.cos(yaw)], axis=1),
-        ],
-        axis=1,
-    )
+    along_x = np.stack([one, zero, time, zero, np.cos(yaw), -np.sin(yaw)], axis=1)
+    along_y = np.stack([zero, one, zero, time, np.sin(yaw), np.cos(yaw)], axis=1)
+    trend = np.stack([along_x, along_y], axis=1)
     trend_columns = trend.reshape(-1, trend.shape[-1])
     window = np.hanning(grid_size)[:, None]
     powers = []
@@ -181,7 +158,7 @@ def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None
         powers.append((np.abs(transform) ** 2).sum(axis=1))
     frequency_hz = np.fft.rfftfreq(grid_size, step_s)
     in_band = (frequency_hz >= BAND_HZ[0]) & (frequency_hz <= BAND_HZ[1])
-    if in_band.sum() < LEAST_BINS:
+    if in_band.sum() < 12:
         return None
     residual, measured = (power[in_band] for power in powers)
     return Spectrum(frequency_hz[in_band], residual, measured, HANN_BINS / (grid_size * step_s))
@@ -190,13 +167,8 @@ def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None
 def _peak_gains(spectrum: Spectrum, centre_hz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return gains in log-likelihood by peaks, and their heights, (widths, `centre_hz`) each."""
     frequency = spectrum.frequency_hz
-    background = np.stack(
-        [
-            np.ones_like(frequency),
-            frequency**2,
-            *(1.0 / (1.0 + (frequency / corner) ** 2) ** 2 for corner in CORNERS_HZ),
-        ]
-    )
+    falling = (1.0 / (1.0 + (frequency / corner_hz) ** 2) ** 2 for corner_hz in (0.2, 0.5, 1.2))
+    background = np.stack([np.ones_like(frequency), frequency**2, *falling])
     without, _ = _fit_spectrum(spectrum.residual, background[None])
     shapes = []
     for width in WIDTHS:
@@ -204,9 +176,8 @@ def _peak_gains(spectrum: Spectrum, centre_hz: np.ndarray) -> tuple[np.ndarray, 
         shapes.append(1.0 / (1.0 + ((frequency - centre_hz[:, None]) / half_hz) ** 2) ** 2)
     peaks = np.concatenate(shapes)[:, None]
     backgrounds = np.broadcast_to(background, (len(peaks), *background.shape))
-    with_peak, weights = _fit_spectrum(
-        spectrum.residual, np.concatenate([backgrounds, peaks], axis=1)
-    )
+    every = np.concatenate([backgrounds, peaks], axis=1)
+    with_peak, weights = _fit_spectrum(spectrum.residual, every)
     shape = (len(WIDTHS), len(centre_hz))
     return (with_peak - without).reshape(shape), weights[:, -1].reshape(shape)
 
@@ -220,7 +191,7 @@ def _fit_spectrum(power: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np
     scale = shapes.mean(axis=2, keepdims=True)
     unit_shapes = shapes / scale
     weights = np.full(unit_shapes.shape[:2], float(power.mean()) / unit_shapes.shape[1])
-    for _ in range(ROUNDS):
+    for _ in range(60):
         model = np.einsum("ct,ctj->cj", weights, unit_shapes)
         numerator = np.einsum("ctj,cj->ct", unit_shapes, power / model**2)
         weights = weights * np.sqrt(numerator / np.einsum("ctj,cj->ct", unit_shapes, 1.0 / model))
@@ -244,21 +215,17 @@ def _peak_shares(
 
 
 def find_turbulence(
-    model: RolloutModel,
-    theta: np.ndarray,
-    disturbance: DisturbanceEquations,
-    limits: Thresholds = THRESHOLDS,
+    model: RolloutModel, theta: np.ndarray, disturbance: DisturbanceEquations
 ) -> tuple[TestedEffect, float] | None:
     """Return the random wind that explains the residual of `model` at `theta` (P,), or None.
 
     None also without a drag that transmits it, with a better random force, or by outliers alone.
     With the wind comes the logarithm of the likelihood ratio of this wind to no wind.
     """
-    transmission = _wind_transmission(model, theta, disturbance.knot)
+    transmission, limits = _wind_transmission(model, theta, disturbance.knot), disturbance.limits
     if np.abs(transmission).max() < 1e-6:
         return None
-    lengths_m = np.geomspace(*limits.wind_lengths_m)
-    intensities = np.geomspace(*limits.wind_intensities)
+    lengths_m, intensities = np.geomspace(0.5, 40.0, 25), np.geomspace(0.02, 8.0, 121)
     roots = [transmission @ _wind_root(disturbance.knot, length) for length in lengths_m]
     table = np.stack([_likelihood(disturbance, root, intensities) for root in roots])
     i, j = np.unravel_index(int(table.argmax()), table.shape)
@@ -322,23 +289,12 @@ def _wind_root(knot: Flown, length_m: float) -> np.ndarray:
     distance = np.concatenate([np.zeros((len(speed), 1)), np.cumsum(step, axis=1)], axis=1)
     correlation = np.exp(-np.abs(distance[:, :, None] - distance[:, None, :]))
     root = np.linalg.cholesky(correlation + 1e-9 * np.eye(KNOTS))
-    axes = np.diag([1.0, 1.0, VERTICAL])
-    return np.einsum("wkl,ab->wkalb", root, axes).reshape(len(root), KNOTS * 3, KNOTS * 3)
-
-
-def _diagonalised(
-    equations: DisturbanceEquations, root: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return information and gradient (W, J) along the independent directions of root @ normal."""
-    transposed = np.swapaxes(root, 1, 2)
-    information, vectors = np.linalg.eigh(transposed @ equations.hessian @ root)
-    gradient = np.swapaxes(vectors, 1, 2) @ (transposed @ equations.gradient[..., None])
-    return information, gradient[..., 0]
+    return np.kron(root, np.diag([1.0, 1.0, VERTICAL]))
 
 
 def _likelihood(equations: DisturbanceEquations, root: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Return log-likelihood ratios of disturbances size * root @ z (z normal) to none, by size."""
-    information, gradient = _diagonalised(equations, root)
+    information, gradient = diagonalised(equations.hessian, equations.gradient, root)
     information = np.maximum(information, 0.0)
     variance = sizes[:, None, None] ** 2
     terms = variance * gradient**2 / (1.0 + variance * information)
@@ -355,7 +311,7 @@ def _has_outliers(
     mean may exceed 3 by `tail` standard errors. A force that acts only at some places or speeds has
     a higher mean. With fewer than eight directions that contain information the result is False.
     """
-    information, gradient = _diagonalised(equations, root)
+    information, gradient = diagonalised(equations.hessian, equations.gradient, root)
     informed = size**2 * information > 1.0
     if informed.sum() < 8:
         return False
@@ -375,8 +331,7 @@ def _free_likelihood(equations: DisturbanceEquations) -> float:
     def loss(logs: np.ndarray) -> float:
         sizes, tau_s = np.exp(logs[:6]), np.exp(logs[6])
         correlation = np.exp(-np.abs(time[:, None] - time) / tau_s) + 1e-9 * np.eye(KNOTS)
-        root = np.einsum("kl,ab->kalb", np.linalg.cholesky(correlation), np.diag(sizes))
-        root = root.reshape(1, KNOTS * 6, KNOTS * 6).repeat(len(equations.gradient), axis=0)
+        root = np.kron(np.linalg.cholesky(correlation), np.diag(sizes))
         return -float(_likelihood(equations, root, np.ones(1))[0])
 
     start = np.log([0.05, 0.05, 0.05, 0.01, 0.01, 0.01, 0.5])

@@ -6,13 +6,10 @@ torque is the error of mean accelerations, without each flight's constant offset
 rollouts, which simulate 1 s from a measured start state, is the slow part of their errors, divided
 by the slow errors that noise alone gives; so 1 means noise only. "Slow" errors are the projections
 of a rollout's errors on Legendre polynomials of time, in which a wrong model shows more than white
-noise; the start state is free within its noise. The plain errors from the measured start states are
-reported as well, in metres and so on. Their noise floor is the noise of the start states, carried
-through the rollout by the model's Jacobian.
+noise; the start state is free within its noise.
 
-The size of an effect is how much it changes these flights. With little noise every difference is
-significant, even the model's numerical errors. So an effect is not named, however small its
-p-value, if the upper end of the 95 % interval of its size is below all thresholds of relevance
+With little noise every difference is significant, even the model's numerical errors. So an effect
+is not named if the upper end of the 95 % interval of its size is below all thresholds of relevance
 (equivalence testing; Lakens 2017, doi 10.1177/1948550617697177).
 """
 
@@ -37,10 +34,8 @@ from suite.diagnose.data.windows import (
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
-HORIZONS_S = (0.1, 0.5, 1.0)
-"""Times after the start at which plain errors of rollouts are reported [s]."""
-START_SIGMAS = 3.0
-"""Largest correction of a number of a start state, in standard deviations of its noise."""
+DRAWS = 1000
+"""Number of draws of a bootstrap."""
 
 
 def rms_length(vectors: np.ndarray) -> float:
@@ -71,9 +66,9 @@ class Gap(NamedTuple):
     """RMS error that measurement noise alone gives."""
     offset: float = 0.0
     """RMS of the flights' trims, which are no part of `score`; 0 if none are subtracted."""
-    together: int = THRESHOLDS.bootstrap_block
+    together: int = 4
     """Number of neighbouring stretches whose errors are correlated: a bootstrap draws them
-    together."""
+    together. Four rollouts that begin every 0.25 s overlap."""
 
     @property
     def rms(self) -> float:
@@ -85,14 +80,14 @@ class Gap(NamedTuple):
         """RMS error over all stretches, with the flights' trims."""
         return float(np.hypot(self.rms, self.offset))
 
-    def ci95(self, seed: int, limits: Thresholds = THRESHOLDS) -> tuple[float, float]:
+    def ci95(self, seed: int) -> tuple[float, float]:
         """Return the 95 % interval of `rms` by a block bootstrap over stretches."""
-        low, high = np.quantile(np.sqrt(self._means(self.score, seed, limits)), [0.025, 0.975])
+        low, high = np.quantile(np.sqrt(self._means(self.score, seed)), [0.025, 0.975])
         return float(low), float(high)
 
-    def energy_low95(self, seed: int, limits: Thresholds = THRESHOLDS) -> float:
+    def energy_low95(self, seed: int) -> float:
         """Return the lower end of the 95 % interval of the mean `energy`."""
-        return float(np.quantile(self._means(self.energy, seed, limits), 0.025))
+        return float(np.quantile(self._means(self.energy, seed), 0.025))
 
     def exceeds(self, before: Gap, weight: float, limits: Thresholds) -> bool:
         """Return whether the energy is significantly larger than that of `before`.
@@ -102,19 +97,19 @@ class Gap(NamedTuple):
         over stretches, so that rows in overlapping ones count once.
         """
         rise = self.energy - before.energy
-        rise_low = np.quantile(self._means(rise, 0, limits), 0.025)
+        rise_low = np.quantile(self._means(rise, 0), 0.025)
         return bool(rise_low > 0.0 and rise.sum() * weight > limits.refuting_chi2)
 
-    def _means(self, values: np.ndarray, seed: int, limits: Thresholds) -> np.ndarray:
-        """Return the means (D,) of D bootstrap draws of `values` (W,), one of each stretch.
+    def _means(self, values: np.ndarray, seed: int) -> np.ndarray:
+        """Return the means (DRAWS,) of bootstrap draws of `values` (W,), one of each stretch.
 
         The values form a circle, so that each of them is drawn equally often. With few values,
         fewer are drawn together, so that draws differ.
         """
-        rng, count, draws = np.random.default_rng(seed), len(values), limits.bootstrap_draws
+        rng, count = np.random.default_rng(seed), len(values)
         block = max(1, min(self.together, count // 4))
-        block_start = rng.integers(0, count, (draws, -(-count // block), 1))
-        rows = (block_start + np.arange(block)).reshape(draws, -1)[:, :count] % count
+        block_start = rng.integers(0, count, (DRAWS, -(-count // block), 1))
+        rows = (block_start + np.arange(block)).reshape(DRAWS, -1)[:, :count] % count
         return values[rows].mean(axis=1)
 
 
@@ -141,8 +136,8 @@ def start_correction(
     """Return corrections (W, F) of the true start states, fitted to all rows of each window.
 
     The noise of a measured start state grows along a rollout. So each number of the state is
-    corrected by what fits the model with `theta` (P,) best, but at most by `START_SIGMAS`; without
-    a limit where nothing was measured. Windows in which the model diverges, and the rotor speeds,
+    corrected by what fits the model with `theta` (P,) best, but at most by three sigma; without a
+    limit where nothing was measured. Windows in which the model diverges, and the rotor speeds,
     are not corrected.
     """
     linear = from_true_starts(model, theta, windows)
@@ -153,7 +148,7 @@ def start_correction(
         linear, windows = take(linear, flies), take(windows, flies)
         whitening = make_whitening(linear, noise, windows, limits)
         best = block_of(whitening, linear, (), windows).free[:, :STATE]
-        most = START_SIGMAS * np.nan_to_num(noise.sigma[:STATE], nan=np.inf)
+        most = 3.0 * np.nan_to_num(noise.sigma[:STATE], nan=np.inf)
         correction[flies, :STATE] = np.clip(best, -most, most)
     return correction
 
@@ -174,7 +169,7 @@ def gap_of(
     rotors = np.full(linear.offset.shape[1] - STATE, rotor_spread(windows, limits))
     free_noise = np.append(np.nan_to_num(noise.sigma[:STATE]), rotors)
     channels: dict[str, dict[str, Channel]] = {}
-    for horizon_s in HORIZONS_S:
+    for horizon_s in (0.1, 0.5, 1.0):
         channels[f"{horizon_s:g} s"] = {}
         distance_s = np.abs(np.asarray(windows.row_s) - horizon_s)
         for name in STATE_GROUPS:
@@ -187,7 +182,7 @@ def gap_of(
             floor = noise_floor(linear.slope[rows][:, :STATE], free_noise)[:, SLICES[name]]
             parts = (error, np.maximum(floor, 1e-12)) if len(stretch) else (np.zeros((1, 3)),) * 2
             channels[f"{horizon_s:g} s"][name] = Channel(*map(rms_length, parts))
-    return Gap(score, slow.sum(axis=1), channels, together=limits.bootstrap_block)
+    return Gap(score, slow.sum(axis=1), channels)
 
 
 def overlap(windows: FlightWindows) -> float:
@@ -210,8 +205,6 @@ def noise_floor(slope: np.ndarray, noise: np.ndarray) -> np.ndarray:
 FORCE_S, TORQUE_S = 0.5, 0.1
 """Times over which an effect's mean linear and angular accelerations are computed [s]. The time for
 the angular one is short, as the rate loop soon counteracts a rotation."""
-DRIFT_S = 1.0
-"""Time after which an effect's drift, the change of the position, is measured [s]."""
 
 
 class EffectSize(NamedTuple):
@@ -260,7 +253,7 @@ def rollout_size(shift: np.ndarray, windows: FlightWindows) -> EffectSize:
     has_acc = valid[..., SLICES["accelerometer"]].all(axis=-1)
     if has_acc.any():
         force = max(force, rms_length(shift[has_acc][:, SLICES["accelerometer"]]))
-    return EffectSize(force, growth("rates", TORQUE_S, 1), growth("position", DRIFT_S, 2))
+    return EffectSize(force, growth("rates", TORQUE_S, 1), growth("position", 1.0, 2))
 
 
 def view_size(shift: np.ndarray, in_world: bool) -> EffectSize:

@@ -13,51 +13,33 @@ of that. The share is estimated from the body rates and rotor speeds.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from eval.logs.flight_log import FlightLog
 from suite.diagnose.data.colour import Noise, measured_noise
 from suite.diagnose.data.noise import Linearisation, at_least
-from suite.diagnose.data.sampling import own_spacing_s
 from suite.diagnose.data.whitening import Whitening, block_of, make_whitening, slow_energy
 from suite.diagnose.data.windows import SLICES, FlightWindows
-from suite.diagnose.estimate.block import Estimate
-from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.thresholds import Thresholds
-
-FAST = ("rates", "rotor speed")
-"""Groups of channels that follow a command within a few hundredths of a second."""
 
 
 def with_model_error(
-    model: RolloutModel,
-    theta: np.ndarray,
-    windows: FlightWindows,
-    linear: Linearisation,
-    coarser: FlightWindows,
-    limits: Thresholds,
+    windows: FlightWindows, linear: Linearisation, coarser: np.ndarray, limits: Thresholds
 ) -> Thresholds:
     """Return `limits` with the lower limits of the noise raised to the model's error.
 
-    `linear` has slopes along all parameters and start numbers at `theta` (P,). `coarser` are the
-    same W stretches with longer steps and fewer rotor speeds.
+    `linear` has the residuals of W windows, and slopes along all parameters and start numbers.
+    `coarser` (W, N, 19) are the residuals with longer steps and fewer rotor speeds.
     """
     noise = measured_noise(linear, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)
-    difference = _difference(model, theta, linear, coarser)
+    difference = _difference(linear, coarser)
     return _raised(_rms(difference, linear, noise, whitening, windows), limits)
 
 
 def with_held_commands(
-    model: RolloutModel,
-    theta: np.ndarray,
-    windows: FlightWindows,
-    linear: Linearisation,
-    fewer: FlightWindows,
-    limits: Thresholds,
+    windows: FlightWindows, linear: Linearisation, fewer: np.ndarray, limits: Thresholds
 ) -> Thresholds | None:
     """Return `limits` with the noise raised to the error of held commands; None without the error.
 
@@ -65,17 +47,18 @@ def with_held_commands(
     change with `fewer`, limit the error's share of that change. With a small share, the log has
     every command.
 
-    Args: see `with_model_error`; `fewer` are the same stretches with every second command.
+    Args: see `with_model_error`; `fewer` are the residuals with every second command.
     """
     noise = measured_noise(linear, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)
-    difference = _difference(model, theta, linear, fewer)
+    difference = _difference(linear, fewer)
     rms, residual = (
         _rms(errors, linear, noise, whitening, windows) for errors in (difference, linear.residual)
     )
     shares = residual / np.maximum(rms, 1e-12)
-    fast = (s for name, s in zip(SLICES, shares, strict=True) if name in FAST and s > 0.0)
-    share = min(fast, default=0.0)
+    by_group = dict(zip(SLICES, shares, strict=True))
+    fast = (by_group["rates"], by_group["rotor speed"])
+    share = min((share for share in fast if share > 0.0), default=0.0)
     if share < limits.held_share:
         return None
     # The error accumulates along a window, so its slow part exceeds that of white noise.
@@ -91,15 +74,6 @@ def with_held_commands(
     return _raised(rms * np.array(factor), limits)
 
 
-def commands_are_slow(logs: Sequence[FlightLog], limits: Thresholds) -> bool:
-    """Return whether some log has commands in fewer rows than a drone usually receives them."""
-    return any(
-        own_spacing_s(log.time_s, log.rate_cmd_b) > limits.command_spacing_s
-        for log in logs
-        if log.rate_cmd_b is not None
-    )
-
-
 def beyond_error(change: np.ndarray, error: np.ndarray, width: np.ndarray) -> bool:
     """Return whether an effect, or a shape of the residual, is more than the model's own error.
 
@@ -113,11 +87,9 @@ def beyond_error(change: np.ndarray, error: np.ndarray, width: np.ndarray) -> bo
     return bool((distance - error > least).any())
 
 
-def _difference(
-    model: RolloutModel, theta: np.ndarray, linear: Linearisation, other: FlightWindows
-) -> np.ndarray:
-    """Return by how much the residuals (W, N, 19) of `other` differ; NaN where one diverges."""
-    difference = model.residual(Estimate(theta, linear.offset), other) - linear.residual
+def _difference(linear: Linearisation, other: np.ndarray) -> np.ndarray:
+    """Return by how much the residuals `other` (W, N, 19) differ; NaN where one diverges."""
+    difference = other - linear.residual
     finite = np.isfinite(difference).all(axis=(1, 2), keepdims=True)
     return np.where(finite, difference, np.nan)
 

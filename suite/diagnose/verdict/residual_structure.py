@@ -10,20 +10,20 @@ energy than noise gives (a score test of a smooth random disturbance).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import gamma
 
 from eval.effects.interface import GRAVITY
-from suite.diagnose.data.whitening import Whitening, block_of
+from suite.diagnose.data.whitening import block_of
 from suite.diagnose.data.windows import KNOTS, FlightWindows
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.gauss_newton import Z95
 from suite.diagnose.estimate.permutation import permutation_test
 from suite.diagnose.evidence.rollout import Flown
-from suite.diagnose.evidence.rollouts import RolloutModel
+from suite.diagnose.evidence.rollouts import RolloutEvidence
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.model_error import beyond_error
 
@@ -42,8 +42,12 @@ class DisturbanceEquations(NamedTuple):
     """(W, 6 KNOTS) J'r."""
     knot: Flown
     """(W, KNOTS, ...) simulated state at the knots."""
-    shapes: ShapeLibrary
-    """The shapes that are fitted."""
+    unit: np.ndarray
+    """(W, 6 KNOTS, J) linear [m/s^2] and angular [rad/s^2] acceleration in body axes that each of
+    the J columns of all shapes gives with a coefficient of 1."""
+    groups: Mapping[str, tuple[int, ...]]
+    """Columns of each shape, by its name for people such as "force with the speed"."""
+    limits: Thresholds = THRESHOLDS
 
 
 class ShapeScore(NamedTuple):
@@ -53,7 +57,7 @@ class ShapeScore(NamedTuple):
     gain: float
     p_value: float
     columns: tuple[int, ...]
-    """Numbers of its columns in `ShapeLibrary.unit`."""
+    """Numbers of its columns in `DisturbanceEquations.unit`."""
 
 
 class ResidualStructure(NamedTuple):
@@ -66,49 +70,47 @@ class ResidualStructure(NamedTuple):
 
 
 def disturbance_equations(
-    model: RolloutModel,
-    windows: FlightWindows,
-    whitening: Whitening,
-    estimate: Estimate,
-    limits: Thresholds = THRESHOLDS,
+    evidence: RolloutEvidence, windows: FlightWindows, estimate: Estimate
 ) -> DisturbanceEquations:
-    """Return the normal equations of a disturbance that may explain the residual at `estimate`."""
-    disturbed, knot = model.respond(estimate, windows)
-    equations = block_of(whitening, disturbed, range(6 * KNOTS), windows).equations
-    shapes = shape_library(knot, np.asarray(windows.start_s), limits)
-    return DisturbanceEquations(equations.hessian, equations.gradient, knot, shapes)
+    """Return the normal equations of a disturbance that may explain the residual at `estimate`.
+
+    `windows` are those of the `evidence`, or the same with another input.
+    """
+    disturbed, knot = evidence.model.respond(estimate, windows)
+    equations = block_of(evidence.whitening, disturbed, range(6 * KNOTS), windows).equations
+    shapes = _shapes(knot, np.asarray(windows.start_s))
+    return DisturbanceEquations(
+        equations.hessian, equations.gradient, knot, *shapes, evidence.limits
+    )
 
 
 def residual_structure(
-    equations: DisturbanceEquations,
-    fold: np.ndarray,
-    seed: int = 0,
-    limits: Thresholds = THRESHOLDS,
+    equations: DisturbanceEquations, fold: np.ndarray, seed: int = 0
 ) -> ResidualStructure:
     """Test the residual for structure, by both tests.
 
     `fold` (W,) is the cross-validation fold of each window; one fold is left out at a time.
     """
     # From forces and torques at the knots to coefficients of the shapes.
-    groups = equations.shapes.groups
-    hessian, gradient = _along(equations, equations.shapes.unit)
+    groups = equations.groups
+    hessian, gradient = _along(equations, equations.unit)
     size = np.sqrt(np.maximum(np.einsum("wjj->j", hessian), 1e-12))
     gains, p_values, _ = permutation_test(
         hessian / np.outer(size, size),
         gradient / size,
-        [group.columns for group in groups],
+        list(groups.values()),
         (),
         fold,
         seed,
-        limits=limits,
+        limits=equations.limits,
     )
     scores = [
-        ShapeScore(group.label, gain, p_value, group.columns)
-        for group, gain, p_value in zip(groups, gains, p_values, strict=True)
+        ShapeScore(label.rstrip(), gain, p_value, columns)
+        for (label, columns), gain, p_value in zip(groups.items(), gains, p_values, strict=True)
     ]
     return ResidualStructure(
         sorted(scores, key=lambda shape: -shape.gain),
-        {axis: _energy_p_value(equations, i, limits) for i, axis in enumerate(AXES)},
+        {axis: _energy_p_value(equations, i) for i, axis in enumerate(AXES)},
     )
 
 
@@ -117,7 +119,6 @@ def beyond_model_error(
     equations: DisturbanceEquations,
     coarse: DisturbanceEquations,
     share: float,
-    limits: Thresholds = THRESHOLDS,
 ) -> ResidualStructure:
     """Return `structure` without the significant shapes that the model's own error may explain.
 
@@ -126,7 +127,7 @@ def beyond_model_error(
     """
 
     def is_kept(shape: ShapeScore) -> bool:
-        if shape.p_value > limits.shape_p_value:
+        if shape.p_value > equations.limits.shape_p_value:
             return True
         value, width = _fit(equations, shape.columns)
         error = share * np.abs(_fit(coarse, shape.columns)[0] - value)
@@ -137,7 +138,7 @@ def beyond_model_error(
 
 def _fit(equations: DisturbanceEquations, columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Return the coefficients (C,) of columns of the shapes, and half-widths of 95 % intervals."""
-    hessian, gradient = _along(equations, equations.shapes.unit[..., list(columns)])
+    hessian, gradient = _along(equations, equations.unit[..., list(columns)])
     covariance = np.linalg.pinv(hessian.sum(axis=0))
     half_width = Z95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return covariance @ gradient.sum(axis=0), half_width
@@ -150,7 +151,18 @@ def _along(equations: DisturbanceEquations, unit: np.ndarray) -> tuple[np.ndarra
     return transposed @ equations.hessian @ unit, gradient
 
 
-def _energy_p_value(equations: DisturbanceEquations, axis: int, limits: Thresholds) -> float:
+def diagonalised(
+    hessian: np.ndarray, gradient: np.ndarray, root: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return information and gradient (W, J) along the independent directions of root @ normal.
+
+    `hessian` (W, K, K) and `gradient` (W, K) are those of a disturbance; `root` is (..., K, J).
+    """
+    information, vectors = np.linalg.eigh(root.mT @ hessian @ root)
+    return information, (vectors.mT @ (root.mT @ gradient[..., None]))[..., 0]
+
+
+def _energy_p_value(equations: DisturbanceEquations, axis: int) -> float:
     """Return the p-value of a random disturbance along `axis`, over several correlation times.
 
     For one correlation time, the eigenvectors of the information are independent directions of the
@@ -162,48 +174,27 @@ def _energy_p_value(equations: DisturbanceEquations, axis: int, limits: Threshol
     """
     entries = np.arange(KNOTS) * 6 + axis
     hessian = equations.hessian[:, entries][:, :, entries]
-    gradient = equations.gradient[:, entries, None]
+    gradient = equations.gradient[:, entries]
     time = np.linspace(0.0, 1.0, KNOTS)
     p_values = []
-    for correlation_s in limits.colours_s:
+    for correlation_s in (0.3, 0.03):  # as of gusts and of rotors
         root = np.linalg.cholesky(np.exp(-np.abs(time[:, None] - time) / correlation_s))
-        information, vectors = np.linalg.eigh(root.T @ hessian @ root)
-        informed = information > limits.informed_share * max(float(information.max()), 1e-12)
-        along = (np.swapaxes(vectors, 1, 2) @ (root.T @ gradient))[..., 0]
+        information, along = diagonalised(hessian, gradient, root)
+        informed = information > 1e-9 * max(float(information.max()), 1e-12)
         information, along = information[informed], along[informed]
-        for share in limits.disturbance_quantiles:
+        for share in (0.9, 0.5, 0.1):  # quantiles that set the tested sizes
             size = 1.0 / np.quantile(information, share)
             weight = size * information / (1.0 + size * information)
             mean = float(weight.sum())
-            variance = 2.0 * float((weight**2).sum()) + (limits.noise_error * mean) ** 2
+            # The measured noise power has a relative uncertainty of 2 %.
+            variance = 2.0 * float((weight**2).sum()) + (0.02 * mean) ** 2
             energy = float((weight * (along**2 / information)).sum())
             p_values.append(float(gamma.sf(energy, mean**2 / variance, scale=variance / mean)))
-    return min(1.0, len(p_values) * min(p_values)) if p_values else 1.0
+    return min(1.0, len(p_values) * min(p_values))
 
 
-class ShapeGroup(NamedTuple):
-    """One shape along several axes, as columns of `ShapeLibrary.unit`."""
-
-    label: str
-    """Name of the shape for people, such as "force with the speed"."""
-    columns: tuple[int, ...]
-    """Numbers of its columns."""
-
-
-class ShapeLibrary(NamedTuple):
-    """All shapes at the knots of W windows."""
-
-    unit: np.ndarray
-    """(W, KNOTS * 6, J) linear [m/s^2] and angular [rad/s^2] acceleration in body axes that each of
-    J columns gives with a coefficient of 1."""
-    groups: tuple[ShapeGroup, ...]
-    """The shapes, as groups of columns."""
-
-
-def shape_library(
-    knot: Flown, start_s: np.ndarray, limits: Thresholds = THRESHOLDS
-) -> ShapeLibrary:
-    """Return all shapes at the knots (W, KNOTS, ...) of W windows.
+def _shapes(knot: Flown, start_s: np.ndarray) -> tuple[np.ndarray, dict[str, tuple[int, ...]]]:
+    """Return `unit` and `groups` of all shapes at the knots, as in `DisturbanceEquations`.
 
     `start_s` (W,) is the start of each window, from the start of its flight [s].
     """
@@ -215,7 +206,7 @@ def shape_library(
     speed = np.sqrt((vel_w**2).sum(axis=-1))
     yaw = np.arctan2(rot_w[..., 1, 0], rot_w[..., 0, 0])
     time = start_s[:, None] + np.linspace(0.0, 1.0, KNOTS)
-    # Keys must differ: two have a trailing space, which their labels below do not.
+    # Keys must differ: two have a trailing space, which the labels of their scores do not.
     scalars = {
         "nothing: it is constant": np.ones_like(speed),
         "the time in flight": time,
@@ -231,7 +222,7 @@ def shape_library(
         "the thrust": thrust,
         "the thrust's square": thrust**2,
         "the thrust's change": change,
-        "the thrust's direction of change": np.tanh(change / limits.thrust_reversal),
+        "the thrust's direction of change": np.tanh(change / 10.0),  # above 10 m/s^3
         "thrust times velocity along x": thrust * vel_b[..., 0],
         "thrust times velocity along y": thrust * vel_b[..., 1],
         "the heading": np.cos(yaw),
@@ -239,59 +230,53 @@ def shape_library(
         "twice the heading": np.cos(2.0 * yaw),
         "twice the heading ": np.sin(2.0 * yaw),
     }
-    columns: list[np.ndarray] = []
-    groups: list[ShapeGroup] = []
+    columns, groups = list[np.ndarray](), dict[str, tuple[int, ...]]()
 
     def add(label: str, shapes: list[np.ndarray]) -> None:
-        groups.append(ShapeGroup(label, tuple(range(len(columns), len(columns) + len(shapes)))))
+        groups[label] = tuple(range(len(columns), len(columns) + len(shapes)))
         columns.extend(shapes)
 
     # Each scalar times a force along each body axis, and times a torque about each body axis.
     unit_axes = np.eye(6)
     for label, scalar in scalars.items():
         along = scalar[..., None, None] * unit_axes
-        add(f"force with {label.rstrip()}", [along[..., i, :] for i in range(3)])
-        add(f"torque with {label.rstrip()}", [along[..., i, :] for i in range(3, 6)])
+        add(f"force with {label}", [along[..., i, :] for i in range(3)])
+        add(f"torque with {label}", [along[..., i, :] for i in range(3, 6)])
     # A drag whose dependence on the speed is free.
-    motion = [hat[..., None] * vel_b for hat in _hats(speed, limits.pieces)]
+    motion = [hat[..., None] * vel_b for hat in _hats(speed)]
     add("force with the motion, by its speed", [
         along_b[..., i, None] * unit_axes[i] for along_b in motion for i in range(3)
     ])  # fmt: skip
     for label, scalar in (("thrust", thrust), ("climb", vel_w[..., 2]), ("height", pos_w[..., 2])):
         add(
             f"force along body z, by the {label}",
-            [h[..., None] * unit_axes[2] for h in _hats(scalar, limits.pieces)],
+            [h[..., None] * unit_axes[2] for h in _hats(scalar)],
         )
     # Forces along world axes, everywhere or near a place.
     world = np.concatenate([axes_b, np.zeros_like(axes_b)], axis=-2)
     add("force along fixed directions", [world[..., i] for i in range(3)])
     add("force with the place", [
-        world[..., i] * bump[..., None] for bump in _bumps(pos_w, limits.cells) for i in range(3)
+        world[..., i] * bump[..., None] for bump in _bumps(pos_w) for i in range(3)
     ])  # fmt: skip
     from_centre_b = np.einsum("wkij,wkj->wki", axes_b, pos_w - pos_w.mean(axis=(0, 1)))
     radial = np.concatenate([from_centre_b, np.zeros_like(from_centre_b)], axis=-1)
     add("force towards a place", [radial])
     stacked = np.stack(columns, axis=-1)
-    return ShapeLibrary(stacked.reshape(len(stacked), KNOTS * 6, -1), tuple(groups))
+    return stacked.reshape(len(stacked), KNOTS * 6, -1), groups
 
 
-def _hats(scalar: np.ndarray, pieces: int) -> list[np.ndarray]:
+def _hats(scalar: np.ndarray) -> list[np.ndarray]:
     """Return hat functions (piecewise linear bumps) of `scalar` (W, KNOTS), each (W, KNOTS).
 
-    They stand on quantiles of the scalar.
+    They stand on six quantiles of the scalar.
     """
-    corners = np.unique(np.quantile(scalar, np.linspace(0.0, 1.0, pieces + 1)))
-    if len(corners) < 2:
-        return [np.ones_like(scalar)]
+    corners = np.unique(np.quantile(scalar, np.linspace(0.0, 1.0, 6)))
     return [np.interp(scalar, corners, heights) for heights in np.eye(len(corners))]
 
 
-def _bumps(pos_w: np.ndarray, cells: int) -> list[np.ndarray]:
-    """Return Gaussian bumps on a grid over the horizontal positions, each (W, KNOTS)."""
+def _bumps(pos_w: np.ndarray) -> list[np.ndarray]:
+    """Return 4 x 4 Gaussian bumps on a grid over the horizontal positions, each (W, KNOTS)."""
     low, high = pos_w[..., :2].min(axis=(0, 1)), pos_w[..., :2].max(axis=(0, 1))
-    width = np.maximum(high - low, 0.5) / (cells - 1)
-    bumps = []
-    for cell in np.ndindex(cells, cells):
-        distance = (pos_w[..., :2] - low) / width - cell
-        bumps.append(np.exp(-0.5 * (distance**2).sum(axis=-1) / 0.5**2))
-    return bumps
+    width = np.maximum(high - low, 0.5) / 3
+    distances = [(pos_w[..., :2] - low) / width - cell for cell in np.ndindex(4, 4)]
+    return [np.exp(-0.5 * (distance**2).sum(axis=-1) / 0.5**2) for distance in distances]

@@ -15,7 +15,7 @@ from suite.diagnose.diagnose import diagnose
 from suite.diagnose.sources.rollout_source import rollouts_of
 from tests.support.diagnosis_flights import fly, fly_all
 from tests.support.real_flights import VEHICLE, flights
-from tests.support.vehicles import PLAIN, with_effects, with_lag
+from tests.support.vehicles import LAGGED, PLAIN, with_effects
 
 UNOPTIMISED = os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] != "0"
 """The setting of tests/conftest.py, or of the caller."""
@@ -41,9 +41,6 @@ def compiled_quickly():
 def log():
     """Return one flight of the plain vehicle."""
     return fly(PLAIN, 0, duration_s=4.0, motors=True)
-
-
-LAGGED = with_lag(PLAIN, 0.03)
 
 
 @pytest.fixture(scope="session")

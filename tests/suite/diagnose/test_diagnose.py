@@ -30,10 +30,8 @@ from tests.support import diagnosis_flights
 from tests.support.broken_logs import BREAKAGES, rows
 from tests.support.diagnosis_flights import fly, fly_all
 from tests.support.real_flights import Pendulum
-from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
+from tests.support.vehicles import LAGGED, PLAIN, REMEMBERING, with_effects, with_lag
 from tracks.common.files import plain, to_json
-
-LAGGED = with_lag(PLAIN, 0.03)
 
 
 def flights(vehicle, seed=0, count=3, duration_s=7.0, **options):
@@ -259,16 +257,21 @@ def test_without_noise_the_models_own_error_is_no_finding(vehicle, drive):
     assert all(not one["relevant"] for one in found["negligible"])
 
 
+def slow_and_complete(monkeypatch, **options):
+    """Return flights with every second of their commands, and flights as slow with all."""
+    sparse = [rows(log, slice(0, None, 2)) for log in flights(LAGGED, noise=0.1, **options)]
+    monkeypatch.setattr(diagnosis_flights, "EVERY", 10)
+    return sparse, flights(LAGGED, noise=0.1, **options)
+
+
 @pytest.mark.slow
 def test_commands_between_the_rows_of_a_log_are_no_effect(monkeypatch):
     """If the log has every command, its slow rows limit nothing."""
     uncertain = list[bool]()
     monkeypatch.setattr(rollout_source.RolloutSource, "is_relevant", lambda *_: True)
     monkeypatch.setattr(rollout_source, "structure_where", lambda *got: uncertain.append(got[2]))
-    logs = flights(LAGGED, duration_s=5.0, noise=0.1)
-    sparse = [rows(log, slice(0, None, 2)) for log in logs]
-    monkeypatch.setattr(diagnosis_flights, "EVERY", 10)
-    for logs, lacks in ((sparse, True), (flights(LAGGED, duration_s=5.0, noise=0.1), False)):
+    pairs = zip(slow_and_complete(monkeypatch, duration_s=5.0), (True, False), strict=True)
+    for logs, lacks in pairs:
         found = diagnose(logs, LAGGED, drive="commands")
         assert (found.verdict.label, found.named) == ("no_gap", [])
         assert (rollouts.LACKING in found.warnings) == lacks
@@ -284,12 +287,11 @@ def test_the_noise_counts_as_certain_only_if_no_command_is_lacking(monkeypatch):
         made = rollouts.by_rollouts(given)
         return made.sources[0], rollouts.LACKING in made.warnings
 
-    logs = flights(LAGGED, count=2, duration_s=4.0, noise=0.1)
-    source, lacks = source_of([rows(log, slice(0, None, 2)) for log in logs])
+    sparse, complete = slow_and_complete(monkeypatch, count=2, duration_s=4.0)
+    source, lacks = source_of(sparse)
     assert lacks and source.coarser is not None and source.coarser_share == 1.0
     assert sum(source.limits.least_noise) > sum(limits.least_noise)
-    monkeypatch.setattr(diagnosis_flights, "EVERY", 10)
-    source, lacks = source_of(flights(LAGGED, count=2, duration_s=4.0, noise=0.1))
+    source, lacks = source_of(complete)
     assert not lacks and source.coarser is None and source.limits == limits
 
 

@@ -25,7 +25,7 @@ from tests.support.commands import refused
 from tests.support.diagnosis_flights import fly_all
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.recordings import columns
-from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
+from tests.support.vehicles import LAGGED, PLAIN, REMEMBERING, with_effects
 
 STEPS = ["The logs", "The measurement noise", "The candidates",
          "Alternatives to the named effects", "Remaining error", "The evidence"]  # fmt: skip
@@ -165,7 +165,6 @@ def test_a_change_is_written_as_every_diagnosis_is(tmp_path, capsys, monkeypatch
     assert load_vehicle(str(tmp_path / "out/vehicle.toml")).effects
 
 
-LAGGED = with_lag(PLAIN, 0.03)
 SET = {"effects": [{"name": "rotor_drag", "alternatives": ["linear_drag"]}]}
 (DRAGS,) = planning.separations_of(["rotor_drag", "linear_drag"])
 

@@ -17,7 +17,7 @@ from suite.diagnose.verdict import actuators, model_error
 from suite.diagnose.verdict import residual_structure as structure
 from suite.diagnose.verdict.gap import Gap, gap_of, overlap, start_correction
 from tests.support.diagnosis_flights import NOISE, fly, fly_all
-from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
+from tests.support.vehicles import LAGGED, PLAIN, REMEMBERING, with_effects, with_lag
 
 
 def covered(scores, **options):
@@ -103,8 +103,7 @@ def test_a_window_that_diverges_is_left_out_and_one_without_an_error_counts(monk
     errors = np.ones((3, 5, 19)) * np.array([2.0, 0.0, 1.0])[:, None, None]
     errors[2, 4, 7] = np.inf
     linear = Linearisation(np.zeros_like(errors), *np.zeros((2, 0)))
-    model = SimpleNamespace(residual=lambda *_: errors)
-    difference = model_error._difference(model, np.zeros(0), linear, None)
+    difference = model_error._difference(linear, errors)
     windows = SimpleNamespace(valid=np.ones(errors.shape, bool))
     rms = model_error._rms(difference, linear, Noise(np.ones(19), {}), None, windows)
     assert rms == pytest.approx(np.full(6, np.sqrt((2.0**2 + 0.0) / 2.0)))
@@ -115,12 +114,11 @@ def test_a_shape_that_grows_with_the_models_error_is_left_out_and_one_that_stays
     unit = np.zeros((2, 2, 6, 2))
     unit[..., 0, 0], unit[..., 5, 1] = [[1.0, 2.0], [3.0, 1.0]], [[2.0, 1.0], [1.0, 3.0]]
     unit = unit.reshape(2, 12, 2)
-    library = structure.ShapeLibrary(unit, ())
     hessian, names = np.tile(100.0 * np.eye(12), (2, 1, 1)), ("force", "torque")
 
     def of(error, physics):
         gradient = (hessian @ unit @ np.array([error, physics])[..., None])[..., 0]
-        return structure.DisturbanceEquations(hessian, gradient, None, library)
+        return structure.DisturbanceEquations(hessian, gradient, None, unit, {})
 
     fine, coarse = of(0.3, 0.2), of(0.9, 0.21)
     shapes = [structure.ShapeScore(n, 9.0, 5e-4, (k,)) for k, n in enumerate(names)]
@@ -130,9 +128,6 @@ def test_a_shape_that_grows_with_the_models_error_is_left_out_and_one_that_stays
         assert [shape.label for shape in left.shapes] == kept
     by_chance = found._replace(shapes=[found.shapes[0]._replace(p_value=0.2)])
     assert structure.beyond_model_error(by_chance, fine, coarse, 0.5) == by_chance
-
-
-LAGGED = with_lag(PLAIN, 0.03)
 
 
 @pytest.fixture(scope="module")

@@ -101,7 +101,7 @@ def test_a_gap_has_its_interval_its_noise_floor_and_the_share_that_remains_of_it
 
 
 def test_a_diagnosis_is_measured_on_what_was_held_out(drag, found_drag, flown):
-    assert drag.label == "named" and drag.flights.driven_by == "commands"
+    assert drag.verdict.label == "named" and drag.flights.driven_by == "commands"
     linear = gaps.from_true_starts(flown.model, found_drag.theta, flown.held)
     again = gaps.gap_of(linear, flown.held, of_rollouts(found_drag.search.last).noise)
     np.testing.assert_array_equal(again.score, found_drag.after.score)
@@ -112,9 +112,9 @@ def test_without_the_name_its_shape_is_left_and_a_drag_is_not_taken_for_wind(fou
     found, details = found_drag.search, found_drag.remaining.details
     evidence, bare = of_rollouts(found.last), found.estimate._replace(theta=flown.start.theta)
     windows = evidence.trusted
-    given = (flown.model, windows, evidence.whitening)
-    both = (structure.disturbance_equations(*given, one) for one in (bare, found.estimate))
-    equations, with_it = both
+    equations, with_it = (
+        structure.disturbance_equations(evidence, windows, one) for one in (bare, found.estimate)
+    )
     with_gap = structure.residual_structure(equations, np.arange(len(windows.flight)) % 5)
     assert with_gap.shapes[0].gain > 10.0 * max(details["shapes"][0]["gain"], 1.0)
     assert min(with_gap.coloured.values()) < 1e-6 <= min(details["coloured"].values())
@@ -125,7 +125,7 @@ def test_a_random_disturbance_has_its_size_or_none_at_the_end_of_the_tried_value
     rng, unit = np.random.default_rng(2), np.broadcast_to(np.eye(6), (200, 6, 6))
     noise = 2.0 * rng.standard_normal((200, 6))
     gradient = 4.0 * 2.0 * rng.standard_normal((200, 6)) + noise
-    equations = structure.DisturbanceEquations(4.0 * unit, gradient, None, None)  # type: ignore[arg-type]
+    equations = structure.DisturbanceEquations(4.0 * unit, gradient, None, unit, {})  # type: ignore[arg-type]
     sizes = np.array([0.5, 1.0, 2.0, 4.0, 8.0])
     assert sizes[_likelihood(equations, unit, sizes).argmax()] == 2.0
     assert _range_of(sizes, (sizes > 0.5) & (sizes < 8.0)) == [1.0, 4.0]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from suite.diagnose.data.view import SmoothedFlight, weak_form
+from suite.diagnose.data.view import FORCE, SmoothedFlight, weak_form
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import candidates
 from suite.diagnose.evidence.evidence import Evaluation
@@ -17,7 +17,8 @@ from suite.diagnose.report.summary import next_steps
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.examine import contradicted
 from suite.diagnose.sources.view_source import closed_share, fit_black_box, inputs_of
-from suite.diagnose.verdict.disturbances import Swing, find_swing
+from suite.diagnose.thresholds import THRESHOLDS
+from suite.diagnose.verdict.disturbances import Swing, residual_swing
 from tests.support.diagnosis_flights import fly_all
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import with_effects
@@ -35,7 +36,7 @@ def found_in(logs, vehicle=VEHICLE, view=None):
 
 
 def test_a_drag_is_named_and_closes_what_any_model_could(by_views):
-    assert by_views.label == "named" and by_views.warnings == []
+    assert by_views.verdict.label == "named" and by_views.warnings == []
     assert by_views.vehicle.effects["linear_drag"].coefficient[0] == pytest.approx(0.4, abs=0.05)
     force, left = by_views.findings[0], by_views.findings[0].remaining
     assert left.gap_details["closed"] > 0.8 > 0.3 * left.explainable
@@ -90,7 +91,7 @@ def test_a_battery_that_sags_is_named_with_its_size(rate, duration_s, fall):
         logs = [replace(log, voltage=16.8 - fall * (log.time_s - log.time_s[0])) for log in logs]
     names, found = found_in(logs)
     ((_, name),) = found.named
-    assert set(names) == {"battery_sag"} and (fall == 0.0 or found.label == "named")
+    assert set(names) == {"battery_sag"} and (fall == 0.0 or found.verdict.label == "named")
     sag = found.vehicle.effects["battery_sag"]
     if fall:
         assert sag.per_volt == pytest.approx(rate / fall, rel=0.1)
@@ -149,7 +150,7 @@ def test_flights_that_hardly_move_leave_wind_and_drag_and_a_leaning_frame():
 def test_noise_of_the_rotor_speeds_is_no_inertia_and_no_thrust():
     """Noise in what drives makes every slope smaller, as more inertia would."""
     names, found = found_in(flights(4, 204, 5.0, 1.5))
-    assert (found.label, names) == ("no_gap", {})
+    assert (found.verdict.label, names) == ("no_gap", {})
 
 
 def pushed(extra, seed, duration_s=6.0):
@@ -173,7 +174,7 @@ def hysteresis(motion, t):
 )
 def test_what_is_outside_the_catalogue_is_no_wind_and_no_thrust_alone(extra, seed, duration_s):
     names, found = found_in(pushed(extra, seed, duration_s))
-    assert found.label in ("partly", "unknown") and "constant_wind" not in names
+    assert found.verdict.label in ("partly", "unknown") and "constant_wind" not in names
     assert found.verdict.where is not None
 
 
@@ -184,7 +185,7 @@ def test_a_force_that_nothing_explains_is_not_no_gap():
         return 1.5 * np.array([np.sin(1.5 * motion.pos_w[0]), np.cos(1.5 * motion.pos_w[1]), 0.0])
 
     names, found = found_in(pushed(by_place, 20))
-    assert (found.label, names) == ("unknown", {})
+    assert (found.verdict.label, names) == ("unknown", {})
     assert found.verdict.share_left > 0.9 and "m/s^2 beyond the noise" in found.verdict.where
     shown = found.main.source.series(found.main.search)
     assert shown.label.partition("body ")[2][0] in "xy", "the picture shows where the error is"
@@ -194,7 +195,7 @@ def test_a_force_that_nothing_explains_is_not_no_gap():
 def test_one_effect_is_named_without_a_second_small_one_but_with_what_looks_alike():
     names, found = found_in(flights(4, seed=11, speed=4.0, blade_flapping=(2e-6,)))
     ((name, rivals),) = names.items()
-    assert found.label == "named" and "blade_flapping" in {name, *rivals}
+    assert found.verdict.label == "named" and "blade_flapping" in {name, *rivals}
     names, _ = found_in(flights(4, seed=12, speed=1.0, mass_offset=(0.08,)))
     assert {"mass_offset", "thrust_scale"} <= {*names, *set().union(*names.values())}
 
@@ -212,8 +213,14 @@ def made(period_s, pull, moved, rng, noise=0.1):
     return SmoothedFlight(rows, form, measured), left
 
 
-def swing_of(*flights):
-    return find_swing([flight for flight, _ in flights], [left for _, left in flights])
+def swing_of(*made):
+    flights, left = zip(*made, strict=True)
+    flight = np.repeat(np.arange(len(left)), [len(one) for one in left])
+    data = SimpleNamespace(residual=np.concatenate(left), flight=flight)
+    task: Any = SimpleNamespace(
+        view=FORCE, flights=flights, residuals=lambda _: data, limits=THRESHOLDS
+    )
+    return residual_swing(task, np.zeros(0))
 
 
 def test_a_pull_at_one_period_is_a_swing_and_own_motion_noise_or_other_periods_are_none():
@@ -228,7 +235,9 @@ def test_a_pull_at_one_period_is_a_swing_and_own_motion_noise_or_other_periods_a
         assert swing_of(*(made(1.4, 0.0, 0.0, rng) for _ in range(3))) is None
     assert swing_of(*(made(1.4, 0.3, 3.0, rng) for _ in range(3))) is None
     assert swing_of(*(made(period_s, 0.1, 0.0, rng) for period_s in (0.7, 1.0, 1.5, 2.2))) is None
-    assert find_swing([], []) is None
+    flight, left = made(1.4, 0.3, 0.1, rng)
+    form = flight.form._replace(middle_s=flight.form.middle_s[:7])
+    assert swing_of((flight._replace(form=form), left[:7])) is None, "too short for a spectrum"
 
 
 @pytest.mark.slow
@@ -236,7 +245,7 @@ def test_a_load_on_a_line_is_said_to_swing_with_its_period():
     logs = flights(4, seed=1, duration_s=10.0, speed=1.0, load=(0.08, 0.5))
     _, found = found_in(logs)
     swing = found.findings[0].remaining.swing
-    assert found.label in ("partly", "unknown") and swing is not None
+    assert found.verdict.label in ("partly", "unknown") and swing is not None
     # A pendulum on a free body of 0.75 kg swings faster than on a wall, by sqrt(1 + 0.08 / 0.75).
     assert swing.period_s == pytest.approx(1.42 / np.sqrt(1.0 + 0.08 / 0.75), rel=0.08)
     entries = diagnosis_json(found)
