@@ -101,8 +101,8 @@ def page(
         _answer(result),
         _written(result, toml, files),
     ]
+    sections += [replace(section, folded=True) for section in details]
     shown = [section for section in sections if section.parts]
-    shown += [replace(section, folded=True) for section in details]
     return Report(f"Diagnosis: {TITLES[result['verdict']]}", result["headline"], facts, shown)
 
 

@@ -146,6 +146,8 @@ def test_sections_show_the_numbers(drag, found):
     assert texts(sections.noise_section(drag).parts[1])[0][0] == "position [m]"
     assert len(sections.actuators_section(found).parts) == 2
     assert "Actuators" not in html(page(drag, {**found, "actuators": []}, "", set()))
+    bare = [replace(one, search=replace(one.search, first=[])) for one in drag.findings]
+    assert "The candidates" not in html(page(replace(drag, findings=bare), found, "", set()))
     rest = {**found, "unexplained": {"where": "a shape", "share": 0.25, "above_noise": []}}
     words = str(sections.residual_section(rest).parts[0])
     assert words.startswith("25 % of the error of rollouts") and words.endswith(": a shape.")
