@@ -31,7 +31,7 @@ from suite.diagnose.data.sampling import (
     own_spacing_s,
     with_fewer_rows,
 )
-from suite.diagnose.data.steps import LONGEST_S, torque_between_rows
+from suite.diagnose.data.steps import LONGEST_S, torque_between_rows, wrench_difference
 from suite.diagnose.data.view import (
     FORCE,
     LEAST_ROWS,
@@ -43,7 +43,6 @@ from suite.diagnose.data.view import (
     smoothed,
 )
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict.actuators import wrench_difference
 from tracks.geometry.rotation import rot_to_quat
 
 SLOW_WIDTH_S = 1.0

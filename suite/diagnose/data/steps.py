@@ -232,3 +232,16 @@ def start_rotor_error(time_s: np.ndarray, rate_b: np.ndarray, vehicle: Vehicle) 
     commanded = np.asarray(wanted_speed(plant, hover, rates))
     error = 0.5 * rate_error @ ((commanded[1:] - commanded[0]) / 0.1)
     return max(float(np.sqrt((error**2).mean())), LEAST_START_ERROR)
+
+
+def wrench_difference(
+    measured: np.ndarray, commanded: np.ndarray, vehicle: Vehicle
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the accelerations by `measured` rotor speeds less those by `commanded` ones.
+
+    Both speeds are (N, 4) [rad/s]. The result is the difference of thrust over mass (N,) [m/s^2],
+    and that of the angular acceleration in body axes (N, 3) [rad/s^2].
+    """
+    thrust = vehicle.rotors.thrust_coefficient * (measured**2 - commanded**2)
+    wrench = thrust @ rotor_mixer(vehicle).T
+    return wrench[:, 0] / vehicle.mass, wrench[:, 1:] / np.array(vehicle.inertia)

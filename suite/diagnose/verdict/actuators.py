@@ -26,7 +26,7 @@ from eval.quadrotor.plant import Command, Plant, make_plant
 from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.sampling import follow_lag, hold, interpolate, on_every_row
-from suite.diagnose.data.steps import has_firmware_loop, rotor_mixer, step_s
+from suite.diagnose.data.steps import has_firmware_loop, step_s, wrench_difference
 from suite.diagnose.evidence.moments import means_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
@@ -236,19 +236,6 @@ def _at_rows(
     """
     # The speed at the end of step k is that at the start of step k + 1.
     return np.concatenate([speed[:1], follow_lag(speed, dt, time_constant)])[step_of_row]
-
-
-def wrench_difference(
-    measured: np.ndarray, commanded: np.ndarray, vehicle: Vehicle
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the accelerations by `measured` rotor speeds less those by `commanded` ones.
-
-    Both speeds are (N, 4) [rad/s]. The result is the difference of thrust over mass (N,) [m/s^2],
-    and that of the angular acceleration in body axes (N, 3) [rad/s^2].
-    """
-    thrust = vehicle.rotors.thrust_coefficient * (measured**2 - commanded**2)
-    wrench = thrust @ rotor_mixer(vehicle).T
-    return wrench[:, 0] / vehicle.mass, wrench[:, 1:] / np.array(vehicle.inertia)
 
 
 def _rms(values: np.ndarray) -> float:
