@@ -14,6 +14,7 @@ from tests.support.policy_files import small_checkpoint
 from tests.support.tools import BLOCKER
 
 ROOMS = ("tracks", "policies", "eval", "suite")
+STEPS = ("estimate", "data", "evidence", "search", "verdict", "sources", "report")
 ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
 HEAVY = ("numpy", "jax", "mujoco", "torch", "tyro", "rich", "scipy", "pyarrow", "argparse")
@@ -60,6 +61,18 @@ def test_imports_go_one_way():
         for path in FILES
         for name in imported(path)
         if name.split(".")[0] in ROOMS[ROOMS.index(path.relative_to(ROOT).parts[0]) + 1 :]
+    ]
+    assert not wrong
+
+
+def test_the_steps_of_the_diagnosis_import_one_way():
+    folder = "suite.diagnose."
+    wrong = [
+        f"{path.relative_to(ROOT)} imports {name}"
+        for number, step in enumerate(STEPS)
+        for path in (ROOT / "suite" / "diagnose" / step).glob("*.py")
+        for name in imported(path)
+        if name.startswith(folder) and name.split(".")[2] in STEPS[number + 1 :]
     ]
     assert not wrong
 
