@@ -1,6 +1,7 @@
 """Flight logs: one flight as arrays, read from and written to Parquet or CSV.
 
-The columns, their units and the rules for a valid file are in `eval/logs/columns.py`. The suite
+The columns and their units are in `docs/flight_logs.md`, the rules for a valid file in
+`eval/logs/columns.py`. The suite
 also records the policy's action, the rows of its decisions and the next gate, as extra columns.
 Unknown columns of any origin are kept.
 """

@@ -95,8 +95,8 @@ def score_case(
     Args:
         name: name of the case.
         answer: contents of its answer.
-        diagnosis: contents of `diagnosis.json`, and
-        seconds: time of the diagnosis [s]; both are None if it failed.
+        diagnosis: contents of `diagnosis.json`; None if the diagnosis failed.
+        seconds: time of the diagnosis [s]; None if it failed.
         hubs: (3,) angular damping about the body axes that the simulator has by itself, because the
             hubs of the rotors move through the air [1/s]; None if it has none.
     """

@@ -42,7 +42,8 @@ def trajectories_for(result: Mapping[str, Any]) -> tuple[list[Trajectory], list[
             trajectories += plan_for(names)
             words += [advice(effect["name"], rival) for rival in effect["alternatives"]]
             words += [MEASURES[key] for entry in separations_of(names) for key in entry.measure]
-    # Each trajectory is flown twice, so that one flight can be held out; the second is rotated.
+    # Each trajectory is flown twice, so that one flight can be held out; the second is rotated
+    # about z by 2.1 rad.
     flights = [
         flight
         for trajectory in dict.fromkeys(trajectories)

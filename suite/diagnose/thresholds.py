@@ -40,6 +40,8 @@ class Thresholds:
     lag_followed_share: float = 0.99
     """Least share of the rotor speeds' variance that commands and a lag must explain. If speeds
     change little, noise of the rates in the commanded speeds resembles a lag."""
+    lag_least_flights: int = 3
+    """Least number of flights that must show the lag."""
     lag_closed_share: float = 0.25
     """Least share by which another lag lowers the squared error that the vehicle's own lag has."""
     held_out_share: float = 0.2
@@ -57,8 +59,9 @@ class Thresholds:
     """Degree of the polynomial that is subtracted from a window before noise is modelled as
     coloured (correlated in time): errors of the start state resemble coloured noise."""
     colour_gain: float = 3.0
-    """Least rise of the log-likelihood to model noise as coloured, not white, and to include a
-    drift (error of the model) in it."""
+    """Least rise of the log-likelihood to model noise as coloured, not white."""
+    drift_gain: float = 3.0
+    """Least rise of the log-likelihood to include a drift (error of the model) in the noise."""
     colour_aside: float = 3.0
     """Largest difference between the row times of a window and the median row times of all windows,
     in rows. Windows with a larger one are left out of the noise model."""
@@ -107,9 +110,10 @@ class Thresholds:
     effect is not exact and has a residual of this size."""
     short_list: int = 5
     """Number of candidates that are fitted with the nonlinear model at each step of the search."""
+    alike_share: float = 0.5
+    """Share of the best gain from which a group of columns explains about as much as the best."""
     near_share: float = 0.5
-    """Share of the best gain from which a candidate explains about as much as the best; least
-    linear gain of these candidates."""
+    """Least linear gain of the candidates on the short list, as a share of the best gain."""
     rival_chi2: float = 9.0
     """An alternative ("rival") is a candidate whose chi-square is less than this above the named
     effect's (three sigma)."""
@@ -157,8 +161,7 @@ class Thresholds:
     least_view_s: float = 1.0
     """Least flight time to fit, and least flight time to hold out, for force and torque [s]."""
     least_flights: int = 3
-    """Least number of flights from which the spread of trims or rotor lags between flights is
-    estimated."""
+    """Least number of flights from which the spread of trims between flights is estimated."""
     longest_memory: int = 40
     """Largest time difference in the autocorrelation of a view's errors, in windows of the view."""
     least_fast_share: float = 0.5
@@ -204,6 +207,8 @@ class Thresholds:
     """Probability of a false name of a change, over all candidates and views."""
     change_draws: int = 9999
     """Number of draws of the null of a change, for all candidates together."""
+    swing_p_value: float = 0.001
+    """Probability of a false peak in the spectrum of the force residual, over all periods."""
     swing_share: float = 0.15
     """Least share of the force residual's power that oscillates at the period of the peak."""
     swing_driven: float = 0.5
@@ -223,8 +228,7 @@ class Thresholds:
     """Least fall of the held-out squared error by a name, as a share of the residual above the
     noise, if that residual is significant."""
     shape_p_value: float = 0.001
-    """Largest p-value with which a function of the state, or a swing (an oscillating force) of any
-    period, counts as structure in the residual."""
+    """Largest p-value with which a function of the state counts as structure in the residual."""
     colour_p_value: float = 1e-4
     """Largest p-value with which a smooth disturbance along an axis counts as structure."""
     structure: float = 1.15

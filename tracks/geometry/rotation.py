@@ -39,7 +39,7 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def yaw_rotation(yaw: Array) -> Array:
-    """Return the rotation matrices (..., 3, 3) about z by `yaw` (...,) [rad]."""
+    """Return the rotation matrices (..., 3, 3) about z by the array `yaw` (...,) [rad]."""
     xp = yaw.__array_namespace__()
     cos, sin, zero = xp.cos(yaw), xp.sin(yaw), xp.zeros_like(yaw)
     rows = ((cos, -sin, zero), (sin, cos, zero), (zero, zero, zero + 1.0))

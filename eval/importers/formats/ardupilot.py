@@ -1,8 +1,18 @@
 """Read ArduPilot's `.bin` logs with pymavlink (extra `mavlink`).
 
 The vehicle's world is north-east-down and its body forward-right-down. Messages and units follow
-ArduPilot's documentation of its log messages (Copter 4.x); of an instance or core, the lowest is
-read.
+ArduPilot's documentation of its log messages (Copter 4.x); the first one in the log is used.
+
+| signal | messages |
+|---|---|
+| rate, acc | IMU (rad/s, m/s^2), of the lowest instance |
+| quat | ATT (roll, pitch, yaw in deg) |
+| pos, vel | XKF1, NKF1 (PN PE PD in m, VN VE VD in m/s), of the lowest core |
+| cmd_rate | RATE (RDes PDes YDes in deg/s) |
+| throttle | CTUN (ThO, 0 to 1) |
+| pwm | RCOU (pulses in us), the outputs that SERVOn_FUNCTION makes motors 1 to 4 |
+| motor | ESC (RPM by instance, in the order of these outputs), where all four report |
+| voltage | BAT (Volt) |
 """
 
 from __future__ import annotations

@@ -4,6 +4,15 @@ ROS's worlds are z-up and its bodies forward-left-up; quaternions are xyzw. The 
 Odometry is in its child frame, the body. A mapping file's [topics] selects a topic where several
 hold the same kind of message; a pose without an odometry there replaces every odometry. Its
 `[frames] motors` gives the positions of the motors.
+
+| kind | messages |
+|---|---|
+| odometry | nav_msgs/Odometry |
+| pose | geometry_msgs/PoseStamped, PoseWithCovarianceStamped |
+| imu | sensor_msgs/Imu |
+| command | mavros_msgs/AttitudeTarget (body_rate, thrust from 0 to 1) |
+| motors | actuator_msgs/Actuators (velocity), mav_msgs/Actuators (angular_velocities) [rad/s] |
+| battery | sensor_msgs/BatteryState |
 """
 
 from __future__ import annotations

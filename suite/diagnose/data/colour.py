@@ -244,7 +244,7 @@ def _fit_by_time(
     """
 
     def score(process: _Process) -> float:
-        cost = limits.colour_gain if process.drift else 0.0
+        cost = limits.drift_gain if process.drift else 0.0
         return _likelihood(stretches, process) - cost
 
     drifts = DRIFTS if stretches.drift.any() else (0.0,)

@@ -2,11 +2,11 @@
 
 Such a log (here: inertial log) begins at rest or in hover, so its first specific force points up.
 From there the gyro is integrated to the attitude, and the specific force minus gravity to the
-velocity. The drift depends on a few parameters: tilt and velocity at the start, biases of gyro and
-accelerometer, and later changes of the tilt. Drag makes them observable, as the force across the
-thrust is opposite to the velocity (Leishman et al. 2014, doi 10.1109/MCS.2013.2287362). The drag
-coefficients, which all flights of a vehicle share, are estimated too, since the vehicle file may
-lack them. The estimate is least squares with priors.
+velocity. Yaw and horizontal position begin at 0. The drift depends on a few parameters: tilt and
+velocity at the start, biases of gyro and accelerometer, and later changes of the tilt. Drag makes
+them observable, as the force across the thrust is opposite to the velocity (Leishman et al. 2014,
+doi 10.1109/MCS.2013.2287362). The drag coefficients, which all flights of a vehicle share, are
+estimated too, since the vehicle file may lack them. The estimate is least squares with priors.
 
 In such flights the model is compared with the accelerometer, not with a derivative of the velocity.
 """

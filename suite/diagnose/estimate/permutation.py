@@ -118,7 +118,7 @@ def permutation_test(
     # Draws of the null: the gradient over the fitted and over the tested part of the windows.
     if len(fold) >= limits.few_windows:
         best = max(falls)
-        share = limits.near_share if best > limits.strong_gain else 1.0
+        share = limits.alike_share if best > limits.strong_gain else 1.0
         close = [g for g, fall in zip(groups, falls, strict=True) if fall >= share * best]
         places = sorted({column for group in close for column in group})
         change = fitted_change(hessian.sum(0), gradient.sum(0), places)

@@ -97,7 +97,7 @@ def batches(
 def slopes_along(model: Callable[..., Any]) -> Callable[..., Any]:
     """Return `model` (vehicle, theta, offset, data) with slopes along a fifth argument.
 
-    That are K directions (K, P + F): of parameters, then of nuisance parameters of every piece.
+    These are K directions (K, P + F): of parameters, then of nuisance parameters of every piece.
     """
 
     def linear(given: VehicleArrays, theta: Any, offset: Any, data: Any, directions: Any) -> Any:

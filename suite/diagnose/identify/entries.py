@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -32,51 +33,43 @@ def entries_of(driven: DrivenVehicle, fitted: Fitted, log_thrust: float = 0.0) -
     `log_thrust` is the logarithm of the scale of the thrust, from the force fit.
     """
     names = [name for name in fitted.names if name not in fitted.known]
-    entries = list[Number]()
-
-    def add(
-        key: str, unit: str, formula: Formula, needs: Sequence[str], widest: float = np.inf
-    ) -> None:
-        """Add an entry whose intervals follow from the fit's covariance.
-
-        `needs` names for each value the fitted number that must be identified. An identified value
-        whose 95 % interval has a half-width above `widest` `follows` (see `Number`).
-        """
-        values = np.atleast_1d(formula(fitted.values()))
-        # Finite differences of the formula turn the covariance of the fit into that of the values.
-        slopes = np.zeros((len(values), len(fitted.unknowns)))
-        for k, unknown in enumerate(fitted.unknowns):
-            up, down = fitted.values(), fitted.values()
-            up[unknown.name] += unknown.step
-            down[unknown.name] -= unknown.step
-            change = np.atleast_1d(formula(up)) - np.atleast_1d(formula(down))
-            slopes[:, k] = change / (2.0 * unknown.step)
-        variance = np.einsum("vi,ij,vj->v", slopes, fitted.covariance, slopes)
-        half = Z95 * np.sqrt(np.maximum(variance, 0.0))
-        known = [fitted.identifies(name) for name in needs]
-        spans = [
-            (float(v - h), float(v + h)) if is_known and h <= widest else None
-            for v, h, is_known in zip(values, half, known, strict=True)
-        ]
-        follows = any(one and span is None for one, span in zip(known, spans, strict=True))
-        entries.append(Number(key, unit, values.tolist(), spans, follows))
-
+    entries, entry = list[Number](), partial(_entry, fitted)
     # Thrust and drag.
     if "thrust" in names and driven.drive == "pwm":
-        exponent: Formula = lambda n: driven.motor_map(n).voltage_exponent  # noqa: E731
-        add("motors.thrust", "N", lambda n: driven.motor_map(n).thrust, ("thrust", "thrust"))
-        add("motors.voltage_exponent", "1", exponent, ("battery",))
+        entries = [
+            entry("motors.thrust", "N", lambda n: driven.motor_map(n).thrust, 2 * ["thrust"]),
+            entry(
+                "motors.voltage_exponent",
+                "1",
+                lambda n: driven.motor_map(n).voltage_exponent,
+                ["battery"],
+            ),
+        ]
     elif "thrust" in names and driven.drive == "rotors":
-        coefficient: Formula = lambda n: driven.vehicle(n).rotors.thrust_coefficient  # noqa: E731
-        add("rotors.thrust_coefficient", "N/(rad/s)^2", coefficient, ("thrust",))
+        one = entry(
+            "rotors.thrust_coefficient",
+            "N/(rad/s)^2",
+            lambda n: driven.vehicle(n).rotors.thrust_coefficient,
+            ["thrust"],
+        )
+        entries.append(one)
     elif "thrust" in names:
-        add("effects.thrust_scale.scale", "1", lambda n: np.exp(n["thrust"]), ("thrust",))
+        scale = entry("effects.thrust_scale.scale", "1", lambda n: np.exp(n["thrust"]), ["thrust"])
+        entries.append(scale)
     if "drag_z" in names:
-        drag: Formula = lambda n: driven.vehicle(n).effects["linear_drag"].coefficient  # noqa: E731
-        add("effects.linear_drag.coefficient", "1/s", drag, [f"drag_{axis}" for axis in "xyz"])
+        drag = entry(
+            "effects.linear_drag.coefficient",
+            "1/s",
+            lambda n: driven.vehicle(n).effects["linear_drag"].coefficient,
+            [f"drag_{axis}" for axis in "xyz"],
+        )
+        entries.append(drag)
     # Inertia and yaw torque.
     if "inertia_x" in names:
-        add("inertia", "kg m^2", lambda n: possible_inertia(driven.vehicle(n).inertia), INERTIAS)
+        inertia = entry(
+            "inertia", "kg m^2", lambda n: possible_inertia(driven.vehicle(n).inertia), INERTIAS
+        )
+        entries.append(inertia)
     if "yaw" in names:
         # Flights show the ratio of torque to inertia about z. The uncertainty of the inertia counts
         # if the inertia is identified; otherwise the inertia is held fixed.
@@ -86,18 +79,57 @@ def entries_of(driven: DrivenVehicle, fitted: Fitted, log_thrust: float = 0.0) -
             numbers = {name: n[name] for name in (*identified, "yaw")}
             return driven.vehicle({**numbers, "thrust": log_thrust}).rotors.torque_coefficient
 
-        add("rotors.torque_coefficient", "N m/(rad/s)^2", twist, ("yaw",))
+        entries.append(entry("rotors.torque_coefficient", "N m/(rad/s)^2", twist, ["yaw"]))
     # Lag, delay and gains of the rate loop.
     if "late" in names:
-        add("rotors.time_constant", "s", lambda n: n["lag"], ("lag",))
+        entries.append(entry("rotors.time_constant", "s", lambda n: n["lag"], ["lag"]))
         # `late` is the sum of lag and delay. The delay is at least as uncertain as the lag, however
         # exact the sum is. The delay in the file keeps the sum.
         widest = fitted.unknowns[fitted.index("late")].max_half_width
-        add(DELAY, "s", lambda n: n["late"] - n["lag"], ("late",), widest)
+        entries.append(entry(DELAY, "s", lambda n: n["late"] - n["lag"], ["late"], widest))
     if "gain_x" in names:
-        start, gains = np.asarray(driven.start.controller.rate_gain), [f"gain_{a}" for a in "xyz"]
-        add("controller.rate_gain", "1/s", lambda n: start * np.exp([n[g] for g in gains]), gains)
+        start, needs = np.asarray(driven.start.controller.rate_gain), [f"gain_{a}" for a in "xyz"]
+        gains = entry(
+            "controller.rate_gain",
+            "1/s",
+            lambda n: start * np.exp([n[name] for name in needs]),
+            needs,
+        )
+        entries.append(gains)
     return entries
+
+
+def _entry(
+    fitted: Fitted,
+    key: str,
+    unit: str,
+    formula: Formula,
+    needs: Sequence[str],
+    widest: float = np.inf,
+) -> Number:
+    """Return an entry whose intervals follow from the fit's covariance.
+
+    `needs` names for each value the fitted number that must be identified. An identified value
+    whose 95 % interval has a half-width above `widest` `follows` (see `Number`).
+    """
+    values = np.atleast_1d(formula(fitted.values()))
+    # Finite differences of the formula turn the covariance of the fit into that of the values.
+    slopes = np.zeros((len(values), len(fitted.unknowns)))
+    for k, unknown in enumerate(fitted.unknowns):
+        up, down = fitted.values(), fitted.values()
+        up[unknown.name] += unknown.step
+        down[unknown.name] -= unknown.step
+        change = np.atleast_1d(formula(up)) - np.atleast_1d(formula(down))
+        slopes[:, k] = change / (2.0 * unknown.step)
+    variance = np.einsum("vi,ij,vj->v", slopes, fitted.covariance, slopes)
+    half = Z95 * np.sqrt(np.maximum(variance, 0.0))
+    known = [fitted.identifies(name) for name in needs]
+    spans = [
+        (float(v - h), float(v + h)) if is_known and h <= widest else None
+        for v, h, is_known in zip(values, half, known, strict=True)
+    ]
+    follows = any(one and span is None for one, span in zip(known, spans, strict=True))
+    return Number(key, unit, values.tolist(), spans, follows)
 
 
 def with_entries(

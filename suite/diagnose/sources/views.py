@@ -253,7 +253,7 @@ def references_of(
 ) -> tuple[dict[str, ViewEvidence], RotorSpread | None, tuple[str, ...]]:
     """Return the evidence of the reference flights by view, the spread between flights, and notes.
 
-    `flights` and `evidence` are those of the other flights. A note tells of an unusable flight.
+    `flights` and `evidence` are those of the other flights. Each unusable flight has a note.
 
     Raises:
         ValueError: if less than two are usable, or their signals differ from the other flights'.

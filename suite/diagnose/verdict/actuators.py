@@ -30,6 +30,12 @@ from suite.diagnose.data.steps import has_firmware_loop, step_s, wrench_differen
 from suite.diagnose.evidence.moments import means_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
+LONGEST_LAG_S, LONGEST_DELAY_S, DELAYS_TRIED = 0.15, 0.06, 9
+"""In the fit of the rotors: longest time constant and longest delay of commands [s], and number of
+delays that are tried before the best is refined."""
+LONGEST_S = 60.0
+"""Flight time after which no more flights are compared [s]; more adds little."""
+
 
 class TestedEffect(NamedTuple):
     """An effect that a separate test named, not the search: rotor lag or random wind."""
@@ -166,7 +172,7 @@ def _mismatch(
     dt, nominal_lag, stretches = step_s(vehicle), vehicle.rotors.time_constant, list[_Stretch]()
     plant = make_plant(vehicle, dt, {})
     for log in logs:
-        if sum(int(np.ptp(one.row)) for one in stretches) * dt < 60.0:  # more adds little
+        if sum(int(np.ptp(one.row)) for one in stretches) * dt < LONGEST_S:
             stretches += _stretches(log, plant, commanded_by, limits)
     if not stretches:
         return None
@@ -189,7 +195,9 @@ def _mismatch(
     def best_lag(delay: float) -> tuple[float, float]:
         """Return the mean squared error with the best lag, and that lag [s]."""
         cost = partial(squared_error, commanded(delay))
-        best = minimize_scalar(cost, bounds=(0.0, 0.15), method="bounded", options={"xatol": 1e-4})
+        best = minimize_scalar(
+            cost, bounds=(0.0, LONGEST_LAG_S), method="bounded", options={"xatol": 1e-4}
+        )
         return min((float(best.fun), float(best.x)), (cost(0.0), 0.0))
 
     # Best delay and lag together, and the best delay for the nominal lag.
@@ -218,7 +226,7 @@ def _mismatch(
 
 def _best_delay(cost: Callable[[float], float]) -> tuple[float, float]:
     """Return the delay of the commands with the smallest `cost` [s], and that cost."""
-    grid = np.linspace(0.0, 0.06, 9)
+    grid = np.linspace(0.0, LONGEST_DELAY_S, DELAYS_TRIED)
     best_index = int(np.argmin([cost(delay) for delay in grid]))
     bounds = (grid[max(best_index - 1, 0)], grid[min(best_index + 1, len(grid) - 1)])
     options = {"xatol": 2e-4}
@@ -340,7 +348,7 @@ def find_rotor_lag(
         for mismatch in by_flight
         if mismatch is not None and mismatch.rms_fitted**2 <= unexplained * mismatch.spread**2
     ]
-    if len(mismatches) < limits.least_flights:
+    if len(mismatches) < limits.lag_least_flights:
         return None
     lags = np.array([mismatch.time_constant for mismatch in mismatches])
     half_step = 0.5 * step_s(vehicle)

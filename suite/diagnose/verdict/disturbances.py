@@ -43,6 +43,10 @@ WIDTHS = (0.03, 0.1)
 """Tested half widths of a peak, as shares of its frequency."""
 HANN_BINS = 1.5
 """Width of a spectral line after a Hann window, and of the correlation of bins [frequency bins]."""
+LEAST_MEANS, LEAST_FILLED, LEAST_FREQUENCIES = 8, 0.7, 12
+"""For a spectrum: fewest means of the view, least share of times with one, fewest frequencies."""
+UPDATES = 60
+"""Number of updates of the weights in the fit of a spectrum."""
 
 
 class Swing(NamedTuple):
@@ -113,7 +117,7 @@ def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
     centre_hz = float(frequency_hz[best])
     force_ratio, share = _peak_shares(spectra, centre_hz, [one[width, best] for one in heights])
     if (
-        p_value > limits.shape_p_value
+        p_value > limits.swing_p_value
         or share < limits.swing_share
         or force_ratio < limits.swing_driven
     ):
@@ -131,12 +135,12 @@ def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None
     `residual_b` (M, 3) is its residual force in body axes [m/s^2].
     """
     middle_s = flight.form.middle_s
-    if len(middle_s) < 8:
+    if len(middle_s) < LEAST_MEANS:
         return None
     step_s = float(np.median(np.diff(middle_s)))
     grid_index = np.round((middle_s - middle_s[0]) / step_s).astype(int)
     grid_size = int(grid_index[-1]) + 1
-    if grid_size * step_s * BAND_HZ[0] < 1.0 or len(middle_s) < 0.7 * grid_size:
+    if grid_size * step_s * BAND_HZ[0] < 1.0 or len(middle_s) < LEAST_FILLED * grid_size:
         return None
     rot_w = np.asarray(flight.rows.rot_w)[flight.form.middle_row]
     residual_w = (rot_w @ residual_b[..., None])[..., 0][:, :2]
@@ -158,7 +162,7 @@ def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None
         powers.append((np.abs(transform) ** 2).sum(axis=1))
     frequency_hz = np.fft.rfftfreq(grid_size, step_s)
     in_band = (frequency_hz >= BAND_HZ[0]) & (frequency_hz <= BAND_HZ[1])
-    if in_band.sum() < 12:
+    if in_band.sum() < LEAST_FREQUENCIES:
         return None
     residual, measured = (power[in_band] for power in powers)
     return Spectrum(frequency_hz[in_band], residual, measured, HANN_BINS / (grid_size * step_s))
@@ -167,6 +171,7 @@ def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None
 def _peak_gains(spectrum: Spectrum, centre_hz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return gains in log-likelihood by peaks, and their heights, (widths, `centre_hz`) each."""
     frequency = spectrum.frequency_hz
+    # The smooth background falls above one of these corner frequencies.
     falling = (1.0 / (1.0 + (frequency / corner_hz) ** 2) ** 2 for corner_hz in (0.2, 0.5, 1.2))
     background = np.stack([np.ones_like(frequency), frequency**2, *falling])
     without, _ = _fit_spectrum(spectrum.residual, background[None])
@@ -191,7 +196,7 @@ def _fit_spectrum(power: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np
     scale = shapes.mean(axis=2, keepdims=True)
     unit_shapes = shapes / scale
     weights = np.full(unit_shapes.shape[:2], float(power.mean()) / unit_shapes.shape[1])
-    for _ in range(60):
+    for _ in range(UPDATES):
         model = np.einsum("ct,ctj->cj", weights, unit_shapes)
         numerator = np.einsum("ctj,cj->ct", unit_shapes, power / model**2)
         weights = weights * np.sqrt(numerator / np.einsum("ctj,cj->ct", unit_shapes, 1.0 / model))
@@ -225,6 +230,7 @@ def find_turbulence(
     transmission, limits = _wind_transmission(model, theta, disturbance.knot), disturbance.limits
     if np.abs(transmission).max() < 1e-6:
         return None
+    # Length scales [m] and intensities [m/s] of the turbulence that are tried.
     lengths_m, intensities = np.geomspace(0.5, 40.0, 25), np.geomspace(0.02, 8.0, 121)
     roots = [transmission @ _wind_root(disturbance.knot, length) for length in lengths_m]
     table = np.stack([_likelihood(disturbance, root, intensities) for root in roots])

@@ -6,10 +6,13 @@ torque is the error of mean accelerations, without each flight's constant offset
 rollouts, which simulate 1 s from a measured start state, is the slow part of their errors, divided
 by the slow errors that noise alone gives; so 1 means noise only. "Slow" errors are the projections
 of a rollout's errors on Legendre polynomials of time, in which a wrong model shows more than white
-noise; the start state is free within its noise.
+noise; the start state is free within its noise. The plain errors from the measured start states are
+reported as well, in metres and so on. Their noise floor is the noise of the start states, carried
+through the rollout by the model's Jacobian.
 
-With little noise every difference is significant, even the model's numerical errors. So an effect
-is not named if the upper end of the 95 % interval of its size is below all thresholds of relevance
+The size of an effect is how much it changes these flights. With little noise every difference is
+significant, even the model's numerical errors. So an effect is not named, however small its
+p-value, if the upper end of the 95 % interval of its size is below all thresholds of relevance
 (equivalence testing; Lakens 2017, doi 10.1177/1948550617697177).
 """
 

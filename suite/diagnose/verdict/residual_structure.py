@@ -180,6 +180,7 @@ def _energy_p_value(equations: DisturbanceEquations, axis: int) -> float:
     for correlation_s in (0.3, 0.03):  # as of gusts and of rotors
         root = np.linalg.cholesky(np.exp(-np.abs(time[:, None] - time) / correlation_s))
         information, along = diagonalised(hessian, gradient, root)
+        # Directions with almost no information are left out.
         informed = information > 1e-9 * max(float(information.max()), 1e-12)
         information, along = information[informed], along[informed]
         for share in (0.9, 0.5, 0.1):  # quantiles that set the tested sizes

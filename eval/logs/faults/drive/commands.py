@@ -293,7 +293,7 @@ def _response(vehicle: Vehicle) -> float:
 
 
 def check_controller_rate(rows: Rows, wanted_hz: float | None) -> list[Finding]:
-    """Return a finding on whether commands change `wanted_hz` times a second, as the policy's."""
+    """Return a finding on whether commands change at the policy's rate `wanted_hz` [Hz]."""
     name = next((n for n in ("action", "cmd_rate", "cmd_thrust", "motor_cmd", "pwm")
                  if n in rows), None)  # fmt: skip
     if wanted_hz is None or name is None:
