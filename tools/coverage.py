@@ -30,6 +30,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+import tyro
 from scipy.signal import lfilter
 
 from eval.effects import EFFECTS
@@ -235,11 +236,17 @@ def measure(count: int, seed: int, cases: Sequence[str], out: str) -> dict[tuple
     return rows
 
 
-def main(count: int, seed: int, cases: Sequence[str], out: str) -> None:
+def main(
+    count: tyro.conf.Positional[int],
+    seed: tyro.conf.Positional[int] = 0,
+    cases: tyro.conf.Positional[str] = "",
+    out: tyro.conf.Positional[str] = "",
+) -> None:
     """Identify `count` vehicles, and print the table; the arguments are those of `measure`."""
+    names = cases.split(",") if cases else list(CASES)
     print("| log | number | estimated | covered | 95 % interval of that | half-width | pulls |")
     print("|---|---|---|---|---|---|---|")
-    measured = measure(count, seed, cases, out)
+    measured = measure(count, seed, names, out)
     for (case, key), rows in sorted(measured.items()):
         pull, width = (np.array([row[k] for row in rows]) for k in (1, 2))
         covered = int((np.abs(pull) < 1.0).sum())
@@ -249,7 +256,7 @@ def main(count: int, seed: int, cases: Sequence[str], out: str) -> None:
             f"| {100 * low:.0f} to {100 * high:.0f} % | {100 * np.median(width):.1f} % "
             f"| {pull.mean():.2f}, {np.sqrt((pull**2).mean()):.2f} |"
         )
-    print("\n" + "\n".join(counts_table(measured, cases)))
+    print("\n" + "\n".join(counts_table(measured, names)))
 
 
 def counts_table(measured: Mapping[tuple[str, str], Sequence], cases: Sequence[str]) -> list[str]:
@@ -267,5 +274,4 @@ def counts_table(measured: Mapping[tuple[str, str], Sequence], cases: Sequence[s
 
 
 if __name__ == "__main__":
-    words = sys.argv[1:] + ["0", "", ""][len(sys.argv) - 2 :]
-    main(int(words[0]), int(words[1]), words[2].split(",") if words[2] else list(CASES), words[3])
+    tyro.cli(main)

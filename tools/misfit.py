@@ -12,10 +12,10 @@ many cases an effect is named that is not there.
 from __future__ import annotations
 
 import contextlib
-import sys
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+import tyro
 
 from eval.effects import EFFECTS
 from eval.flights.follow import FlightFailed
@@ -134,7 +134,7 @@ def first_valid_draw(seed: list[int]) -> Iterator[Outcome]:
             return
 
 
-def main(count: int, seed: int) -> int:
+def main(count: tyro.conf.Positional[int], seed: tyro.conf.Positional[int] = 0) -> int:
     """Run `count` cases, one process for each core, and return the exit code."""
     outcomes = dict[int, Outcome]()
 
@@ -154,4 +154,4 @@ def main(count: int, seed: int) -> int:
 
 if __name__ == "__main__":
     one_thread_a_product()
-    raise SystemExit(main(int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0))
+    raise SystemExit(tyro.cli(main))

@@ -17,13 +17,13 @@ minutes on two cores.
 from __future__ import annotations
 
 import contextlib
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import tyro
 from scipy.stats import binomtest
 
 from eval.effects import EFFECTS
@@ -152,10 +152,12 @@ def share_line(label: str, count: int, of: int) -> str:
     return f"{label}: {count} of {of} ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
-def main() -> None:
+def main(
+    cases: tyro.conf.Positional[int] = 60,
+    seed: tyro.conf.Positional[int] = 5_600_000,
+    first: tyro.conf.Positional[int] = 0,
+) -> None:
     """Run the cases, and print a line for each and the shares."""
-    words = sys.argv[1:]
-    cases, seed, first = (int(v) for v in (*words, *("60", "5600000", "0")[len(words) :]))
     keep_compiled()
     outcomes, all_errors = Counter[str](), list[float]()
     for number, (name, truth, diagnosis) in enumerate(run(cases, seed, first), first):
@@ -177,4 +179,4 @@ def main() -> None:
 
 if __name__ == "__main__":
     with contextlib.suppress(KeyboardInterrupt):
-        main()
+        tyro.cli(main)

@@ -13,12 +13,13 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
+
+import tyro
 
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.cli import main
@@ -193,7 +194,7 @@ def crazyswarm2(logs: Path, out: Path) -> list[str]:
     return lines
 
 
-def write_page(logs: Path, out: Path) -> None:
+def write_page(logs: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path]) -> None:
     """Diagnose the flights of the three laboratories, and write the page.
 
     The flights of two laboratories are also diagnosed without their pose.
@@ -217,4 +218,4 @@ def write_page(logs: Path, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    write_page(Path(sys.argv[1]), Path(sys.argv[2]))
+    tyro.cli(write_page)

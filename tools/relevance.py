@@ -16,7 +16,6 @@ and Pearson). 60 sets take about 30 minutes on one core.
 from __future__ import annotations
 
 import contextlib
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,6 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import tyro
 from poseless import IDENTIFIABLE, hidden_values, outcome_of, share_line
 from scipy.spatial.transform import Rotation
 
@@ -139,10 +139,12 @@ def at_threshold(name: str, values: Any, vehicle: Vehicle, logs: Sequence[Flight
     return space.effects(theta)[name]
 
 
-def main() -> None:
+def main(
+    sets: tyro.conf.Positional[int] = 60,
+    seed: tyro.conf.Positional[int] = 6_100_000,
+    first: tyro.conf.Positional[int] = 0,
+) -> None:
     """Run the sets, and print a line for each and the shares."""
-    words = sys.argv[1:]
-    sets, seed, first = (int(v) for v in (*words, *("60", "6100000", "0")[len(words) :]))
     keep_compiled()
     clean, hidden_sets, named = 0, 0, 0
     for number in range(first, first + sets):
@@ -185,4 +187,4 @@ def _words(setting: Setting) -> str:
 
 if __name__ == "__main__":
     with contextlib.suppress(KeyboardInterrupt):
-        main()
+        tyro.cli(main)
