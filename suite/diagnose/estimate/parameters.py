@@ -115,7 +115,10 @@ def effects_at(layout: ParameterLayout, base: Mapping[str, Any], theta: Array) -
 
 
 def refuse_own_motion(vehicle: Vehicle) -> None:
-    """Raise a ValueError for an effect with a state of its own, such as a swinging load."""
+    """Raise a ValueError for an effect with a state of its own, such as a swinging load.
+
+    No log holds that state, so no stretch of a flight can be simulated.
+    """
     for name in vehicle.effects:
         if EFFECTS[name].start is not None:
             raise ValueError(
@@ -126,6 +129,9 @@ def refuse_own_motion(vehicle: Vehicle) -> None:
 
 def make_space(vehicle: Vehicle) -> ParameterSpace:
     """Return the space of all numbers that flights of `vehicle` can identify.
+
+    It does not contain random effects, effects with a state of their own, known constants, and
+    components that no flight shows.
 
     Raises:
         ValueError: for a vehicle whose file has an effect with a motion of its own.
