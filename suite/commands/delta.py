@@ -33,6 +33,9 @@ class Config(Command):
     """The vehicle of --model quad: a shipped name or a vehicle file (.toml)."""
     held_out: Advanced[Annotated[float, Range(0.0, 1.0, above=True, below=True)]] = 0.25
     """Share of the flights that are held out: the fit does not use them."""
+    accept: Advanced[tuple[str, ...]] = ()
+    """Continue in spite of these faults of the logs; the names are those that suite check
+    prints."""
     iterations: Iterations = 1500
     """Number of gradient steps."""
     seed: Seed = 0
@@ -58,15 +61,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     )
     recipe = with_model(named_recipe(config.recipe), config.model, config.vehicle)
     dynamics = recipe.quadrotor or recipe.physics
-    if recipe.quadrotor is not None:
-        from eval.logs.faults.vehicle import check_vehicle_name
-        from eval.logs.flight_log import flight_files, read_flights
-
-        logs, _ = read_flights(flight_files(config.flights))
-        found = [check_vehicle_name(log.about, recipe.quadrotor.vehicle) for log in logs]
-        for text in sorted({finding.evidence for notes in found for finding in notes}):
-            console.note(f"warning: {text}")
-    result = fit_delta(fitting, dynamics, config.flights, config.out, console)
+    result = fit_delta(fitting, dynamics, config.flights, config.out, console, config.accept)
     errors = plain(result.errors)
     console.say(markdown(errors_grid({"horizon_s": fitting.horizon_s, **errors})))
     console.say(f"delta: {config.out / 'delta'}")

@@ -14,6 +14,7 @@ from suite.common.console import Console, Silent
 from suite.common.curve import tensorboard
 from suite.common.options import Advanced, Command
 from suite.common.running.hosts import ProcessOptions, connect, read_member
+from suite.common.stages import first_changes
 from suite.common.startup import use_device
 from suite.train.config import TrainConfig
 from suite.train.overrides import PREFIX, check_owned, check_phases, phase_configs, with_changes
@@ -136,7 +137,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from policies.formats.policy_file import load_delta
     from policies.shipped import locate
     from suite.delta.replay import check_corrects
-    from suite.train.run import load_start_params, train
+    from suite.train.run import interface_changes, load_start_params, train
 
     resolved = resolve(config)
     params, delta = None, None
@@ -144,7 +145,14 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         # The trained policy goes to out/policy, which must not be the one to start from.
         start, trained = locate(config.init_from) / CONFIG, config.out / "policy" / CONFIG
         check_no_input(trained, [start])
-        params = load_start_params(config.init_from, phase_configs(resolved)[0].spec)
+        phases = phase_configs(resolved)
+        params = load_start_params(config.init_from, phases[0].spec)
+        if changes := interface_changes(config.init_from, phases[-1].spec):
+            console.note(
+                f"warning: the trained policy will have the inputs and the rate of the recipe "
+                f"{config.recipe}, which are not those of {config.init_from} (there): "
+                + first_changes(changes)
+            )
     if config.delta is not None:
         stored = load_delta(config.delta)
         fit = stored.config.get("fit", {})

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from eval.logs.faults.check import kept_lines
-from eval.logs.flight_log import FlightLog, flight_files, read_flights
+from eval.logs.faults.check import CheckContext
+from eval.logs.faults.checked import COMPENSATED, read_checked
+from eval.logs.flight_log import FlightLog
 from policies.formats.checkpoint import save_arrays
 from policies.formats.policy_file import DELTA
 from suite.common.console import Console
@@ -89,20 +90,22 @@ def fit_delta(
     paths: Sequence[Path],
     out: Path,
     console: Console,
+    accept: Sequence[str] = (),
 ) -> DeltaFit:
     """Fit the Delta Action Model to flight logs; write delta/, delta.json and table.md into `out`.
 
     It corrects the trainer's point mass or quadrotor, `dynamics`. Paths are logs and folders of
-    them.
+    them. The interface faults `accept` (wrong units, signs, clocks) do not stop the fit.
 
     Raises:
-        ValueError: for invalid logs.
+        ValueError: for invalid logs, and for faults that the network would learn.
     """
     refuse_other_run(out, config)
     # Read the flights, and hold some of them out.
-    logs, warnings = read_flights(flight_files(paths))
-    logs, short = long_enough(logs, config.horizon_s)
-    for warning in [*warnings, *short, *kept_lines(logs)]:
+    vehicle = dynamics.vehicle if isinstance(dynamics, QuadrotorConfig) else None
+    checked = read_checked(paths, CheckContext(vehicle), [*accept, *COMPENSATED])
+    logs, short = long_enough(checked.logs, config.horizon_s)
+    for warning in [*checked.warnings, *short]:
         console.note(f"warning: {warning}")
     groups = split(logs, config.held_out, config.seed)
     description = describe_dynamics(dynamics)
@@ -139,11 +142,12 @@ def fit_delta(
         "model": description["model"],
         "horizon_s": config.horizon_s,
         "held_out": [log.name for log in groups[1]],
-        **({"vehicle": dynamics.vehicle} if isinstance(dynamics, QuadrotorConfig) else {}),
+        **({} if vehicle is None else {"vehicle": vehicle}),
         "windows": {"fit": len(fit_windows.pos_w), "held_out": len(held_out.pos_w)},
         **result.errors,
         **({} if result.identified is None else {"identified": result.identified}),
         "curve": result.curve,
+        "findings": checked.findings,
     }
     write_run_record(out, config, config.seed)
     stored = {**plain(config), **description, "rate_hz": rate_hz}

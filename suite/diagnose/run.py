@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from eval.logs.faults.check import CheckContext, check_before_diagnosis, lines_of
-from eval.logs.flight_log import FlightLog, flight_files, read_flights
+from eval.logs.faults.check import CheckContext
+from eval.logs.faults.checked import read_checked
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console
 from suite.common.provenance import refuse_other_run, write_run_record
@@ -44,15 +44,12 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     vehicle = load_vehicle(config.vehicle)
     refuse_own_motion(vehicle)
     # Read the files, and check the logs for faults of interfaces.
-    logs, warnings = read_flights(flight_files(config.flights), partial=True)
-    before: list[FlightLog] = []
-    if config.reference:
-        before, notes = read_flights(flight_files(config.reference), partial=True)
-        warnings = [*warnings, *notes]
-    findings = check_before_diagnosis(logs, CheckContext(vehicle), config.accept, before)
-    logs, slow = without_slow_rotors(logs)
-    before, slow_before = without_slow_rotors(before)
-    warnings = [*warnings, *lines_of(findings), *slow, *slow_before]
+    flights = read_checked(
+        config.flights, CheckContext(vehicle), config.accept, config.reference, partial=True
+    )
+    logs, slow = without_slow_rotors(flights.logs)
+    before, slow_before = without_slow_rotors(flights.earlier)
+    warnings = [*flights.warnings, *slow, *slow_before]
     for warning in warnings:
         console.note(f"warning: {warning}")
     shown_count = len(warnings)
@@ -85,7 +82,7 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
         result["plan"] = write_plan(out / "plan", *trajectories_for(result))
         files |= {"plan/plan.json"} if result["plan"]["flights"] else set()
     # Write the results.
-    result["findings"] = findings
+    result["findings"] = flights.findings
     result["identified"] = is_identified(config.vehicle)
     result = {**plain(result), **stamp(SCHEMA, config.seed)}
     names = ", ".join(effect["name"] for effect in result["effects"]) or "none"

@@ -246,7 +246,8 @@ def _fit_stage(run: LoopRun, model: DeltaModel) -> Stage:
     def work(folder: Path) -> None:
         tuning = run.tuning(model.diagnosed)
         try:
-            fit_delta(fit, tuning.quadrotor or tuning.physics, [run.logs], folder, run.console)
+            dynamics = tuning.quadrotor or tuning.physics
+            fit_delta(fit, dynamics, [run.logs], folder, run.console, ACCEPTED)
         except ValueError as error:
             raise WorkFailed(
                 f"the Delta Action Model cannot be fitted to the flights in {run.logs}: {error}; "

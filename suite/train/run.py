@@ -23,7 +23,7 @@ from policies.spec import PolicySpec
 from suite.common.console import Console
 from suite.common.curve import Mirror
 from suite.common.running import hosts
-from suite.common.stages import Estimate
+from suite.common.stages import Estimate, differences
 from suite.train.config import TrainConfig
 from suite.train.overrides import check_phases, phase_configs, phase_ends
 from suite.train.shards import check_processes
@@ -68,6 +68,15 @@ def estimate(
         most_frames = max(most_frames, frames)
     floats = most_frames * (images * pixels + FLOATS_PER_UNIT * config.spec.hidden_size)
     return Estimate(seconds, PROGRAM_BYTES + floats * 4.0)  # 4 bytes a float
+
+
+def interface_changes(policy: str, spec: PolicySpec) -> list[str]:
+    """Return what differs in `spec` from the interface of a policy (as for `load_start_params`)."""
+    from policies.formats.policy_file import load_policy_checkpoint
+    from suite.judging.flying import checkpoint_folder
+
+    start = load_policy_checkpoint(checkpoint_folder(policy, "--init-from"))
+    return differences(plain(start.spec), plain(spec))
 
 
 def load_start_params(policy: str, spec: PolicySpec) -> network.Params:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from eval.logs.faults.drive.commands import (
 )
 from eval.logs.faults.drive.motor_map import check_motor_map
 from eval.logs.faults.drive.motors import check_lift, check_motors
-from eval.logs.faults.finding import Finding, findings_of, line
+from eval.logs.faults.finding import Finding, findings_of
 from eval.logs.faults.pose import Rows, check_pose
 from eval.logs.faults.position import check_height_sign, check_jumps
 from eval.logs.faults.reading import Readings, read_rows, readings_in
@@ -31,13 +30,11 @@ from eval.logs.faults.vectors import check_accelerometer, check_gyro, check_velo
 from eval.logs.faults.vehicle import (
     LIFT,
     check_camera,
-    check_same_vehicle,
     check_vehicle_name,
     check_vehicle_numbers,
 )
 from eval.logs.flight_log import FlightLog, columns_from_log, log_from_columns
 from eval.vehicles.vehicle import Vehicle
-from tracks.common.names import unknown_name
 
 LEAST_ROWS = 50
 """Least rows for any check."""
@@ -173,7 +170,7 @@ def check_log(
     checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
     findings, readings, _ = run_checks(rows_of(log), checks, against, fix)
     action = {} if log.action_b is None else {"action": log.action_b}
-    measured = {"time": log.time_s, **action, **_signals(columns_from_log(log))}
+    measured = {"time": log.time_s, **action, **signals_of(columns_from_log(log))}
     findings += check_controller_rate(measured, against.policy_hz)
     findings += [] if log.pos_w is None else check_jumps(log.time_s, log.pos_w)
     findings += check_vehicle_name(log.about, against.vehicle)
@@ -188,7 +185,7 @@ def with_fixes(log: FlightLog, readings: Readings) -> FlightLog:
     """Return a log with its signals read in another way; missing values are kept."""
     columns = columns_from_log(log)
     signals = {**GROUPS, "throttle": ("throttle",)}  # a checked column that no group has
-    rows = {"time": log.time_s, **_signals(columns, signals)}
+    rows = {"time": log.time_s, **signals_of(columns, signals)}
     filled_quat = filled(log.time_s, rows["quat"]) if "quat" in rows else None
     corrected = read_rows(
         {**rows, "quat": filled_quat} if filled_quat is not None else rows, readings
@@ -202,81 +199,6 @@ def with_fixes(log: FlightLog, readings: Readings) -> FlightLog:
             columns |= dict(zip(names, corrected[group].T, strict=True))
     columns["time"] = corrected["time"]
     return log_from_columns(columns, log.about, log.name, limits=False)
-
-
-def check_before_diagnosis(
-    logs: Sequence[FlightLog],
-    against: CheckContext,
-    accept: Sequence[str] = (),
-    earlier: Sequence[FlightLog] = (),
-) -> list[dict[str, Any]]:
-    """Return the findings of logs and files as records, before a diagnosis or identification.
-
-    Known faults that are named in `accept` are ignored. The vehicle of `earlier` flights, before a
-    change, may have another name.
-
-    Raises:
-        ValueError: for a fault that a diagnosis would attribute to a wrong effect, or two copies of
-            a flight, of which one could be held out to test the fit to the other.
-    """
-    flights = [*logs, *earlier]
-    for number, log in enumerate(flights):
-        for other in flights[:number]:
-            if _is_copy(log, other):
-                raise ValueError(f"{other.name} and {log.name} are the same flight: give it once")
-    unknown = [fault for fault in accept if fault not in FAULTS]
-    if unknown:
-        raise unknown_name("fault", unknown[0], list(FAULTS))
-    found: list[tuple[Finding, str | None]] = [(f, None) for f in check_files(against)]
-    for log in flights:
-        found += [(finding, log.name) for finding in check_log(log, against)[0]]
-    found += [*check_same_vehicle(logs), *check_same_vehicle(earlier)]
-    stops = [(f, name) for f, name in found if f.is_open and f.fault not in accept]
-    if stops:
-        lines = [f"{name or 'the vehicle file'}: {line(f)}" for f, name in stops]
-        faults = " ".join(sorted({f.fault for f, _ in stops}))
-        raise ValueError(
-            "\n".join(["an effect named from these flights would be wrong:", *lines])
-            + f"\ncorrect it, or continue anyway with --accept {faults}"
-        )
-    return [{**f._asdict(), "flight": name} for f, name in found if f.status != "ok"]
-
-
-def _is_copy(log: FlightLog, other: FlightLog) -> bool:
-    """Return whether two logs have the same rows: equal times and equal values of all signals."""
-
-    def is_same(ours: np.ndarray, theirs: np.ndarray) -> bool:
-        """Return whether the values are equal, but for the rounding of a CSV file."""
-        return np.allclose(ours, theirs, rtol=0.0, atol=1e-5, equal_nan=True)
-
-    # Most pairs of flights have other times, so their signals are not compared.
-    if log.time_s.shape != other.time_s.shape or not is_same(log.time_s, other.time_s):
-        return False
-    ours, theirs = (_signals(columns_from_log(one)) for one in (log, other))
-    return ours.keys() == theirs.keys() and all(is_same(ours[k], theirs[k]) for k in ours)
-
-
-def lines_of(records: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return lines of text for the records with a fault and status doubt or note.
-
-    A report prints them as warnings.
-    """
-    return [
-        f"{record['flight'] or 'vehicle file'}: {record['fault']}: {record['evidence']}"
-        for record in records
-        if record["fault"] and record["status"] in ("doubt", "note")
-    ]
-
-
-def kept_lines(logs: Sequence[FlightLog]) -> list[str]:
-    """Return lines of text for the open findings that the metadata of logs show.
-
-    They are kept there, or the logs are of several vehicles. A command that does not check the logs
-    prints them as warnings.
-    """
-    found = [(finding, log.name) for log in logs for finding in findings_of(log.about)]
-    found += check_same_vehicle(logs)
-    return [f"{name}: {line(finding)}" for finding, name in found if finding.is_open]
 
 
 def check_files(against: CheckContext) -> list[Finding]:
@@ -299,7 +221,7 @@ def rows_of(log: FlightLog) -> dict[str, np.ndarray]:
     Missing values of slower signals are interpolated linearly.
     """
     columns, rows = columns_from_log(log), {"time": log.time_s}
-    for group, value in _signals(columns).items():
+    for group, value in signals_of(columns).items():
         if np.isfinite(value).all(axis=1).sum() > LEAST_ROWS:
             rows[group] = filled(log.time_s, value)
     for name in ("throttle", "baro"):
@@ -321,7 +243,7 @@ def filled(time_s: np.ndarray, value: np.ndarray) -> np.ndarray:
     return result
 
 
-def _signals(
+def signals_of(
     columns: Mapping[str, np.ndarray], groups: Mapping[str, Sequence[str]] = GROUPS
 ) -> dict[str, np.ndarray]:
     """Return the signals (T, C) of a log's columns, by name; NaN where a row lacks them."""

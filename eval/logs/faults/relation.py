@@ -164,9 +164,12 @@ def forward_mean(value: np.ndarray, count: int) -> np.ndarray:
 
 
 def shift_rows(values: np.ndarray, count: int) -> np.ndarray:
-    """Return `values` (T, C) moved to `count` rows later; NaN before the first."""
+    """Return `values` (T, C) moved to `count` rows later; NaN before the first.
+
+    `count` may exceed T, as in a log with bursts of rows, whose median step is short.
+    """
     moved = np.full_like(values, np.nan)
-    moved[count:] = values[: len(values) - count]
+    moved[count:] = values[: max(0, len(values) - count)]
     return moved
 
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from eval.logs.faults.check import CheckContext, check_before_diagnosis, lines_of
-from eval.logs.flight_log import flight_files, read_flights
+from eval.logs.faults.check import CheckContext
+from eval.logs.faults.checked import COMPENSATED, read_checked
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console
 from suite.common.provenance import stamp
@@ -19,8 +19,6 @@ from suite.diagnose.identify.numbers import number_lines, numbers_json
 
 SCHEMA = 1
 """Version of the JSON that `suite identify` prints."""
-ESTIMATED = ("motor_map", "battery_scaling")
-"""Faults of a vehicle file that an identification repairs, so it does not refuse them."""
 MADE_BY = "by suite identify"
 """Mark in the first line of a vehicle file that this command wrote."""
 
@@ -52,10 +50,9 @@ def identify_files(
     # Read the files, and check the logs for faults of interfaces.
     start = load_vehicle(vehicle)
     refuse_own_motion(start)
-    logs, warnings = read_flights(flight_files(flights), partial=True)
-    findings = check_before_diagnosis(logs, CheckContext(start), [*accept, *ESTIMATED])
-    logs, slow = without_slow_rotors(logs)
-    warnings = [*warnings, *lines_of(findings), *slow]
+    checked = read_checked(flights, CheckContext(start), [*accept, *COMPENSATED], partial=True)
+    logs, slow = without_slow_rotors(checked.logs)
+    warnings = [*checked.warnings, *slow]
     console.say(f"{_counted(len(logs))}, {sum(log.duration_s for log in logs):.0f} s in all")
     if unmodelled := unmodelled_effects(start):
         warnings.append(
@@ -80,7 +77,7 @@ def identify_files(
         "not_identified": list(identified.not_identified),
         "left": identified.residual_rms,
         "flights": list(identified.flights),
-        "findings": findings,
+        "findings": checked.findings,
         "warnings": [*warnings, *identified.notes],
         **stamp(SCHEMA, None),
     }

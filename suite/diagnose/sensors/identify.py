@@ -14,8 +14,10 @@ import numpy as np
 
 from eval.judging.statistics import Interval
 from eval.logs.columns import FlightLogError
-from eval.logs.faults.check import kept_lines
-from eval.logs.flight_log import FlightLog, flight_files, read_flights
+from eval.logs.faults.catalogue import FAULTS
+from eval.logs.faults.check import CheckContext
+from eval.logs.faults.checked import read_checked
+from eval.logs.flight_log import FlightLog
 from eval.sensors import SENSORS
 from eval.sensors.measured_state import AXES, GROUPS
 from eval.sensors.sensors_file import save_sensors, sensor_set
@@ -168,7 +170,7 @@ def parameters_of(fitted: Fitted) -> dict[str, tuple[Interval, str]]:
 def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> dict[str, Any]:
     """Fit a sensors model to the estimates in flight logs, and write its file.
 
-    A log without an estimate gives a warning.
+    A log without an estimate gives a warning, as does each fault that the checks of a log find.
 
     Returns:
         The JSON object that `--json` prints.
@@ -177,9 +179,9 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
         ValueError: if no log has both an estimate and a reference, or no axis has enough data.
     """
     # Read the logs, and leave out those that have no estimate or no reference.
-    logs, warnings = read_flights(flight_files(flights), partial=True)
+    checked = read_checked(flights, CheckContext(), list(FAULTS), partial=True)
     used, seconds, refused = [], 0.0, []
-    for log in logs:
+    for log in checked.logs:
         try:
             errors = errors_of(log)
             used.append(log)
@@ -188,7 +190,7 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
             refused.append(str(error))
     if not used:
         raise ValueError("no flight can be used:\n" + "\n".join(refused))
-    warnings += [*kept_lines(used), *(f"not used: {text}" for text in refused)]
+    warnings = [*checked.warnings, *(f"not used: {text}" for text in refused)]
     console.say(f"{len(used)} flights with an estimate and a reference, {seconds:.0f} s in all")
     # Move each reference to the gyro's clock, fit, and check on held-out flights.
     clocks = [clock_of(log) for log in used]
@@ -198,7 +200,7 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
         if clock.shift_s.any()
     }
     used = [on_gyro_clock(log, clock) for log, clock in zip(used, clocks, strict=True)]
-    fitted, checked = fit_sensors(used), held_out(used)
+    fitted, compared = fit_sensors(used), held_out(used)
     if not fitted.axes:
         raise ValueError(
             "no axis of the estimate has two stretches of 5 s without a hole; fly longer, or log "
@@ -226,10 +228,11 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
         "sensors": str(out),
         "parameters": numbers_json(numbers),
         "held_out": {
-            axis: {**compared._asdict(), "fits": compared.fits, "within": WITHIN}
-            for axis, compared in checked.items()
+            axis: {**one._asdict(), "fits": one.fits, "within": WITHIN}
+            for axis, one in compared.items()
         },
         "clock_s": clocks_s,
+        "findings": checked.findings,
         "flights": [log.name for log in used],
         "warnings": warnings,
         **stamp(SCHEMA, None),

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from eval.importers import import_log
-from eval.logs.faults.check import CheckContext, check_before_diagnosis
+from eval.logs.faults.check import CheckContext
+from eval.logs.faults.checked import check_flights
 from suite.experiments.injected.flights import flight_signals
 from suite.experiments.injected.kinds import KINDS, inject
 from suite.experiments.injected.writers import write_table
@@ -82,7 +83,7 @@ def same(one, other):
 def refused_by(log, vehicle=PLAIN):
     """The faults for which a diagnosis refuses a log."""
     try:
-        check_before_diagnosis([log], CheckContext(vehicle))
+        check_flights([log], CheckContext(vehicle))
     except ValueError as error:
         return set(str(error).splitlines()[-1].partition("--accept ")[2].split())
     return set()

@@ -112,6 +112,12 @@ def test_training_goes_on_from_a_policy_by_its_name_and_does_not_write_over_it(
     first = "phases.1.spec.rate_hz=20"
     run(f"train --init-from race --set {first} --out", tmp_path / "run")
     assert rates == [20.0], "of the first phase"
+    assert "will have" not in capsys.readouterr().err
+    # The default recipe would give this policy more inputs, and train it through a quadrotor.
+    run("train --init-from race-paper --out", tmp_path / "run")
+    said = capsys.readouterr().err
+    assert "will have the inputs and the rate of the recipe race" in said
+    assert "second_gate is False there, True here" in said
     own = shutil.copytree(shipped.locate("race-paper"), tmp_path / "policy")
     said = refused(capsys, "train --out", tmp_path, "--init-from", own)
     assert "config.json is also an input and would be overwritten" in said

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 
+from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.finding import Finding
 from eval.logs.flight_log import flight_files, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -64,7 +65,10 @@ def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(tmp_path, monke
     console, shown = Console(), []
     told = nullcontext(lambda *words: shown.append(words))
     monkeypatch.setattr(console, "progress", lambda *_: told)
-    result = fit_delta(CONFIG, PHYSICS, [tmp_path], tmp_path / "out", console)
+    accept = ["thrust_command_unit"]  # the thrust commands are only there because a log needs some
+    result = fit_delta(CONFIG, PHYSICS, [tmp_path], tmp_path / "out", console, accept)
+    kept = json.loads((tmp_path / "out" / "delta.json").read_text())["findings"]
+    assert accept[0] in [one["fault"] for one in kept]
     without, identified, with_delta = result.errors.values()
     assert result.identified is not None and without.position_m > 0.1
     assert with_delta.position_m < 0.3 * without.position_m
@@ -135,9 +139,7 @@ SLOWER = QuadrotorConfig(replace(with_lag(QUAD.vehicle, 0.05), name="other"))
     [(PHYSICS, "action_y"), (PHYSICS, "decisions"), (QUAD, "policy_step"), (QUAD, "cmd_thrust")],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_flights_without_what_a_fit_needs_are_refused(tmp_path, dynamics, missing, capsys):
-    doubt = Finding("doubt", "motors", "6 motors turn", "motor_count", 6.0, 0.97, "none")
-    kept = {"findings": [doubt._asdict()]}
+def test_flights_without_what_a_fit_needs_are_refused(tmp_path, dynamics, missing):
     for i, log in enumerate(fly(nominal_model(PHYSICS), 2, seconds=1.5)):
         extra = {name: column for name, column in log.extra.items() if name != missing}
         if missing == "decisions":
@@ -145,13 +147,22 @@ def test_flights_without_what_a_fit_needs_are_refused(tmp_path, dynamics, missin
         given = {"thrust_cmd": np.full_like(log.time_s, 9.81), "rate_cmd_b": log.rate_b}
         if missing == "cmd_thrust":
             given = {"rotor_speed": np.full((len(log.time_s), 4), 900.0)}
-        about = {**kept, "vehicle": f"drone {i}"}
-        write_flight(tmp_path / f"{i}.parquet", replace(log, extra=extra, about=about, **given))
+        write_flight(tmp_path / f"{i}.parquet", replace(log, extra=extra, **given))
     with pytest.raises(ValueError, match=r"record (longer )?flights with suite collect"):
-        fit_delta(FitConfig(), dynamics, [tmp_path], tmp_path / "out", Console())
-    # A log that an earlier step does not refuse repeats the open findings of its import.
-    said = capsys.readouterr().err
-    assert missing != "cmd_thrust" or ("6 motors turn" in said and "vehicle_mixed" in said)
+        fit_delta(FitConfig(), dynamics, [tmp_path], tmp_path / "out", Console(), list(FAULTS))
+
+
+def test_a_fault_that_the_network_would_learn_stops_the_fit(tmp_path, capsys):
+    """It is found in the log, or was by its import."""
+    doubt = Finding("doubt", "motors", "6 motors turn", "motor_count", 6.0, 0.97, "none")
+    for i, log in enumerate(fly(nominal_model(PHYSICS), 2, seconds=1.5)):
+        pos_w = log.pos_w * [1.0, -1.0, 1.0]
+        given = {"thrust_cmd": np.full_like(log.time_s, 9.81), "rate_cmd_b": log.rate_b}
+        about = {"findings": [doubt._asdict()] if i else [], "vehicle": f"drone {i}"}
+        write_flight(tmp_path / f"{i}.parquet", replace(log, pos_w=pos_w, about=about, **given))
+    with pytest.raises(ValueError, match="would be wrong") as error:
+        fit_delta(FitConfig(), PHYSICS, [tmp_path], tmp_path / "out", Console())
+    assert "--accept motor_count position_axes" in str(error.value), str(error.value)
 
 
 def test_flights_of_another_vehicle_than_the_corrected_one_warn(tmp_path, capsys, monkeypatch):
@@ -160,12 +171,13 @@ def test_flights_of_another_vehicle_than_the_corrected_one_warn(tmp_path, capsys
         about = {"vehicle": "reference"}
         write_flight(tmp_path / f"{i}.parquet", replace(log, about=about, **given))
 
-    def fit(*_):
+    def cut(*_):
         raise WorkFailed("far enough")
 
-    monkeypatch.setattr("suite.delta.run.fit_delta", fit)
+    monkeypatch.setattr("suite.delta.quadrotor.cut_quadrotor_windows", cut)
+    command = f"delta {tmp_path} --model quad --out {tmp_path / 'out'} --accept {' '.join(FAULTS)}"
     for vehicle, warns in (("crazyflie21", True), ("reference", False)):
-        assert run(f"delta {tmp_path} --model quad --vehicle {vehicle}") == 1
+        assert run(f"{command} --vehicle {vehicle}") == 1
         said = capsys.readouterr().err
         assert ("the log names the vehicle 'reference'" in said and vehicle in said) == warns
 

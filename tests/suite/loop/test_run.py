@@ -16,7 +16,8 @@ import pytest
 from eval.effects.body import ComOffset, MassOffset, TorqueTrim
 from eval.judging.results import read_trials
 from eval.logs.faults.catalogue import FAULTS
-from eval.logs.faults.check import CheckContext, check_before_diagnosis
+from eval.logs.faults.check import CheckContext
+from eval.logs.faults.checked import check_flights
 from eval.logs.flight_log import flight_files, read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import with_effects
@@ -276,8 +277,8 @@ def test_a_heavy_load_is_diagnosed_although_it_resembles_wrong_units():
         heavy = with_effects(PLAIN, {"mass_offset": MassOffset(load_kg)})
         log, given = fly(heavy, 0, duration_s=3.0, motors=True), CheckContext(PLAIN)
         with pytest.raises(ValueError, match="continue anyway with --accept motor_poles"):
-            check_before_diagnosis([log], given)
-        check_before_diagnosis([log], given, work.ACCEPTED)
+            check_flights([log], given)
+        check_flights([log], given, work.ACCEPTED)
 
 
 def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root, tmp_path):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from eval.logs.faults.catalogue import FAULTS
-from eval.logs.faults.check import CheckContext, check_before_diagnosis, check_log, kept_lines
+from eval.logs.faults.check import CheckContext, check_log
+from eval.logs.faults.checked import check_flights, lines_of
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.position import check_jumps
 from eval.logs.faults.reading import parse_readings, read_rows
@@ -47,10 +48,18 @@ def test_a_copy_of_a_flight_is_refused(tmp_path):
     log = fly(PLAIN, 0, duration_s=3.0)
     rounded = replace(log, name="copy", rate_b=np.round(log.rate_b, 6))
     with pytest.raises(ValueError, match=f"{log.name} and copy are the same flight"):
-        check_before_diagnosis([log, fly(PLAIN, 1, duration_s=3.0), rounded], CheckContext())
+        check_flights([log, fly(PLAIN, 1, duration_s=3.0), rounded], CheckContext())
     unknown = replace(log, rate_b=np.full_like(log.rate_b, np.nan))
     moved = replace(unknown, pos_w=log.pos_w + [0.0, 0.0, 1.0])
-    check_before_diagnosis([log, unknown, moved], CheckContext(), list(FAULTS))
+    check_flights([log, unknown, moved], CheckContext(), list(FAULTS))
+
+
+def test_a_log_in_bursts_of_rows_is_checked():
+    """Its median step is far below the mean one, so a delay in rows may exceed the log."""
+    log = fly(PLAIN, 0, duration_s=3.0)
+    burst_s = np.repeat(log.time_s[::2], 2)[: len(log.time_s)]
+    burst_s[1::2] += 1e-3
+    check_log(replace(log, time_s=burst_s), CheckContext(PLAIN))
 
 
 def test_logs_of_two_vehicles_are_refused_and_a_log_without_a_name_is_not():
@@ -60,16 +69,16 @@ def test_logs_of_two_vehicles_are_refused_and_a_log_without_a_name_is_not():
         for k, log in enumerate(flights)
     ]
     with pytest.raises(ValueError, match="of vehicle 'other'; 2 of 3 logs are of 'mine'") as error:
-        check_before_diagnosis(logs, CheckContext())
+        check_flights(logs, CheckContext())
     assert logs[2].name in str(error.value) and "--accept vehicle_mixed" in str(error.value)
-    records = check_before_diagnosis(logs, CheckContext(), ["vehicle_mixed"])
+    records = check_flights(logs, CheckContext(), ["vehicle_mixed"])
     assert [r["flight"] for r in records if r["fault"] == "vehicle_mixed"] == [logs[2].name]
-    # Commands that do not check the logs, such as `suite identify --sensors`, warn.
-    (warning,) = kept_lines(logs)
+    # Commands that accept a fault, such as `suite identify --sensors`, warn.
+    (warning,) = lines_of([r for r in records if r["fault"] == "vehicle_mixed"])
     assert warning.startswith(logs[2].name) and "vehicle 'other'" in warning
-    check_before_diagnosis([*logs[:2], replace(logs[2], about={})], CheckContext())
+    check_flights([*logs[:2], replace(logs[2], about={})], CheckContext())
     # Flights before a change may be of a vehicle file with another name.
-    check_before_diagnosis(logs[:2], CheckContext(), earlier=logs[2:])
+    check_flights(logs[:2], CheckContext(), earlier=logs[2:])
 
 
 @pytest.mark.parametrize(
