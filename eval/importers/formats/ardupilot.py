@@ -36,7 +36,7 @@ from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError, quoted
 from eval.logs.faults.drive.motors import check_count
-from eval.logs.faults.finding import Finding
+from eval.logs.faults.finding import CUT, Finding
 
 SUMMARY = "ArduPilot log (.bin)"
 TAKES_MAP = TAKES_SOURCE = False
@@ -80,8 +80,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
     Raises:
         FlightLogError: where the reader is not installed, or the file is not an ArduPilot log.
     """
-    messages, parameters, about = _load(path)
-    findings: list[Finding] = []
+    messages, parameters, about, findings = _load(path)
     parts: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def take(name: str, kinds: tuple[str, ...], columns: str, factor: Any) -> None:
@@ -131,8 +130,8 @@ def read(path: Path, options: ImportOptions) -> Recording:
     )
 
 
-def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]]:
-    """Return columns by message, parameters, and the log's metadata."""
+def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str], list[Finding]]:
+    """Return columns by message, parameters, the log's metadata, and findings about the file."""
     try:
         from pymavlink.DFReader import DFReader_binary
     except ImportError:
@@ -162,6 +161,7 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
             reader.__init__(str(path))
             while (message := reader.recv_match(type=list(MESSAGES))) is not None:
                 table[message.get_type()].append(message.to_dict())
+            findings = [Finding("note", "file", CUT)] if _is_cut(reader) else []
         parameters = {str(row["Name"]): float(row["Value"]) for row in table.pop("PARM")}
         texts = [str(row["Message"]) for row in table.pop("MSG")]
         messages = {name: _columns(rows, name) for name, rows in table.items() if rows}
@@ -169,7 +169,14 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
         reason = f"an ArduPilot log that cannot be read ({quoted(error)})"
         raise FlightLogError(str(path), None, None, reason) from None
     parameters = {name: value for name, value in parameters.items() if np.isfinite(value)}
-    return messages, parameters, {"firmware": texts[0]} if texts else {}
+    return messages, parameters, {"firmware": texts[0]} if texts else {}, findings
+
+
+def _is_cut(reader: Any) -> bool:
+    """Return whether the file ends within a message, or within its first three bytes."""
+    kinds = (kind for kind in reader.formats if len(reader.offsets[kind]))
+    end = max(reader.offsets[kind][-1] + reader.formats[kind].len for kind in kinds)
+    return end > reader.data_len or 0 < reader.data_len - end < 3
 
 
 @contextlib.contextmanager

@@ -20,7 +20,7 @@ from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError, quoted
 from eval.logs.faults.drive.motors import check_count
-from eval.logs.faults.finding import Finding
+from eval.logs.faults.finding import CUT, Finding
 from eval.logs.faults.sensors import check_voltage_fails
 from eval.logs.files import read_head
 from tracks.input.ranges import is_number
@@ -303,8 +303,7 @@ def _check_file(log: Any) -> list[Finding]:
     """Return findings on damage, dropouts and the thrust model's parameter."""
     findings = []
     if log.is_cut:
-        text = "it ends within a message: the rest of the flight may be missing"
-        findings.append(Finding("note", "file", text))
+        findings.append(Finding("note", "file", CUT))
     if log.file_corruption:
         findings.append(Finding("doubt", "file", "damaged in places; undamaged messages were read"))
     if log.dropouts:

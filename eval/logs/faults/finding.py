@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 STATUSES = ("corrected", "doubt", "not identifiable", "note", "ok")
 """All statuses of a finding, the most serious first; `Finding.status` defines them."""
+CUT = "it ends within a message: the rest of the flight may be missing"
+"""Evidence of a note about a file that was cut off."""
 SURE = 0.9
 """A doubt with at least this confidence is open: a diagnosis refuses its log."""
 

@@ -52,12 +52,15 @@ def test_a_message_without_a_length_is_no_circle(tmp_path, monkeypatch):
         import_log(path)
 
 
-def test_a_ulog_that_ends_within_a_message_has_a_note(tmp_path):
-    path = made.write_ulog(tmp_path / "log.ulg", span=(0, 4))
-    for data, is_cut in ((path.read_bytes(), False), (path.read_bytes()[:-5], True)):
-        path.write_bytes(data)
-        _, findings = import_log(path, None, FULL)
-        assert ("it ends within a message" in text(findings, "file")) == is_cut
+def test_a_log_that_ends_within_a_message_has_a_note(tmp_path):
+    ulog = made.write_ulog(tmp_path / "log.ulg", span=(0, 4))
+    flown = known_flight.fly(np.arange(0.0, 4.0, 0.01))
+    for path in (ulog, raw_logs.write_bin(tmp_path / "log.bin", flown, True)):
+        whole = path.read_bytes()
+        for data, is_cut in ((whole, False), (whole[:-5], True), (whole[:-50], True)):
+            path.write_bytes(data)
+            _, findings = import_log(path, None, FULL)
+            assert ("it ends within a message" in text(findings, "file")) == is_cut
 
 
 def test_dropouts_are_counted_and_their_time_is_in_seconds():
