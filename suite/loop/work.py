@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from eval.judging.results import read_trials
+from eval.logs.faults.catalogue import FAULTS
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies.formats.policy_file import load_delta
 from suite.common.console import Console, Quiet
@@ -247,7 +248,8 @@ def _fit_stage(run: LoopRun, model: DeltaModel) -> Stage:
         tuning = run.tuning(model.diagnosed)
         try:
             dynamics = tuning.quadrotor or tuning.physics
-            fit_delta(fit, dynamics, [run.logs], folder, run.console, ACCEPTED)
+            # The suite itself wrote these logs, so no finding is a wrong unit or sign.
+            fit_delta(fit, dynamics, [run.logs], folder, run.console, tuple(FAULTS))
         except ValueError as error:
             raise WorkFailed(
                 f"the Delta Action Model cannot be fitted to the flights in {run.logs}: {error}; "

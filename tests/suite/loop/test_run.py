@@ -184,7 +184,7 @@ class Stub(Small):
         (out / "report.html").write_text("<p>diagnosis</p>")
         (out / "diagnosis.json").write_text(json.dumps(answer(self.effects)))
 
-    def fit(self, config, quad, paths, out, console):
+    def fit(self, config, quad, paths, out, console, accept):
         self.fitted.append((quad.vehicle, sorted(path.name for path in flight_files(paths))))
         params = delta_network.init(jax.random.key(0))
         shift = 0.01 if "com_offset" in quad.vehicle.effects else 0.02
