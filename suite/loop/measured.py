@@ -49,6 +49,8 @@ def add_measurement_noise(flights: Path, out: Path, seed: int) -> list[Path]:
         log = read_flights([flights / row["file"]])[0][0]
         has_contact = row["ended_by"] not in ("finished", "timeout")
         log = noisy(cut_end(log, CONTACT_MARGIN_S if has_contact else 0.0), rng)
+        # The diagnosis would warn that the hidden vehicle has another name than the simulation's.
+        log = replace(log, about={k: v for k, v in log.about.items() if k != "vehicle"})
         if log.duration_s < SHORTEST_S:
             continue
         write_flight(out / row["file"], log)

@@ -252,10 +252,12 @@ def test_crashed_flights_lose_their_end_and_short_ones_are_left_out(logs, tmp_pa
     # The last is too short to be used.
     flown = (*logs[:2], measured.cut_end(logs[2], logs[2].duration_s - 1.2))
     for log, ended_by in zip(flown, ("collision", "timeout", "finished"), strict=True):
-        file = write_flight(flights / f"{ended_by}.parquet", log)
+        about = {**log.about, "vehicle": "hidden"}
+        file = write_flight(flights / f"{ended_by}.parquet", replace(log, about=about))
         rows.append({**rows[0], "file": file.name, "ended_by": ended_by})
     (flights / "flights.json").write_text(json.dumps({"flights": rows}))
     files = measured.add_measurement_noise(flights, out, 0)
+    assert all("vehicle" not in log.about for log in read_flights(files)[0]), "it is hidden"
     assert [file.name for file in files] == ["collision.parquet", "timeout.parquet"]
     cut, whole = read_flights(files)[0]
     lost_s = logs[0].duration_s - cut.duration_s
