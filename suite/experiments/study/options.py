@@ -45,7 +45,7 @@ class JudgingOptions:
 class FourGateOptions:
     """Options of the experiments that train on tracks of four gates."""
 
-    recipe: str = "race-paper"
+    recipe: str = "quick"
     """The recipe of all trainings, except for its size, its gates and the compared settings."""
     set: tuple[str, ...] = ("episode.image_stride=3",)
     """Change settings of the recipe by name."""
@@ -113,7 +113,7 @@ def four_gate_recipe(config: FourGateOptions) -> TrainConfig:
     if base.phases:
         raise ValueError(
             f"--recipe {config.recipe} has {len(base.phases)} phases, allowed is a recipe without, "
-            "such as race-paper: PPO has none, and the steps of a page are of one length"
+            "such as quick: PPO has none, and the steps of a page are of one length"
         )
     base = replace(base, episode=replace(base.episode, gates=GATES, batch=config.worlds))
     check_phases(base)
