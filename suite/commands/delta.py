@@ -50,6 +50,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for an unknown recipe or logs that cannot be used.
     """
+    from eval.logs.faults.check import CheckContext
+    from eval.logs.faults.checked import COMPENSATED, read_checked
     from suite.delta.fit import FitConfig
     from suite.delta.run import errors_grid, fit_delta
     from suite.train.recipes import named_recipe, with_model
@@ -61,7 +63,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     )
     recipe = with_model(named_recipe(config.recipe), config.model, config.vehicle)
     dynamics = recipe.quadrotor or recipe.physics
-    result = fit_delta(fitting, dynamics, config.flights, config.out, console, config.accept)
+    context = CheckContext(recipe.quadrotor.vehicle if recipe.quadrotor else None)
+    flights = read_checked(config.flights, context, [*config.accept, *COMPENSATED])
+    result = fit_delta(fitting, dynamics, flights, config.out, console)
     errors = plain(result.errors)
     console.say(markdown(errors_grid({"horizon_s": fitting.horizon_s, **errors})))
     console.say(f"delta: {config.out / 'delta'}")

@@ -14,7 +14,7 @@ from suite.common.console import Console, Silent
 from suite.common.curve import tensorboard
 from suite.common.options import Advanced, Command
 from suite.common.running.hosts import ProcessOptions, connect, read_member
-from suite.common.stages import first_changes
+from suite.common.stages import differences, first_changes
 from suite.common.startup import use_device
 from suite.train.config import TrainConfig
 from suite.train.overrides import PREFIX, check_owned, check_phases, phase_configs, with_changes
@@ -134,20 +134,20 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     import jax
 
     from policies.formats.checkpoint import CONFIG
-    from policies.formats.policy_file import load_delta
-    from policies.shipped import locate
+    from policies.formats.policy_file import load_delta, load_policy_checkpoint
     from suite.delta.replay import check_corrects
-    from suite.train.run import interface_changes, load_start_params, train
+    from suite.judging.flying import checkpoint_folder
+    from suite.train.run import start_params, train
 
     resolved = resolve(config)
     params, delta = None, None
     if config.init_from is not None:
         # The trained policy goes to out/policy, which must not be the one to start from.
-        start, trained = locate(config.init_from) / CONFIG, config.out / "policy" / CONFIG
-        check_no_input(trained, [start])
-        phases = phase_configs(resolved)
-        params = load_start_params(config.init_from, phases[0].spec)
-        if changes := interface_changes(config.init_from, phases[-1].spec):
+        folder, phases = checkpoint_folder(config.init_from, "--init-from"), phase_configs(resolved)
+        check_no_input(config.out / "policy" / CONFIG, [folder / CONFIG])
+        start = load_policy_checkpoint(folder)
+        params = start_params(start, phases[0].spec)
+        if changes := differences(plain(start.spec), plain(phases[-1].spec)):
             console.note(
                 f"warning: the trained policy will have the inputs and the rate of the recipe "
                 f"{config.recipe}, which are not those of {config.init_from} (there): "

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from eval.logs.faults.check import CheckContext
-from eval.logs.faults.checked import COMPENSATED, read_checked
+from eval.logs.faults.checked import CheckedFlights
 from eval.logs.flight_log import FlightLog
 from policies.formats.checkpoint import save_arrays
 from policies.formats.policy_file import DELTA
@@ -87,25 +86,21 @@ def long_enough(logs: Sequence[FlightLog], horizon_s: float) -> tuple[list[Fligh
 def fit_delta(
     config: FitConfig,
     dynamics: PointMassConfig | QuadrotorConfig,
-    paths: Sequence[Path],
+    flights: CheckedFlights,
     out: Path,
     console: Console,
-    accept: Sequence[str] = (),
 ) -> DeltaFit:
     """Fit the Delta Action Model to flight logs; write delta/, delta.json and table.md into `out`.
 
-    It corrects the trainer's point mass or quadrotor, `dynamics`. Paths are logs and folders of
-    them. The interface faults `accept` (wrong units, signs, clocks) do not stop the fit.
+    It corrects the trainer's point mass or quadrotor, `dynamics`.
 
     Raises:
-        ValueError: for invalid logs, and for faults that the network would learn.
+        ValueError: for flights that are too few or too short, or lack a column.
     """
     refuse_other_run(out, config)
-    # Read the flights, and hold some of them out.
-    vehicle = dynamics.vehicle if isinstance(dynamics, QuadrotorConfig) else None
-    checked = read_checked(paths, CheckContext(vehicle), [*accept, *COMPENSATED])
-    logs, short = long_enough(checked.logs, config.horizon_s)
-    for warning in [*checked.warnings, *short]:
+    # Hold some of the flights out.
+    logs, short = long_enough(flights.logs, config.horizon_s)
+    for warning in [*flights.warnings, *short]:
         console.note(f"warning: {warning}")
     groups = split(logs, config.held_out, config.seed)
     description = describe_dynamics(dynamics)
@@ -142,12 +137,12 @@ def fit_delta(
         "model": description["model"],
         "horizon_s": config.horizon_s,
         "held_out": [log.name for log in groups[1]],
-        **({} if vehicle is None else {"vehicle": vehicle}),
+        **({"vehicle": dynamics.vehicle} if isinstance(dynamics, QuadrotorConfig) else {}),
         "windows": {"fit": len(fit_windows.pos_w), "held_out": len(held_out.pos_w)},
         **result.errors,
         **({} if result.identified is None else {"identified": result.identified}),
         "curve": result.curve,
-        "findings": checked.findings,
+        "findings": flights.findings,
     }
     write_run_record(out, config, config.seed)
     stored = {**plain(config), **description, "rate_hz": rate_hz}

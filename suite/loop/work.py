@@ -17,9 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from eval.judging.results import read_trials
-from eval.logs.faults.catalogue import FAULTS
+from eval.logs.faults.checked import CheckedFlights
+from eval.logs.flight_log import flight_files, read_flights
 from eval.quadrotor.vehicle_file import load_vehicle
-from policies.formats.policy_file import load_delta
+from policies.formats.policy_file import load_delta, load_policy_checkpoint
 from suite.common.console import Console, Quiet
 from suite.common.errors import WorkFailed
 from suite.common.running.remote import Job
@@ -248,8 +249,10 @@ def _fit_stage(run: LoopRun, model: DeltaModel) -> Stage:
         tuning = run.tuning(model.diagnosed)
         try:
             dynamics = tuning.quadrotor or tuning.physics
-            # The suite itself wrote these logs, so no finding is a wrong unit or sign.
-            fit_delta(fit, dynamics, [run.logs], folder, run.console, tuple(FAULTS))
+            # The suite itself wrote these logs, so they are not checked for wrong units and signs.
+            logs, warnings = read_flights(flight_files([run.logs]))
+            flights = CheckedFlights(logs, warnings=warnings)
+            fit_delta(fit, dynamics, flights, folder, run.console)
         except ValueError as error:
             raise WorkFailed(
                 f"the Delta Action Model cannot be fitted to the flights in {run.logs}: {error}; "
@@ -299,7 +302,7 @@ def _tuning_stage(run: LoopRun, variant: Variant) -> Stage:
 def _tuning(run: LoopRun, variant: Variant) -> Tuning:
     """Return the fine-tuning of a variant, with its inputs loaded."""
     tuning, first = run.tuning(variant.diagnosed), replace(variant, tuned=None)
-    start = training.load_start_params(str(run.policy(first)), tuning.spec)
+    start = training.start_params(load_policy_checkpoint(run.policy(first)), tuning.spec)
     delta = None
     if variant.delta is not None:
         delta = load_delta(run.out / variant.delta / "delta").arrays

@@ -18,12 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from eval.effects import without_signal
+from policies.formats.policy_file import PolicyCheckpoint
 from policies.networks import delta_network, network
 from policies.spec import PolicySpec
 from suite.common.console import Console
 from suite.common.curve import Mirror
 from suite.common.running import hosts
-from suite.common.stages import Estimate, differences
+from suite.common.stages import Estimate
 from suite.train.config import TrainConfig
 from suite.train.overrides import check_phases, phase_configs, phase_ends
 from suite.train.shards import check_processes
@@ -70,25 +71,12 @@ def estimate(
     return Estimate(seconds, PROGRAM_BYTES + floats * 4.0)  # 4 bytes a float
 
 
-def interface_changes(policy: str, spec: PolicySpec) -> list[str]:
-    """Return what differs in `spec` from the interface of a policy (as for `load_start_params`)."""
-    from policies.formats.policy_file import load_policy_checkpoint
-    from suite.judging.flying import checkpoint_folder
-
-    start = load_policy_checkpoint(checkpoint_folder(policy, "--init-from"))
-    return differences(plain(start.spec), plain(spec))
-
-
-def load_start_params(policy: str, spec: PolicySpec) -> network.Params:
-    """Return the parameters of a policy (name or checkpoint's folder), converted to `spec`.
+def start_params(start: PolicyCheckpoint, spec: PolicySpec) -> network.Params:
+    """Return the parameters of a policy to start a training from, converted to `spec`.
 
     Raises:
-        ValueError: if the policy does not exist, or has an input that `spec` lacks.
+        ValueError: if the policy has an input that `spec` lacks.
     """
-    from policies.formats.policy_file import load_policy_checkpoint
-    from suite.judging.flying import checkpoint_folder
-
-    start = load_policy_checkpoint(checkpoint_folder(policy, "--init-from"))
     return network.adapt_params(jax.tree.map(jnp.asarray, start.params), start.spec, spec)
 
 

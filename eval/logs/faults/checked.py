@@ -22,13 +22,13 @@ COMPENSATED = ("motor_map", "battery_scaling")
 class CheckedFlights(NamedTuple):
     """Flights that were read and checked."""
 
-    logs: list[FlightLog]
+    logs: Sequence[FlightLog]
     """The flights."""
-    earlier: list[FlightLog]
+    earlier: Sequence[FlightLog] = ()
     """Flights of the vehicle before a change."""
-    findings: list[dict[str, Any]]
+    findings: Sequence[dict[str, Any]] = ()
     """What the checks found, as records with the flight's name; None is the vehicle file."""
-    warnings: list[str]
+    warnings: Sequence[str] = ()
     """Lines about files that cannot be used, and about findings that do not stop the command."""
 
 

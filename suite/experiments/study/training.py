@@ -122,10 +122,11 @@ def train_setting(
         The error message if it diverged, else ""; and the measurement of the finished policy, as a
         list of one entry. The list is empty if the policy was measured during the training.
     """
+    from policies.formats.policy_file import load_policy_checkpoint
     from suite.experiments.study.validation import make_validation
     from suite.train.overrides import phase_configs
     from suite.train.ppo.update import train_ppo
-    from suite.train.run import load_start_params, train
+    from suite.train.run import start_params, train
     from suite.train.training_loop import Watch
 
     (key, config), folder, watch = job.task, job.folder, None
@@ -143,7 +144,7 @@ def train_setting(
     if watch:  # the measurements are in the folder
         return "", []
     last = phase_configs(config)[-1]
-    params = load_start_params(str(folder / "policy"), last.spec)
+    params = start_params(load_policy_checkpoint(folder / "policy"), last.spec)
     scores = make_validation(last, *unseen[1:])(params)
     console.note(
         f"{key}, seed {config.seed}: success cross {scores['success_cross']:.0%}, "

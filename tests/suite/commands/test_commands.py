@@ -107,7 +107,7 @@ def test_training_goes_on_from_a_policy_by_its_name_and_does_not_write_over_it(
     assert "--init-from rac: " in said and "a shipped policy's name (race, race-paper" in said
     assert not (tmp_path / "run").exists()
     rates = []
-    monkeypatch.setattr(training, "load_start_params", lambda _, spec: rates.append(spec.rate_hz))
+    monkeypatch.setattr(training, "start_params", lambda _, spec: rates.append(spec.rate_hz))
     monkeypatch.setattr(training, "train", None)
     first = "phases.1.spec.rate_hz=20"
     run(f"train --init-from race --set {first} --out", tmp_path / "run")

@@ -26,11 +26,12 @@ import pytest
 
 import suite
 from policies import shipped
+from policies.formats.policy_file import load_policy_checkpoint
 from suite import cli
 from suite.commands.train import resolve
 from suite.common.usage import EXAMPLES
 from suite.train.recipes import named_recipe, with_model
-from suite.train.run import load_start_params
+from suite.train.run import start_params
 from tests.support.judged_cells import cut_short
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -86,7 +87,7 @@ def _check_together(name, config):
     elif name == "train":
         training = resolve(config)
         if config.init_from in shipped.names():
-            load_start_params(config.init_from, training.spec)
+            start_params(load_policy_checkpoint(shipped.locate(config.init_from)), training.spec)
 
 
 @contextlib.contextmanager

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from eval.logs.faults.catalogue import FAULTS
+from eval.logs.faults.check import CheckContext
+from eval.logs.faults.checked import read_checked
 from eval.logs.faults.finding import Finding
 from eval.logs.flight_log import flight_files, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -66,7 +68,8 @@ def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(tmp_path, monke
     told = nullcontext(lambda *words: shown.append(words))
     monkeypatch.setattr(console, "progress", lambda *_: told)
     accept = ["thrust_command_unit"]  # the thrust commands are only there because a log needs some
-    result = fit_delta(CONFIG, PHYSICS, [tmp_path], tmp_path / "out", console, accept)
+    flights = read_checked([tmp_path], CheckContext(), accept)
+    result = fit_delta(CONFIG, PHYSICS, flights, tmp_path / "out", console)
     kept = json.loads((tmp_path / "out" / "delta.json").read_text())["findings"]
     assert accept[0] in [one["fault"] for one in kept]
     without, identified, with_delta = result.errors.values()
@@ -119,9 +122,9 @@ def test_the_steps_of_a_descent_become_small():
     assert steps[-3:].max() < 0.02 * steps[:3].max()
 
 
-def test_flight_logs_are_found_once_and_without_any_nothing_is_written(tmp_path):
-    with pytest.raises(ValueError, match="no flight logs in"):
-        fit_delta(FitConfig(), PHYSICS, [tmp_path], tmp_path / "out", Console())
+def test_flight_logs_are_found_once_and_without_any_nothing_is_written(tmp_path, capsys):
+    assert run(f"delta {tmp_path} --out {tmp_path / 'out'}") == 2
+    assert "no flight logs in" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     (tmp_path / "a").mkdir()
     for name in ("0.parquet", "1.parquet", "2.csv"):
@@ -148,8 +151,9 @@ def test_flights_without_what_a_fit_needs_are_refused(tmp_path, dynamics, missin
         if missing == "cmd_thrust":
             given = {"rotor_speed": np.full((len(log.time_s), 4), 900.0)}
         write_flight(tmp_path / f"{i}.parquet", replace(log, extra=extra, **given))
+    flights = read_checked([tmp_path], CheckContext(), list(FAULTS))
     with pytest.raises(ValueError, match=r"record (longer )?flights with suite collect"):
-        fit_delta(FitConfig(), dynamics, [tmp_path], tmp_path / "out", Console(), list(FAULTS))
+        fit_delta(FitConfig(), dynamics, flights, tmp_path / "out", Console())
 
 
 def test_a_fault_that_the_network_would_learn_stops_the_fit(tmp_path, capsys):
@@ -160,9 +164,10 @@ def test_a_fault_that_the_network_would_learn_stops_the_fit(tmp_path, capsys):
         given = {"thrust_cmd": np.full_like(log.time_s, 9.81), "rate_cmd_b": log.rate_b}
         about = {"findings": [doubt._asdict()] if i else [], "vehicle": f"drone {i}"}
         write_flight(tmp_path / f"{i}.parquet", replace(log, pos_w=pos_w, about=about, **given))
-    with pytest.raises(ValueError, match="would be wrong") as error:
-        fit_delta(FitConfig(), PHYSICS, [tmp_path], tmp_path / "out", Console())
-    assert "--accept motor_count position_axes" in str(error.value), str(error.value)
+    assert run(f"delta {tmp_path} --out {tmp_path / 'out'}") == 2
+    said = capsys.readouterr().err
+    assert "would be wrong" in said and "--accept motor_count position_axes" in said
+    assert not (tmp_path / "out").exists()
 
 
 def test_flights_of_another_vehicle_than_the_corrected_one_warn(tmp_path, capsys, monkeypatch):

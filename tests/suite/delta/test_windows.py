@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from eval.judging import judge
-from eval.logs.flight_log import log_from_flight, write_flight
+from eval.logs.faults.checked import CheckedFlights
+from eval.logs.flight_log import log_from_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec
 from policies.formats.policy_file import load_delta
@@ -275,11 +276,9 @@ def test_the_network_remembers_the_flight_before_a_window(logs):
 def test_a_fit_cuts_the_error_and_says_what_it_corrects(logs, tmp_path, monkeypatch):
     """As many flights are held out as are fitted: the errors of both are one program."""
     monkeypatch.setattr(quadrotor, "LEAST_PHYSICS_HZ", 100.0)  # a step a row compiles faster
-    for log in logs:
-        write_flight(tmp_path / "logs" / log.name.replace(" ", "-"), log)
     config = FitConfig(horizon_s=0.5, iterations=30, batch=32, rate=1e-2, held_out=0.5)
     quad = QuadrotorConfig(BARE, physics_hz=100.0)
-    result = run.fit_delta(config, quad, [tmp_path / "logs"], tmp_path / "out", Console())
+    result = run.fit_delta(config, quad, CheckedFlights(logs), tmp_path / "out", Console())
     assert result.errors["without"].position_m > 0.05
     assert result.errors["delta_action"].position_m < 0.6 * result.errors["without"].position_m
     stored = load_delta(tmp_path / "out" / "delta")

@@ -18,7 +18,7 @@ from eval.judging.results import read_trials
 from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.check import CheckContext
 from eval.logs.faults.checked import check_flights
-from eval.logs.flight_log import flight_files, read_flights
+from eval.logs.flight_log import read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import with_effects
 from policies.formats.checkpoint import WEIGHTS, save_arrays
@@ -184,8 +184,8 @@ class Stub(Small):
         (out / "report.html").write_text("<p>diagnosis</p>")
         (out / "diagnosis.json").write_text(json.dumps(answer(self.effects)))
 
-    def fit(self, config, quad, paths, out, console, accept):
-        self.fitted.append((quad.vehicle, sorted(path.name for path in flight_files(paths))))
+    def fit(self, config, quad, flights, out, console):
+        self.fitted.append((quad.vehicle, [log.name for log in flights.logs]))
         params = delta_network.init(jax.random.key(0))
         shift = 0.01 if "com_offset" in quad.vehicle.effects else 0.02
         params = {k: np.asarray(v) + shift for k, v in params.items()}
