@@ -123,9 +123,9 @@ FAULTS = (
           "delta/test_windows"),
     # suite: diagnosis
     Fault("suite/diagnose", "(slow**2).sum(axis=(2, 3)) - (explained**2).sum(axis=(2, 3))",
-          "(slow**2).sum(axis=(2, 3))", "diagnose/fit/test_rollouts"),
+          "(slow**2).sum(axis=(2, 3))", "diagnose/evidence/test_rollouts"),
     Fault("suite/diagnose", "float((1 + as_extreme.sum()) / (1 + len(as_extreme)))",
-          "float(as_extreme.sum() / (1 + len(as_extreme)))", "diagnose/fit/test_search"),
+          "float(as_extreme.sum() / (1 + len(as_extreme)))", "diagnose/search/test_search"),
     # suite: blind cases, link
     Fault("suite/blind", "return vector[:, [1, 0, 2]] * [1.0, -1.0, 0.0]",
           "return vector[:, [1, 0, 2]] * [-1.0, 1.0, 0.0]", "continuous/test_engine"),
