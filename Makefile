@@ -35,7 +35,7 @@ $(STAMP): requirements.lock pyproject.toml setup.py
 	@touch $(STAMP)
 
 race: $(STAMP)
-	$(VENV)/bin/suite loop --hidden-vehicle examples/hidden.toml --policy race-paper --recipe quick --no-delta --workers $(JOBS) --out $(OUT)
+	$(VENV)/bin/suite loop --hidden-vehicle examples/hidden.toml --policy race-paper --no-delta --workers $(JOBS) --out $(OUT)
 
 gpu: $(STAMP)
 	$(VENV)/bin/suite reproduce gpu --seconds 100 --out docs/results

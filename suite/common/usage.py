@@ -72,7 +72,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "loop": (
         "suite loop --policy race --out runs/loop",
-        "suite loop --hidden-vehicle examples/hidden.toml --policy race-paper --recipe quick",
+        "suite loop --hidden-vehicle examples/hidden.toml --policy race-paper",
     ),
     "export": (
         "suite export --policy runs/mine/policy --out runs/export",

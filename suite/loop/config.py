@@ -53,8 +53,8 @@ class LoopSize:
 
 SIZES = {"quick": LoopSize(20, 8, 500), "": LoopSize(50, 20, 1500)}
 """Sizes of a loop by recipe; "" is that of all other recipes."""
-HIDDEN_SIZES = {"quick": LoopSize(20, 3, 200, 100), "": LoopSize(25, 3, 200, 60)}
-"""Sizes of a loop with a hidden vehicle, by recipe."""
+HIDDEN_SIZE = LoopSize(25, 3, 200, 60)
+"""Size of a loop with a hidden vehicle."""
 
 
 @dataclass(frozen=True)
@@ -149,10 +149,10 @@ def resolve(
 ) -> LoopConfig:
     """Return the settings of a loop from a recipe and options.
 
-    Numbers that are None are those of the recipe's size (`SIZES`). Without `recipe` it is that of
-    the policy. With a hidden vehicle or another simulator nothing is trained from scratch, and the
-    default policy is the shipped one. With a policy, `changes` apply to its fine-tuning, else to
-    the recipe.
+    Numbers that are None are those of the loop's size (`SIZES`, `HIDDEN_SIZE`). Without `recipe` it
+    is that of the policy. With a hidden vehicle or another simulator nothing is trained from
+    scratch, and the default policy is the shipped one. With a policy, `changes` apply to its
+    fine-tuning, else to the recipe.
 
     Raises:
         ValueError: for an invalid option, with what is allowed.
@@ -173,8 +173,7 @@ def resolve(
     if recipe is None:
         recipe = policy if policy in RECIPES else "race"
     training = replace(named_recipe(recipe), seed=seed)
-    sizes = HIDDEN_SIZES if hidden else SIZES
-    size = sizes.get(recipe, sizes[""])
+    size = HIDDEN_SIZE if hidden else SIZES.get(recipe, SIZES[""])
     if iterations is not None:
         training = with_iterations(training, iterations)
     # The simulation's vehicle, and options that contradict each other.
