@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from eval.judging.results import read_trials
+from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.checked import CheckedFlights
 from eval.logs.flight_log import flight_files, read_flights
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -48,9 +49,6 @@ INPUT_SOURCE = "commands"
 """What drives the simulation in the diagnosis: the recorded commands, since the rate loop of the
 flights is that of the vehicle file. With the recorded rotor speeds a wrong torque would make the
 simulated flights diverge within a second."""
-ACCEPTED = ("motor_unit", "motor_poles", "vehicle_mass", "thrust_command_unit")
-"""Faults of a log that a large hidden effect may resemble, such as a load. The suite itself wrote
-these logs, so their units are right."""
 DIAGNOSIS = Estimate(90.0, 1.5e9)
 """Time and memory of a diagnosis."""
 PHYSICS_HZ = 200.0
@@ -206,7 +204,7 @@ def _diagnosis_stage(run: LoopRun) -> Stage:
             out=folder,
             drive=INPUT_SOURCE,
             seed=run.config.seed,
-            accept=ACCEPTED,
+            accept=tuple(FAULTS),  # the suite itself wrote these logs
         )
         try:
             diagnose_files(config, run.console)

@@ -171,6 +171,8 @@ def _ratio(drive: Drive, measured: np.ndarray) -> Ratio | None:
     # Logarithms of the file's thrust (moved by the delay), the measured thrust and the voltage.
     log_wanted, log_thrust = np.log(wanted), np.log(thrust)
     late = _delay_rows(time_s, log_wanted, log_thrust)
+    if late is None:
+        return None
     log_wanted = shift_rows(log_wanted, late)
     log_volts = np.zeros(len(time_s)) if volts is None else np.log(np.maximum(volts, 0.1))
     log_volts = np.broadcast_to(log_volts[:, None], log_wanted.shape)
@@ -279,17 +281,21 @@ def _fix(drive: Drive, measured: np.ndarray, ratio: Ratio) -> str:
     )
 
 
-def _delay_rows(time_s: np.ndarray, wanted: np.ndarray, thrust: np.ndarray) -> int:
-    """Return the delay with the best correlation of the file's and the measured thrust, in rows."""
+def _delay_rows(time_s: np.ndarray, wanted: np.ndarray, thrust: np.ndarray) -> int | None:
+    """Return the delay with the best correlation of the file's and the measured thrust, in rows.
+
+    It is None if the longest delay that is tried correlates best: then the right one is unknown.
+    """
     step = float(np.median(np.diff(time_s)))
-    trials = dict.fromkeys(round(late / step) for late in np.arange(0.0, LATE_S, STEP_S))
+    trials = list(dict.fromkeys(round(late / step) for late in np.arange(0.0, LATE_S, STEP_S)))
 
     def alike(count: int) -> float:
         moved = shift_rows(wanted, count)
         good = np.isfinite(moved) & np.isfinite(thrust)
         return _correlation(moved[good], thrust[good])
 
-    return max(trials, key=alike)
+    best = max(trials, key=alike)
+    return None if len(trials) > 1 and best == trials[-1] else best
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:

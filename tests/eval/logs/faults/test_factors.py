@@ -258,3 +258,13 @@ def test_a_throttle_that_is_not_linear_or_of_another_full_thrust_is_named(
     share = total / (PLAIN.full_thrust * PLAIN.mass)
     rows = {"time": rows["time"], "acc": rows["acc"], "throttle": factor * share[:, None] ** power}
     assert [f.fault for f in found(rows, vehicle)] == faults
+
+
+@pytest.mark.parametrize(("late", "expected"), [(12, ["throttle_curve"]), (30, [])])
+def test_a_curve_needs_a_delay_that_is_known(late, expected):
+    """A throttle with a wrong curve, so late that no tried delay fits, shows nothing."""
+    rows = flown(depth=1.0)
+    total = rows["motor"] ** 2 @ np.full(4, PLAIN.rotors.thrust_coefficient)
+    throttle = np.roll(total / (PLAIN.full_thrust * PLAIN.mass), -late) ** 0.5
+    rows = {"time": rows["time"], "acc": rows["acc"], "throttle": throttle[:, None]}
+    assert [f.fault for f in found(rows, PLAIN)] == expected
