@@ -35,7 +35,7 @@ class Config(Command):
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     trials: Trials | None = None
     """Trials of each policy on every track at every level. Without it 50, with quick 20; with a
-    hidden vehicle 25, with quick 20."""
+    hidden vehicle 25."""
     flights: Trials | None = None
     """Recorded flights on every track at every level. Without it 20, with quick 8; with a hidden
     vehicle 3."""
@@ -55,7 +55,7 @@ class Config(Command):
     """Gradient steps of the training, instead of the recipe's."""
     finetune_iterations: Advanced[Iterations | None] = None
     """Gradient steps of each fine-tuning. Without it a quarter of the recipe's; with a hidden
-    vehicle 60, with quick 100."""
+    vehicle 60."""
     fit_iterations: Advanced[Iterations | None] = None
     """Gradient steps of the Delta Action Model's fit. Without it 1500, with quick 500; with a
     hidden vehicle 200."""

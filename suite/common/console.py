@@ -166,7 +166,7 @@ def duration(seconds: float) -> str:
 def size(count: float) -> str:
     """Return a number of bytes as text: "812 kB", "2.1 GB"."""
     for unit in ("B", "kB", "MB"):
-        if count < 1000:
+        if count < 999.5:
             return f"{count:.3g} {unit}"
         count /= 1000
     return f"{count:.1f} GB"

@@ -114,6 +114,11 @@ def log_decisions(log: FlightLog) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         ValueError: if the log has no actions.
     """
+    if {"action_thrust", "action_rotor_1"} & log.extra.keys():
+        raise ValueError(
+            f"{log.name}: its policy commands thrust and body rates, or rotors, and a Delta Action "
+            "Model corrects accelerations; record flights of a policy of kind acceleration"
+        )
     if log.action_b is None or log.policy_step is None:
         raise ValueError(
             f"{log.name}: columns action_x, action_y, action_z and policy_step are needed to fit "

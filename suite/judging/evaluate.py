@@ -278,13 +278,15 @@ def _fly_entry(
                 f"{label}: {others} further trials were flown before, which this command does not "
                 f"request: the table is without them, {journal.path.name} keeps them"
             )
+        flown = before
+        won = sum(journal.done[trial].success for trial in trials if trial in journal.done)
         with console.progress(label, len(trials), begun=before) as update:
 
             def keep(result: TrialResult, flight: object) -> None:
+                nonlocal flown, won
                 journal.append(result._replace(policy=label))
-                done = [journal.done[trial] for trial in trials if trial in journal.done]
-                share = sum(r.success for r in done) / len(done)
-                update(len(done), f"{share:.0%} success")
+                flown, won = flown + 1, won + result.success
+                update(flown, f"{won / flown:.0%} success")
 
             fly(
                 policy_for_workers(

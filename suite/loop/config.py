@@ -99,6 +99,21 @@ class LoopConfig:
         """Seed of the first recorded flight."""
         return self.seed + RECORDED_FROM
 
+    def check_files(self) -> None:
+        """Refuse files that have changed since the loop began.
+
+        Raises:
+            ValueError: naming what has changed.
+        """
+        for name, digest in _digests_of_files(
+            self.vehicle, self.sensors, self.hidden_vehicle
+        ).items():
+            if digest != self.digests[name]:
+                raise ValueError(
+                    f"the file of --{name.replace('_', '-')} has changed since the loop began, so "
+                    "its results could not be compared; restore the file, or give another --out"
+                )
+
     @property
     def cells(self) -> int:
         """Number of cells, the pairs of track and level."""
@@ -159,7 +174,6 @@ def resolve(
     """
     from eval.judging.judge import check_records
     from eval.quadrotor.vehicle_file import load_vehicle
-    from eval.sensors.sensors_file import load_sensors, sensors_table
     from eval.worlds import world_class
     from policies.formats.policy_file import load_policy_checkpoint
     from suite.diagnose.estimate.parameters import refuse_own_motion
@@ -178,10 +192,6 @@ def resolve(
         training = with_iterations(training, iterations)
     # The simulation's vehicle, and options that contradict each other.
     simulated = load_vehicle(vehicle)
-    digests = {
-        "vehicle": digest_of(simulated),
-        "sensors": digest_of(sensors_table(load_sensors(sensors))),
-    }
     _check_changes(changes, policy, iterations, hidden)
     if not delta and not hidden:
         raise ValueError(
@@ -209,7 +219,7 @@ def resolve(
                 "is hidden; give a vehicle file with one more effect, such as "
                 "examples/hidden.toml, or another simulator, such as --simulator rotorpy"
             )
-        digests["hidden_vehicle"] = digest_of(true)
+    digests = _digests_of_files(vehicle, sensors, true_vehicle if hidden else None)
     # The settings of the fine-tuning.
     if policy is not None:
         spec = load_policy_checkpoint(checkpoint_folder(policy)).spec
@@ -248,6 +258,20 @@ def resolve(
     return config
 
 
+def _digests_of_files(vehicle: str, sensors: str, hidden_vehicle: str | None) -> dict[str, str]:
+    """Return the SHA-256 of the contents of the files, by option."""
+    from eval.quadrotor.vehicle_file import load_vehicle
+    from eval.sensors.sensors_file import load_sensors, sensors_table
+
+    digests = {
+        "vehicle": digest_of(load_vehicle(vehicle)),
+        "sensors": digest_of(sensors_table(load_sensors(sensors))),
+    }
+    if hidden_vehicle is not None:
+        digests["hidden_vehicle"] = digest_of(load_vehicle(hidden_vehicle))
+    return digests
+
+
 def _check_changes(
     changes: Sequence[str], policy: str | None, iterations: int | None, hidden: bool
 ) -> None:
@@ -270,8 +294,17 @@ def _check_changes(
 
 
 def _check_seeds(config: LoopConfig) -> None:
-    """Refuse track files, on which recorded flights would equal trials, and too few flights."""
-    files = [name for name in parse_tracks(config.track) if is_track_file(name)]
+    """Refuse tracks that no trial of a loop may have, and too few flights.
+
+    On track files recorded flights would equal trials. On the random family policies train.
+    """
+    tracks = parse_tracks(config.track)
+    if "random" in tracks:
+        raise ValueError(
+            "--track random: the fine-tunings train on this family, so they are judged on others; "
+            "give families of zigzag, circular and ellipse"
+        )
+    files = [name for name in tracks if is_track_file(name)]
     if files:
         raise ValueError(
             f"--track {files[0]}: a track from a file is the same at every seed, so recorded "

@@ -145,7 +145,7 @@ def _report(
     rows = [(name, duration(value)) for name, value in times_s.items()]
     files = [
         Links(links),
-        table(["stage", "took"], rows, "Time", strong_last=True),
+        table(["stage", "took"], rows, "Time of the last call", strong_last=True),
         Details("Configuration", to_json(config, indent=2)),
     ]
     return Report(

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -87,10 +88,10 @@ class LoopRun:
 
 
 def plan(run: LoopRun) -> list[Stage]:
-    """Return the stages of a loop in order."""
+    """Return the stages of a loop in order. Each first checks that no file has changed."""
     first = [variant for variant in run.loop.variants if variant.tuned is None]
     later = [variant for variant in run.loop.variants if variant.tuned is not None]
-    return [
+    stages = [
         _first_policy_stage(run),
         *(_judging_stage(run, variant) for variant in first),
         _recording_stage(run),
@@ -100,6 +101,14 @@ def plan(run: LoopRun) -> list[Stage]:
         *(_judging_stage(run, variant) for variant in later),
         _replay_stage(run),
     ]
+    return [
+        replace(stage, work=partial(_on_same_files, run.config, stage.work)) for stage in stages
+    ]
+
+
+def _on_same_files(config: LoopConfig, work: Callable[[Path], Any], folder: Path) -> None:
+    config.check_files()
+    work(folder)
 
 
 def _first_policy_stage(run: LoopRun) -> Stage:
@@ -294,6 +303,10 @@ def _tuning_stage(run: LoopRun, variant: Variant) -> Stage:
         do_jobs(_tune_policy, jobs, run.workers, run.console, "fine-tuning")
 
     estimate = training.estimate(run.config.tuning)
+    if isinstance(run.workers, int):
+        count = sum(each.tuned is not None for each in run.loop.variants)
+        together = max(1, min(run.workers, count))
+        estimate = replace(estimate, memory_bytes=together * estimate.memory_bytes)
     return Stage(f"tuned-{variant.name}", f"fine-tuning {variant.tuned}", estimate, work)
 
 

@@ -22,7 +22,7 @@ from suite.common.errors import WorkFailed
 from suite.delta.fit import FitConfig, _descend, _loss, identify, window_errors
 from suite.delta.replay import PointMassModel, check_corrects, describe_dynamics, nominal_model
 from suite.delta.run import errors_grid, fit_delta, long_enough, split
-from suite.delta.windows import cut_windows
+from suite.delta.windows import cut_windows, log_decisions
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from suite.train.recipes import race, race_paper
 from tests.support.commands import run
@@ -154,6 +154,10 @@ def test_flights_without_what_a_fit_needs_are_refused(tmp_path, dynamics, missin
     flights = read_checked([tmp_path], CheckContext(), list(FAULTS))
     with pytest.raises(ValueError, match=r"record (longer )?flights with suite collect"):
         fit_delta(FitConfig(), dynamics, flights, tmp_path / "out", Console())
+    log = flights.logs[0]
+    rates = replace(log, extra={"action_thrust": log.time_s, "policy_step": log.time_s})
+    with pytest.raises(ValueError, match="its policy commands thrust and body rates"):
+        log_decisions(rates)
 
 
 def test_a_fault_that_the_network_would_learn_stops_the_fit(tmp_path, capsys):

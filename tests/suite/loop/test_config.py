@@ -35,6 +35,7 @@ EXAMPLE = "examples/hidden.toml"
     [
         ("--policy nobody.onnx", "give a checkpoint's folder"),
         ("--track my.toml", "would be the same; give families"),
+        ("--track random", "the fine-tunings train on this family"),
         ("--trials 0", "--trials is 0"),
         ("--flights 1 --track zigzag --difficulty 0", "--flights is 1"),
         ("--no-delta", "without --hidden-vehicle the loop needs the Delta Action Model"),
@@ -179,6 +180,21 @@ def test_a_variant_is_two_stages_and_the_first_policy_is_trained_or_taken():
     names = [stage.name for stage in plan(replace(run, loop=loop))]
     assert names.index("other") < names.index("tuned-longer") < names.index("eval-longer")
     assert len(names) == 9 + 3
+
+
+def test_a_vehicle_file_that_changes_during_a_loop_stops_it(tmp_path):
+    file = tmp_path / "true.toml"
+    save_vehicle(load_vehicle("racer5"), file)
+    run = LoopRun(hidden_effect.LOOP, hidden_loop(hidden=file), tmp_path / "out", Quiet(), 4)
+    stages = {stage.name: stage for stage in plan(run)}
+    single = {stage.name: stage for stage in plan(replace(run, workers=None))}
+    together, alone = stages["tuned-named"].estimate, single["tuned-named"].estimate
+    assert together.memory_bytes == 4 * alone.memory_bytes, "four fine-tunings at once"
+    stages["given"].work(tmp_path / "out" / "given")
+    save_vehicle(replace(load_vehicle("racer5"), mass=0.6), file)
+    with pytest.raises(ValueError, match="--hidden-vehicle has changed since the loop began"):
+        stages["eval-before"].work(tmp_path / "out" / "eval-before")
+    assert not (tmp_path / "out" / "eval-before").exists()
 
 
 def test_flights_that_cannot_be_fitted_end_the_loop_with_advice(tmp_path):
