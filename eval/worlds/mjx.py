@@ -221,21 +221,26 @@ class MjxWorld:
         return _solid_names(track, self._layout)[int(np.asarray(distance)[0].argmin())]
 
     def view(self, wanted: np.ndarray) -> View:
-        """Return the current view, with images for all slots."""
+        """Return the current view, with images for all slots if any are wanted."""
         assert self._on_device is not None
         course, scene = self._on_device
         with jax.default_matmul_precision(PRECISION):
-            view = self._view(self._state, course, scene)
+            view = self._view(self._state, course, scene, bool(wanted.any()))
         return View(*(np.asarray(field, np.float64) for field in view))
 
-    @functools.partial(jax.jit, static_argnums=0)
-    def _view(self, state: SlotStates, course: Course, scene: Scene) -> View:
-        """Return the current view of all slots."""
+    @functools.partial(jax.jit, static_argnums=(0, 4))
+    def _view(self, state: SlotStates, course: Course, scene: Scene, images: bool) -> View:
+        """Return the current view of all slots; without `images` these show nothing in range."""
         pos_w, rot_w, vel_w, _ = _motion(state.qpos, state.qvel)
-        depth = depth_image(scene, pos_w, rot_w, self._rays_b, self._camera.range_m)
+        camera = self._camera
+        if images:
+            depth = depth_image(scene, pos_w, rot_w, self._rays_b, camera.range_m)
+            depth_m = nearest(camera, depth)
+        else:
+            depth_m = jnp.full((len(pos_w), camera.height, camera.width), camera.range_m)
         gate = next_gate(course, state.progress.gates)
         second_gate = next_gate(course, state.progress.gates + 1)
-        return view_of(pos_w, rot_w, vel_w, gate, second_gate, nearest(self._camera, depth))
+        return view_of(pos_w, rot_w, vel_w, gate, second_gate, depth_m)
 
     def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
         """Fly each slot's action (N, size) for its number of physics steps (N,)."""
