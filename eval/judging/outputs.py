@@ -16,6 +16,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.judging.guard import ActionLimits, Guarded
+from eval.logs.faults.vehicle import FOV_LEAST_DEG
 from eval.worlds.trial import TrialResult
 from policies.block_policy import ROUNDING
 from policies.policy import Policy, checked_act
@@ -35,8 +36,6 @@ LIFT = 3.0
 outputs probably contain gravity."""
 CLEAR = 0.5
 """Smallest difference of outputs between gates on opposite sides that counts [m/s^2]."""
-FOV_LEAST_DEG = 10.0
-"""If both fields of view are smaller than this [deg], they are probably in radians."""
 THRUST = (3.0, 40.0)
 """Plausible mean of the commanded thrust per mass [m/s^2]."""
 UNIT_FIX = "check the unit of its output"
