@@ -137,6 +137,21 @@ def notes_of(policy: Policy) -> tuple[Note, ...]:
     return () if notes is None else (*notes, *probable_faults(policy))
 
 
+def object_faults(policy: Policy) -> tuple[Note, ...]:
+    """Return the probable faults of a policy object, of which a copy is tested.
+
+    An object that cannot be copied, or fails with test inputs, is not tested.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            faults = probable_faults(copy.deepcopy(policy))
+    except Exception:  # any error of an object's own code
+        return ()
+    return tuple(
+        doubt._replace(evidence=doubt.evidence.removeprefix(f"{policy.name}: ")) for doubt in faults
+    )
+
+
 def probable_faults(policy: Policy) -> tuple[Note, ...]:
     """Return the probable faults of unit, scale and frame in the policy's camera and outputs."""
     kind, fov_deg = policy.spec.action.kind, policy.spec.camera.fov_deg

@@ -1,11 +1,14 @@
 """Kinds of action: who commands body rates or motors flies as who commands accelerations."""
 
+import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
+import suite
 from eval.effects.interface import GRAVITY
 from eval.judging.guard import ActionLimits, first_action, guard_action, limits_of
 from eval.judging.judge import Record
@@ -228,3 +231,34 @@ def test_short_flights_show_negated_axes_saturation_and_a_constant_memory(capsys
         assert found == [(fault, "doubt")] * bool(fault) + [("memory_constant", "note")], fault
         assert "3 flights of 5 s at level 0 it passed" in capsys.readouterr().out
     assert not Watched(Steady()).hints()  # it has made no decision
+
+
+def test_from_python_the_doubts_of_suite_eval_are_warnings():
+    @dataclass
+    class Own(Pursuit):
+        factor: float = 1.0
+        last_step: float = math.inf
+
+        def act(self, hidden, state, image, fresh):
+            hidden = np.where(fresh[:, None], np.float32(0), hidden) + np.float32(1)
+            action, _ = super().act(hidden, state, image, fresh)
+            factor = np.where(hidden[:, :1] > self.last_step, np.nan, self.factor)
+            return (factor * action).astype(np.float32), hidden
+
+    heavy = replace(VEHICLE, inertia=tuple(1000.0 * moment for moment in VEHICLE.inertia))
+    for policy, vehicle, expected in (
+        (Own(), "reference", []),
+        (Own(factor=57.0), "reference", ["more than the limit"]),
+        (Own(factor=0.02), "reference", ["as if unscaled"]),
+        (Own(last_step=20.0), "reference", ["were not finite"]),
+        (Own(), heavy, ["inertia about x or y is"]),
+    ):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            suite.evaluate_policy(
+                policy, track="zigzag", difficulty=0, trials=1, vehicle=vehicle, seed=3
+            )
+        said = [str(warning.message) for warning in caught]
+        assert len(said) == len(expected), said
+        assert all(text in line for text, line in zip(expected, said, strict=True)), said
+        assert all(warning.filename == __file__ for warning in caught)
