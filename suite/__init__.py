@@ -70,7 +70,7 @@ def evaluate_policy(
     sensors: str | Path = "perfect",
     workers: int | None = None,
 ) -> list[TrialResult]:
-    """Fly trials and return their results, as `suite eval` does.
+    """Fly trials and return their results, as `suite eval` does; its warnings are Python warnings.
 
     Args:
         policy: a policy (`load_policy`, or any object with its methods), a shipped name or a file.
@@ -91,7 +91,8 @@ def evaluate_policy(
         ValueError: for an argument that cannot be used, before the first flight.
     """
     from eval.judging.judge import JudgeOptions, fly
-    from eval.judging.outputs import check_rows
+    from eval.judging.outputs import action_report, check_rows, notes_of, object_faults
+    from eval.logs.faults.vehicle import vehicle_doubts
     from policies.policy import check_is_policy, load_policy
     from suite.judging.flying import policy_for_workers
     from suite.judging.requests import Evaluation
@@ -106,16 +107,25 @@ def evaluate_policy(
     evaluation = Evaluation(trials=trials, seed=seed, simulator=simulator, **request)
     is_source = isinstance(policy, str | Path)
     trial_set = read_trial_set(evaluation, repeated=not is_source, **objects)
-    tests = [] if is_source or hasattr(loaded, "notes") else check_rows(loaded)
-    for note in (*trial_set.differences, *trial_set.notes, *tests):
-        warnings.warn(note, stacklevel=2)
+    is_object = not (is_source or hasattr(loaded, "notes"))
+    tests = check_rows(loaded) if is_object else []
+    notes = dict.fromkeys([*notes_of(loaded), *trial_set.notes, *tests])
+    for note in (*vehicle_doubts(trial_set.vehicle), *trial_set.differences, *notes):
+        warnings.warn(str(note), stacklevel=2)
     flown, processes = loaded, 1 if workers is None else workers
     if is_source:
         flown = policy_for_workers(loaded, str(policy), False, processes)
     options = JudgeOptions(workers=processes, sensors=trial_set.sensors)
-    return fly(
+    results = fly(
         flown, trial_set.trials, trial_set.vehicle, simulator, options, tracks=trial_set.tracks
     )
+    # An object is probed after its flights, so that the probe cannot change them.
+    doubts = object_faults(loaded) if is_object and not tests else ()
+    known = {doubt.fault for doubt in doubts}
+    in_flight = action_report(results, loaded.spec.action)["warnings"]
+    for doubt in (*doubts, *(each for each in in_flight if each.fault not in known)):
+        warnings.warn(f"policy {loaded.name!r}: {doubt}", stacklevel=2)
+    return results
 
 
 def train_policy(

@@ -152,11 +152,13 @@ def _run(name: str, args: list[str]) -> int:
         return int(stop.code or 0)
 
     from suite.common.running.lock import one_writer_each
+    from suite.common.vehicles import warn_of_vehicles
     from tracks.input.ranges import check_ranges
 
     with stdout_kept_clean() if config.json else nullcontext():
         check_ranges(config, options=True)
         with one_writer_each(config.written()):
+            warn_of_vehicles(name, config, Console())
             answer = command.run(config, Console())
     if config.json:
         from tracks.common.files import to_json

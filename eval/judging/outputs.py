@@ -16,6 +16,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.judging.guard import ActionLimits, Guarded
+from eval.logs.faults.vehicle import FOV_LEAST_DEG
 from eval.worlds.trial import TrialResult
 from policies.block_policy import ROUNDING
 from policies.policy import Policy, checked_act
@@ -35,8 +36,6 @@ LIFT = 3.0
 outputs probably contain gravity."""
 CLEAR = 0.5
 """Smallest difference of outputs between gates on opposite sides that counts [m/s^2]."""
-FOV_LEAST_DEG = 10.0
-"""If both fields of view are smaller than this [deg], they are probably in radians."""
 THRUST = (3.0, 40.0)
 """Plausible mean of the commanded thrust per mass [m/s^2]."""
 UNIT_FIX = "check the unit of its output"
@@ -45,6 +44,10 @@ SCALE_FIX = (
     "after a very short training this is no fault"
 )
 """Advice (with `UNIT_FIX`) for outputs of a wrong scale and of a wrong unit."""
+INPUTS = "; or its state or image has other units, signs or order than the contract"
+"""Other cause of outputs with a wrong direction or offset."""
+GRAVITY_FIX = f"an action is net acceleration: subtract 9.81 along the state's world_z{INPUTS}"
+"""Advice for outputs that contain gravity."""
 IMAGE_FACTOR, NO_CHANGE = 1.5, 1e-3
 """Factor on a test image; relative change of the output below which it counts as unchanged."""
 VEL_B, UP_B, GATE_B = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -121,8 +124,7 @@ def _warnings(
     up = float(np.median([row.action_up for row in results]))
     if plain and up > UP_MOST:
         text = f"its outputs contain gravity: {up:.1f} m/s^2 upwards while it climbs"
-        fix = "an action is the net acceleration: subtract 9.81 along the state's world_z"
-        notes.append(Note("action_gravity", text, fix))
+        notes.append(Note("action_gravity", text, GRAVITY_FIX))
     return notes
 
 
@@ -133,6 +135,21 @@ def notes_of(policy: Policy) -> tuple[Note, ...]:
     """
     notes = getattr(policy, "notes", None)
     return () if notes is None else (*notes, *probable_faults(policy))
+
+
+def object_faults(policy: Policy) -> tuple[Note, ...]:
+    """Return the probable faults of a policy object, of which a copy is tested.
+
+    An object that cannot be copied, or fails with test inputs, is not tested.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            faults = probable_faults(copy.deepcopy(policy))
+    except Exception:  # any error of an object's own code
+        return ()
+    return tuple(
+        doubt._replace(evidence=doubt.evidence.removeprefix(f"{policy.name}: ")) for doubt in faults
+    )
 
 
 def probable_faults(policy: Policy) -> tuple[Note, ...]:
@@ -174,17 +191,18 @@ def _acceleration_faults(policy: Policy) -> tuple[Note, ...]:
         text = (
             f"{name}: accelerates away from gates to the left and above, as if its action were FRD"
         )
-        notes.append(Note("action_frame", text, "the suite uses FLU: negate y and z"))
+        notes.append(Note("action_frame", text, "the suite uses FLU: negate y and z" + INPUTS))
     elif min(sideways, up) < -CLEAR:
         axis, side = ("y", "left") if sideways < up else ("z", "up")
         text = f"{name}: accelerates away from gates offset in {axis}, as if {axis} were negated"
-        notes.append(Note("action_frame", text, f"the suite's {axis} points {side}: negate it"))
+        notes.append(
+            Note("action_frame", text, f"the suite's {axis} points {side}: negate it" + INPUTS)
+        )
     if action[:, 2].min() > LIFT:
         text = (
             f"{name}: commands at least {action[:, 2].min():.1f} m/s^2 up in level flight, as if "
         )
-        fix = "an action is the net acceleration: subtract 9.81 along the state's world_z"
-        notes.append(Note("action_gravity", text + "its action contained gravity", fix))
+        notes.append(Note("action_gravity", text + "its action contained gravity", GRAVITY_FIX))
     if policy.spec.action.is_plain and np.abs(output).max() <= UNIT:
         text = f"{name}: outputs only -1 to 1 m/s^2 for gates far to the side, as if unscaled"
         notes.append(Note("action_scale", text, SCALE_FIX))

@@ -37,7 +37,10 @@ def load_onnx(path: Path) -> BlockPolicy:
     loaded = ModelProcess(proto.SerializeToString(), str(path), "onnx")
     for value in (*loaded.inputs, *loaded.outputs):
         if value.kind != "tensor(float)":
-            raise PolicyError(f"{path}: {value.name!r} is {value.kind}, expected tensor(float)")
+            raise PolicyError(
+                f"{path}: {value.name!r} is {value.kind}, expected tensor(float); export it as "
+                "float32, such as by model.float() in PyTorch"
+            )
     shapes = {value.name: value.shape for value in loaded.inputs}
     order = sorted(shapes, key=(*INPUTS, *shapes).index)
     ordered = {name: shapes[name] for name in order}

@@ -40,8 +40,15 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if config.real:
         console.say(f"next: follow {config.out / 'README.md'} or the tutorial of docs/measure.md")
     else:
-        vehicle = config.out / "vehicle.toml"
-        console.say(f"next: suite diagnose {config.out} --vehicle {vehicle} --out runs/example")
+        from eval.logs.flight_log import logs_in
+
+        vehicle, flights = config.out / "vehicle.toml", str(config.out)
+        logs = [path for path in logs_in(config.out) if path.name in contents]
+        if others := len(logs_in(config.out)) - len(logs):
+            text = f"{config.out} holds {others} flight(s) that are not the example's"
+            console.note(f"warning: {text}")
+            flights = " ".join(map(str, logs))
+        console.say(f"next: suite diagnose {flights} --vehicle {vehicle} --out runs/example")
     return {"folder": str(config.out), "files": names}
 
 

@@ -8,17 +8,21 @@ and how to fix it.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from policies.contract import contract_of, summary
 from policies.policy import Policy, load_policy
+from policies.spec import Note
 from suite.common.console import Console
 from tracks.common.files import check_no_input
 
 TIME_LIMIT_S = 5.0
 """Time limit of the short flights that show a policy's actions [s]."""
+LEAST_FLIGHTS = 3
+"""Smallest number of short flights of which one should pass a gate."""
 
 
 def check_policy(
@@ -140,28 +144,46 @@ def policy_findings(policy: Policy, trials: int, console: Console) -> list[dict[
     findings += [_record(doubt.fault.split("_")[0], *doubt) for doubt in probable_faults(policy)]
     # Warnings in flight, without the faults that were found before.
     known = {record["fault"] for record in findings}
-    warnings = _warnings_in_flight(policy, trials, console)
-    new = [warning for warning in warnings if warning[0] not in known]
-    return findings + [_record("action", *warning) for warning in new]
+    warnings, hints = _warnings_in_flight(policy, trials, console, bool(known))
+    findings += [_record("action", *warning) for warning in warnings if warning.fault not in known]
+    return findings + [_record("memory", *hint) | {"status": "note"} for hint in hints]
 
 
 def _warnings_in_flight(
-    policy: Policy, trials: int, console: Console
-) -> list[tuple[str, str, str]]:
-    """Return (fault, evidence, fix) of suspicious actions in a few short flights."""
+    policy: Policy, trials: int, console: Console, explained: bool
+) -> tuple[list[Note], list[Note]]:
+    """Return probable faults of the actions in a few short flights, and hints.
+
+    Flights without a gate are a fault of their own, unless another fault has `explained` them.
+    """
     from eval.judging.judge import JudgeOptions, fly
     from eval.judging.outputs import action_report
+    from eval.judging.watched import Watched
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.worlds.trial import Rules, TrialSpec
 
     trial_specs = [TrialSpec("random", 0, 500_000 + seed) for seed in range(trials)]
     options = JudgeOptions(workers=1, rules=Rules(time_limit_s=TIME_LIMIT_S))
-    results = fly(policy, trial_specs, load_vehicle("racer5"), options=options)
+    watched = Watched(policy)
+    results = fly(watched, trial_specs, load_vehicle("racer5"), options=options)
     actions = action_report(results, policy.spec.action)
-    if actions["decisions"]:
-        share, count = actions["limited"], actions["decisions"]
-        console.say(f"{share:.1%} of {count} actions were limited in {trials} flights")
-    return actions["warnings"]
+    if not actions["decisions"]:
+        return [], []
+    share, count = actions["limited"], actions["decisions"]
+    console.say(f"{share:.1%} of {count} actions were limited in {trials} flights")
+    warnings = [*actions["warnings"], *watched.doubts()]
+    gates = sum(row.gates_passed for row in results)
+    ended = Counter("in flight" if row.ended_by == "timeout" else row.ended_by for row in results)
+    endings = ", ".join(f"{number} {ending}" for ending, number in ended.items())
+    text = f"in {trials} flights of {TIME_LIMIT_S:g} s at level 0 it passed {gates} gates"
+    console.say(f"{text}; at the end: {endings}")
+    if not gates and trials >= LEAST_FLIGHTS and not (warnings or explained):
+        fix = (
+            "compare units, axes, signs and order of its state, image and action with the "
+            "contract above; after a very short training this is no fault"
+        )
+        warnings.append(Note("no_gate", f"{text} ({endings})", fix))
+    return warnings, watched.hints()
 
 
 def _record(signal: str, fault: str, evidence: str, fix: str) -> dict[str, Any]:

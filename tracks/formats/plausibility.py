@@ -12,6 +12,12 @@ QUARTER_DEG = np.pi / 4
 """A yaw of 45 deg, if it is written in radians [deg]."""
 ROUNDING = 0.005
 """Largest rounding of an angle that is written in radians [deg]."""
+STEP_LEAST_M = 0.3
+"""Smallest plausible distance between different gates that follow each other [m]."""
+AGAINST = -0.7
+"""A gate is turned round if the cosines of its direction with the ways to and from it are less."""
+AWAY, TOWARDS = 0.7, 0.9
+"""Cosines of the start's heading with the way to gate 0: surely away, and surely towards it."""
 
 
 def track_notes(name: str, track: Track) -> list[str]:
@@ -23,19 +29,38 @@ def track_notes(name: str, track: Track) -> list[str]:
     if opening_m > OPENING_MOST_M or step_m > STEP_MOST_M:
         notes.append(
             f"its largest gate is {opening_m:g} m wide and gates are up to {step_m:g} m apart; is "
-            "the file in millimetres? Lengths are in metres"
+            "the file in centimetres or millimetres? Lengths are in metres"
         )
     yaw_deg = np.rad2deg(np.arctan2(ahead_w[:, 1], ahead_w[:, 0]))
-    quarters = np.round(yaw_deg / QUARTER_DEG)
-    written = (quarters != 0) & (np.abs(yaw_deg - quarters * QUARTER_DEG) < ROUNDING)
+    written = _in_radians(yaw_deg)
     if written.any() and np.abs(yaw_deg).max() < 2.0 * np.pi + ROUNDING:
         gate = int(np.argmax(written))
         notes.append(f"gate {gate} has a yaw of {yaw_deg[gate]:.4g} deg; is yaw_deg in radians?")
+    way_w = np.diff(np.vstack([track.start_pos_w, center_w]), axis=0)  # to each gate
+    length_m = np.linalg.norm(way_w, axis=1)
+    way_w = way_w / np.maximum(length_m, 1e-9)[:, None]
+    start_deg = np.rad2deg(track.start_yaw)
+    heading = [np.array([np.cos(yaw), np.sin(yaw)]) @ way_w[0, :2]
+               for yaw in np.deg2rad([start_deg, np.rad2deg(start_deg)])]  # fmt: skip
+    if _in_radians(start_deg) and heading[0] < AWAY and heading[1] > TOWARDS:
+        notes.append(f"the start has a yaw of {start_deg:.4g} deg; is start.yaw_deg in radians?")
+    for gate in np.flatnonzero((length_m[1:] > 1e-3) & (length_m[1:] < STEP_LEAST_M))[:1]:
+        apart_m = length_m[gate + 1]
+        notes.append(f"gates {gate} and {gate + 1} are only {apart_m:.2g} m apart; in metres?")
+    cosine = (way_w * ahead_w).sum(axis=1), (way_w[1:] * ahead_w[:-1]).sum(axis=1)
+    for gate in np.flatnonzero((cosine[0][:-1] < AGAINST) & (cosine[1] < AGAINST))[:1]:
+        notes.append(f"gate {gate} faces against the path to and from it; turn its yaw by 180 deg?")
     # A gate may be listed again, for another lap, but not next to itself.
     step_w, turn = np.diff(center_w, axis=0), (ahead_w[1:] * ahead_w[:-1]).sum(axis=1)
     for gate in np.flatnonzero((np.linalg.norm(step_w, axis=1) < 1e-3) & (turn > 0.999))[:1]:
         notes.append(f"gates {gate} and {gate + 1} have the same place and direction")
     return [f"{name}: {note}" for note in [*notes, *_blocked(track)]]
+
+
+def _in_radians(yaw_deg: np.ndarray | float) -> np.ndarray:
+    """Return which yaws [deg], but for 0, are a multiple of 45 deg if they were radians."""
+    quarters = np.round(np.divide(yaw_deg, QUARTER_DEG))
+    return (quarters != 0) & (np.abs(yaw_deg - quarters * QUARTER_DEG) < ROUNDING)
 
 
 def _blocked(track: Track) -> list[str]:

@@ -63,7 +63,7 @@ FAULTS: dict[str, tuple[str, str]] = {
         "the mass in the vehicle file is a multiple of the true one",
         "hover for two seconds",
     ),
-    "vehicle_arms": ("the rotors' places are in cm or mm", ""),
+    "vehicle_arms": ("rotors or body are in cm or mm", ""),
     "vehicle_inertia": ("the inertia is another vehicle's or in another unit", ""),
     "vehicle_thrust": ("thrust-to-weight is implausible", ""),
     "vehicle_torque": ("torque over thrust of a rotor is implausible", ""),

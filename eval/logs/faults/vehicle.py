@@ -24,12 +24,28 @@ TORQUE_M = (0.001, 0.2)
 """Plausible ratio of a rotor's torque to its thrust [m]; usual are 0.005 to 0.05."""
 GAIN = 1.0
 """Smallest plausible gain of the nominal rate loop [1/s]."""
+GAINS = {
+    "betaflight": ("p_roll", "p_pitch"),
+    "px4": ("MC_ROLLRATE_P", "MC_PITCHRATE_P"),
+    "crazyflie": ("roll_kp", "pitch_kp"),
+}
+"""Kind of a firmware's rate loop -> its P gains about roll and pitch."""
+BODY_M, BODY_PER_ARM = 1.5, (0.1, 3.0)
+"""Largest usual half size of the body [m], and its usual ratio to the arm."""
+FOV_LEAST_DEG = 10.0
+"""If both fields of view are smaller than this [deg], they are probably in radians."""
+MOTOR_PER_ROTOR = (0.2, 5.0)
+"""Usual ratio of a motor's thrust at full command by `[motors]` to that of `[rotors]`."""
+FIRMWARE_GAIN = 0.05
+"""A firmware's P gain below this share of its default is probably in another unit."""
+UNSURE = 0.85
+"""Confidence of doubts about keys that only simulated flights use: they stop no diagnosis."""
 FOV_DEG = 2.0
 """Fields of view that differ by at most this belong to the same camera [deg]."""
 
 
 def check_vehicle_numbers(vehicle: Vehicle) -> list[Finding]:
-    """Return findings on implausible arms, thrust, inertia, rotor torque and rate gains."""
+    """Return findings on implausible arms, thrust, inertia, torque, gains, body and camera."""
     found = []
     hubs = np.asarray(vehicle.rotors.position)
     arm = float(np.mean(np.hypot(hubs[:, 0], hubs[:, 1])))
@@ -75,7 +91,51 @@ def check_vehicle_numbers(vehicle: Vehicle) -> list[Finding]:
         )
         # Only rollouts by rate commands use the gains, so they do not stop a diagnosis.
         found.append(Finding("note", "vehicle", text, "vehicle_gain", gain, 0.95, fix))
+    found += _of_simulation(vehicle, arm)
     return found or [Finding("ok", "vehicle", f"full thrust is {lift:.3g} times the weight")]
+
+
+def vehicle_doubts(vehicle: Vehicle) -> list[str]:
+    """Return the doubts of `check_vehicle_numbers` as sentences with their fixes."""
+    return [
+        f"vehicle {vehicle.name!r}: {finding.evidence}; {finding.fix}"
+        for finding in check_vehicle_numbers(vehicle)
+        if finding.status != "ok"
+    ]
+
+
+def _of_simulation(vehicle: Vehicle, arm: float) -> list[Finding]:
+    """Return findings on the body, camera, motors and firmware gains; `arm` is in m."""
+    found = []
+    size = max(vehicle.body.half_size)
+    if size > BODY_M:
+        text = f"the body reaches {size:.3g} m from the centre; usual are at most {BODY_M:g}"
+        low, high = BODY_PER_ARM
+        units = [str(k) for k in (100, 1000) if low <= size / k / arm <= high]
+        fix = "body.half_size in m" + (f": divide by {' or '.join(units)}" if units else "")
+        found.append(Finding("doubt", "vehicle", text, "vehicle_arms", size, UNSURE, fix))
+    fov_deg = vehicle.camera.fov_deg
+    if max(fov_deg) < FOV_LEAST_DEG:
+        text = f"its camera sees only {fov_deg[0]:g} x {fov_deg[1]:g} deg"
+        fix = "camera.fov_deg in degrees, not radians"
+        found.append(Finding("doubt", "vehicle", text, "camera_fov", None, UNSURE, fix))
+    if vehicle.motors is not None:
+        full, rotor = sum(vehicle.motors.thrust), vehicle.rotors.thrust_max
+        if not MOTOR_PER_ROTOR[0] <= full / rotor <= MOTOR_PER_ROTOR[1]:
+            text = f"a motor gives {full:.3g} N by [motors], and a rotor {rotor:.3g} N by [rotors]"
+            fix = "motors.thrust in N, of one motor at the full command 1"
+            about = ("motor_map", full / rotor, UNSURE, fix)
+            found.append(Finding("doubt", "vehicle", text, *about))
+    if (settings := vehicle.controller.settings) is not None:
+        usual = type(settings)()
+        for key in GAINS.get(vehicle.controller.kind, ()):
+            gain, default = getattr(settings, key), getattr(usual, key)
+            if gain < FIRMWARE_GAIN * default:
+                text = f"controller.{key} is {gain:.3g}; the firmware's default is {default:g}"
+                fix = "gains as the firmware's own tool shows them"
+                found.append(Finding("note", "vehicle", text, "vehicle_gain", gain, 0.95, fix))
+                break
+    return found
 
 
 def _gyration(vehicle: Vehicle, arm: float) -> float:

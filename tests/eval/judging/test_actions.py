@@ -1,21 +1,27 @@
 """Kinds of action: who commands body rates or motors flies as who commands accelerations."""
 
+import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
+import suite
 from eval.effects.interface import GRAVITY
 from eval.judging.guard import ActionLimits, first_action, guard_action, limits_of
 from eval.judging.judge import Record
 from eval.judging.outputs import action_report, notes_of, probable_faults
+from eval.judging.watched import Watched
 from eval.logs.flight_log import log_from_flight, read_flight, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules
 from policies.block_policy import BlockPolicy
 from policies.policy import load_policy
 from policies.spec import ActionSpec, PolicySpec
+from suite.common.console import Console
+from suite.judging.checking import policy_findings
 from tests.support.courses import end_of, fly_on, straight
 from tests.support.pilots import Pursuit, Steady
 from tracks.geometry.camera import Camera
@@ -197,7 +203,10 @@ def test_gravity_and_frames_show_in_flight_or_in_made_up_observations():
             action, hidden = policy.model(state, image, hidden)
             return change(action), hidden
 
-        assert [doubt.fault for doubt in notes_of(replace(policy, model=model))] == [fault]
+        (doubt,) = notes_of(replace(policy, model=model))
+        assert doubt.fault == fault
+        ambiguous = fault in ("action_gravity", "action_frame")
+        assert ("or its state or image has other units" in doubt.fix) == ambiguous
 
 
 def test_a_thrust_that_is_a_share_and_a_camera_in_radians_are_doubted():
@@ -208,3 +217,48 @@ def test_a_thrust_that_is_a_share_and_a_camera_in_radians_are_doubted():
     assert faults((0.4, 0.0, 0.0, 0.0)) == ["action_thrust"]
     assert faults((GRAVITY, 0.0, 0.0, 0.0)) == []
     assert faults((GRAVITY, 0.0, 0.0, 0.0), fov_deg=(1.37, 1.11)) == ["camera_fov"]
+
+
+def test_short_flights_show_negated_axes_saturation_and_a_constant_memory(capsys):
+    changes = {
+        "": lambda a: a,
+        "no_gate": lambda a: a * np.array([-1, 1, 1], np.float32),
+        "action_saturated": lambda a: 15 * np.sign(a),
+    }
+    for fault, change in changes.items():
+        records = policy_findings(Changed(change), 3, Console())
+        found = [(record["fault"], record["status"]) for record in records]
+        assert found == [(fault, "doubt")] * bool(fault) + [("memory_constant", "note")], fault
+        assert "3 flights of 5 s at level 0 it passed" in capsys.readouterr().out
+    assert not Watched(Steady()).hints()  # it has made no decision
+
+
+def test_from_python_the_doubts_of_suite_eval_are_warnings():
+    @dataclass
+    class Own(Pursuit):
+        factor: float = 1.0
+        last_step: float = math.inf
+
+        def act(self, hidden, state, image, fresh):
+            hidden = np.where(fresh[:, None], np.float32(0), hidden) + np.float32(1)
+            action, _ = super().act(hidden, state, image, fresh)
+            factor = np.where(hidden[:, :1] > self.last_step, np.nan, self.factor)
+            return (factor * action).astype(np.float32), hidden
+
+    heavy = replace(VEHICLE, inertia=tuple(1000.0 * moment for moment in VEHICLE.inertia))
+    for policy, vehicle, expected in (
+        (Own(), "reference", []),
+        (Own(factor=57.0), "reference", ["more than the limit"]),
+        (Own(factor=0.02), "reference", ["as if unscaled"]),
+        (Own(last_step=20.0), "reference", ["were not finite"]),
+        (Own(), heavy, ["inertia about x or y is"]),
+    ):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            suite.evaluate_policy(
+                policy, track="zigzag", difficulty=0, trials=1, vehicle=vehicle, seed=3
+            )
+        said = [str(warning.message) for warning in caught]
+        assert len(said) == len(expected), said
+        assert all(text in line for text, line in zip(expected, said, strict=True)), said
+        assert all(warning.filename == __file__ for warning in caught)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from eval.quadrotor.vehicle_file import load_vehicle
+from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from policies import shipped
 from policies.formats import policy_file
 from suite.blind import make
@@ -34,6 +34,21 @@ def test_tracks_command_lists_and_draws(tmp_path, capfd):
         said = refused(capfd, f"{command} --out", mine)
         assert f"a file exists: {mine}; give another --out" in said
     assert "--speed is 2.0, allowed is 0 to 1" in refused(capfd, "eval --speed 2")
+
+
+def test_doubts_about_a_vehicle_file_are_printed_once_and_stop_nothing(tmp_path, capfd):
+    vehicle = load_vehicle("reference")
+    arms = tuple(tuple(1000.0 * x for x in hub) for hub in vehicle.rotors.position)
+    save_vehicle(
+        replace(vehicle, rotors=replace(vehicle.rotors, position=arms)), tmp_path / "mm.toml"
+    )
+    command = "eval --track zigzag --difficulty 0 --trials 2 --time-limit-s 0.1 --workers 2"
+    for name, count in ((tmp_path / "mm.toml", 1), ("reference", 0)):
+        assert run(f"{command} --out", tmp_path / "out", "--vehicle", name) == 0
+        assert capfd.readouterr().err.count("divide by 1000") == count
+    train = "train --model quad --list-settings --vehicle"
+    assert run(train, tmp_path / "mm.toml") == 0
+    assert capfd.readouterr().err.count("divide by 1000") == 1
 
 
 def test_effects_command_lists_and_describes(capfd):

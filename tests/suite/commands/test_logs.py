@@ -206,6 +206,11 @@ def test_the_command_copies_all_a_diagnosis_needs(tmp_path, capsys):
     assert files == sorted([*(p.name for p in FILES), "vehicle.toml"])
     for name in files:
         assert (tmp_path / name).read_bytes() == (FOLDER / name).read_bytes()
+    (tmp_path / "mine.parquet").write_bytes(b"")
+    assert run("example --out", tmp_path) == 0
+    said = capsys.readouterr()
+    assert "1 flight(s) that are not the example's" in said.err
+    assert "flight_3.parquet --vehicle" in said.out and "mine" not in said.out
 
 
 def test_the_real_flights_come_as_published_and_tell_a_vehicle_at_the_first_try(tmp_path, capsys):

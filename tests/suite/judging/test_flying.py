@@ -177,7 +177,7 @@ def test_from_python_a_track_file_is_flown_and_a_named_policy_in_several_process
 
     def fly(policy, trials, vehicle, world, options, tracks):
         assert options.workers == 1 or pack(policy)
-        flown.append((options.workers, trials, list(tracks)))
+        return flown.append((options.workers, trials, list(tracks))) or []
 
     monkeypatch.setattr(eval.judging.judge, "fly", fly)
     for track in (YARD, load_track(YARD)):

@@ -35,6 +35,12 @@ def write(folder, text):
         (GATE.replace("1.0", "30.0").replace("1.5]", "40]"), "30 m wide"),
         (GATE + GATE, "gates 0 and 1 have the same place and direction"),
         (GATE + GATE.replace("0, 1.5]", "5, 1.5]\nyaw_deg = 1.5708"), "gate 1 has a yaw of 1.571"),
+        (GATE.replace("1.5]", "150]") + GATE.replace("0, 1.5]", "400, 150]"), "centimetres"),
+        (GATE + GATE.replace("0, 1.5]", "0.1, 1.5]"), "gates 0 and 1 are only 0.1 m apart"),
+        (GATE.replace("1.5]", "1.5]\nyaw_deg = 90.0")
+         + "[start]\nposition = [0, -3, 1.5]\nyaw_deg = 1.5708\n", "is start.yaw_deg in radians?"),
+        (GATE.replace("1.5]", "1.5]\nyaw_deg = 180") + GATE.replace("[0, 0, 1.5]", "[5, 0, 1.5]")
+         + "[start]\nposition = [-3, 0, 1.5]\n", "gate 0 faces against the path"),
         (GATE + '[[spheres]]\nname = "tree"\ncenter = [0, 0, 1.5]\nradius = 0.3\n',
          "the centre of gate 0 is inside 'tree'"),
     ],

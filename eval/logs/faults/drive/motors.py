@@ -62,6 +62,8 @@ POLES = {
     if 0.5 <= mine / true <= 2.0 and mine != true
 }
 """Wrong number of poles -> factor by which speeds from electrical rpm (eRPM) are then too large."""
+COEFFICIENT = "or rotors.thrust_coefficient of the vehicle file is wrong, such as for rpm"
+"""Other cause of a wrong lift, which a log alone does not exclude."""
 SHIPPED_ORDER = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
 """Motor positions (x forward, y left) in the order of the shipped vehicles: front right, rear
 right, rear left, front left."""
@@ -197,6 +199,8 @@ def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
     if gain > CLEAR and scores[best][:2].min() > RIGHT and all(best == _best(h) for h in halves):
         order = ",".join(str(k + 1) for k in best)
         text = f"{figures}; {scores[best][0]:+.2f}, {scores[best][1]:+.2f} in the order {order}"
+        if vehicle is not None:
+            text += "; or rotors.position of the vehicle file has another order or sign"
         names = [n for n in ("motor", "motor_cmd", "pwm") if n in rows]
         clear = scores[best][:2].min() > SURELY and gain > 2.0 * CLEAR
         status, sure = ("corrected", 0.99) if clear else ("doubt", 0.92)
@@ -279,11 +283,13 @@ def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Fin
         text = f"{figures}: they are {UNITS[words]:.3g} times the true ones ({words})"
         others = " or ".join(name for name in near if name != words)
         text += f"; if the vehicle file is far off, it may be {others}" if others else ""
+        text += f"; {COEFFICIENT}"
         fix = option(*((n, f"{1.0 / UNITS[words]:.10g}") for n in names))
         about = ("motor_unit", UNITS[words], 0.97, fix)
         return Finding("corrected", "rotor speeds", text, *about)
     if near:
         text = f"{figures}: they are {factor:.3g} times too large, which may be {' or '.join(near)}"
+        text += f"; {COEFFICIENT}"
         fix = option(*((n, f"{1.0 / factor:.4g}") for n in names))
         return Finding("doubt", "rotor speeds", text, "motor_unit", factor, 0.95, fix)
     poles = sorted(within(POLES, 1.05, factor), key=lambda n: abs(np.log(factor / POLES[n])))

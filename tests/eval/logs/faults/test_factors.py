@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +12,17 @@ from eval.logs.faults.drive.motor_map import check_motor_map
 from eval.logs.faults.drive.motors import check_lift, check_motors
 from eval.logs.faults.relation import match
 from eval.logs.faults.vectors import check_gyro, check_velocity
-from eval.logs.faults.vehicle import check_vehicle_numbers
-from eval.vehicles.vehicle import MotorMap, command_of_thrust
+from eval.logs.faults.vehicle import check_vehicle_numbers, vehicle_doubts
+from eval.quadrotor.loops import KINDS
+from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
+from eval.vehicles.vehicle import CollisionBox, Controller, MotorMap, command_of_thrust
 from tests.support.vehicles import PLAIN
 
+SCALED = Controller(
+    PLAIN.controller.rate_gain, 500.0, kind="betaflight",
+    settings=KINDS["betaflight"].Settings(p_roll=0.45),
+)  # fmt: skip
+"""A firmware's loop with a gain in another unit."""
 HOVER = np.sqrt(PLAIN.mass * 9.81 / (4 * PLAIN.rotors.thrust_coefficient))
 
 
@@ -35,6 +43,7 @@ def test_a_factor_with_a_name_is_put_right():
         finding = lift(factor)
         assert finding.status == "corrected" and words in finding.evidence
         assert finding.fix == f"--read motor={1 / scale:.10g}"
+        assert "or rotors.thrust_coefficient of the vehicle file is wrong" in finding.evidence
 
 
 @pytest.mark.parametrize("factor", [6.5, 11.0, 11.5, 10.2])
@@ -85,6 +94,27 @@ def test_numbers_copied_from_a_firmware_are_doubted(torque, gain, fault, fix):
     wrong = replace(PLAIN, rotors=rotors, controller=replace(PLAIN.controller, rate_gain=gain))
     (finding,) = check_vehicle_numbers(wrong)
     assert finding.fault == fault and fix in finding.fix
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault", "fix"),
+    [
+        ({"body": CollisionBox((64.0, 64.0, 25.0))}, "vehicle_arms", "divide by 1000"),
+        ({"camera": replace(PLAIN.camera, fov_deg=(1.37, 1.11))}, "camera_fov", "not radians"),
+        ({"motors": MotorMap((0.0, 100.0), 16.0)}, "motor_map", "in N, of one motor"),
+        ({"controller": SCALED}, "vehicle_gain", "the firmware's own tool"),
+    ],
+)
+def test_values_of_simulated_flights_are_doubted_and_stop_no_diagnosis(changes, fault, fix):
+    (finding,) = check_vehicle_numbers(replace(PLAIN, **changes))
+    assert (finding.fault, finding.is_open) == (fault, False) and fix in finding.fix
+    (sentence,) = vehicle_doubts(replace(PLAIN, **changes))
+    assert fix in sentence
+
+
+def test_shipped_vehicles_and_examples_are_not_doubted():
+    for vehicle in (*shipped_vehicles(), *Path("examples").glob("*.toml")):
+        assert not vehicle_doubts(load_vehicle(vehicle)), vehicle
 
 
 def thrust(factor, vehicle=PLAIN):
