@@ -22,7 +22,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "world_frame": ("the world points down (NED), or east comes first", TILT),
     "body_frame": ("the body is forward-right-down", ROTATE),
     "position_axes": ("an axis of the position is inverted or swapped", TILT),
-    "position_jump": ("the position jumps: two flights in one file, or a glitch", "log again"),
+    "position_jump": ("the position jumps or stands still", "log again"),
     "position_unit": ("positions are in cm or mm", TILT),
     "velocity_frame": ("the velocity is in other axes", TILT),
     "velocity_unit": ("the velocity is in another unit", TILT),

@@ -265,6 +265,17 @@ def test_a_calm_flight_says_what_it_does_not_show():
     assert not {f.fault for f in findings if f.is_open}
 
 
+@pytest.mark.parametrize("since_s", [0.0, 3.0])
+@pytest.mark.parametrize(("name", "signal"), [("quat", "attitude"), ("pos", "position")])
+def test_a_pose_that_stands_still_while_the_gyro_turns_is_no_other_unit(name, signal, since_s):
+    parts = good(end=8.0)
+    first = int(since_s * HZ)
+    parts[name][first:] = parts[name][first]
+    doubts = [f for f in checked(parts)[0] if f.status in ("corrected", "doubt")]
+    assert [(f.signal, f.is_open) for f in doubts] == [(signal, True)]
+    assert "stands still while the gyro turns" in doubts[0].evidence
+
+
 def test_every_name_is_in_the_catalogue():
     assert {name for kind in KINDS.values() for name in kind.names} <= FAULTS.keys()
     assert sum(kind.race for kind in KINDS.values()) == 10
