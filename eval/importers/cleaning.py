@@ -191,7 +191,7 @@ def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Findin
         return recording, []
     delay, error = fit.delay_s, fit.error_s
     figures = f"it is {1e3 * delay:+.1f} ms (± {1e3 * error:.1f} ms) late against the gyro"
-    is_late, findings = abs(delay) > max(LEAST_S, SURE * error), []
+    is_late, findings = abs(delay) > max(LEAST_S, SURE * error), fit.rotation_findings()
     option = "leave --no-fix out: the import shifts the pose"
     status = "corrected" if fix else "doubt"
     if fit.drifts:

@@ -276,6 +276,22 @@ def test_a_pose_that_stands_still_while_the_gyro_turns_is_no_other_unit(name, si
     assert "stands still while the gyro turns" in doubts[0].evidence
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.06])
+@pytest.mark.parametrize(("angle", "status"), [(3.0, ""), (10.0, "note"), (30.0, "doubt")])
+def test_a_body_that_is_defined_askew_is_no_delay(angle, status, late_s):
+    parts = good()
+    parts["quat"] = known_flight.fly(parts["time"] - late_s).quat
+    turn = Rotation.from_euler("z", angle, degrees=True)
+    turned = Rotation.from_quat(parts["quat"], scalar_first=True) * turn
+    parts["quat"] = turned.as_quat(scalar_first=True)
+    found = check_clock(parts)
+    axes = [f for f in found if f.signal == "pose axes"]
+    assert [(f.status, f.is_open) for f in axes] == [(status, status == "doubt")] * bool(status)
+    (delay,) = [f for f in found if f.signal == "pose delay"]
+    ms = float(delay.evidence.split("it is ")[1].split(" ms")[0])
+    assert ms == pytest.approx(1e3 * late_s, abs=6.0)
+
+
 def test_every_name_is_in_the_catalogue():
     assert {name for kind in KINDS.values() for name in kind.names} <= FAULTS.keys()
     assert sum(kind.race for kind in KINDS.values()) == 10
