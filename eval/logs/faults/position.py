@@ -17,7 +17,7 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import rotate
 from eval.logs.faults.finding import Finding, unseen
-from eval.logs.faults.pose import Rows
+from eval.logs.faults.pose import CALM_RATE, Rows, turns_of
 from eval.logs.faults.reading import option
 from eval.logs.faults.relation import jackknife_error, rms, smooth
 from eval.logs.velocity import velocity_from_position
@@ -182,8 +182,8 @@ def check_jumps(time_s: np.ndarray, pos: np.ndarray) -> list[Finding]:
 
 
 def check_still(rows: Rows) -> list[Finding]:
-    """Return doubts on a position or an attitude that is lost for much of the flight."""
-    findings = []
+    """Return doubts on a pose that is lost for much of the flight, and on a gyro's dead axes."""
+    findings = _dead_axes(rows) if {"quat", "rate"} <= rows.keys() else []
     for name, subject, fault in (
         ("quat", "attitude", "attitude"),
         ("pos", "position", "position_jump"),
@@ -200,6 +200,21 @@ def check_still(rows: Rows) -> list[Finding]:
             fix += "" if is_lost[1:].all() else " or suite import, which leaves this part out"
             findings.append(Finding("doubt", subject, text, fault, share, 0.95, fix))
     return findings
+
+
+def _dead_axes(rows: Rows) -> list[Finding]:
+    """Return the doubt on axes of the gyro that are constant while the attitude turns about them."""
+    turns = smooth(rows["time"], turns_of(rows["time"], rows["quat"]), 0.5 * WIDTH_S)
+    turns, rate = (value[np.isfinite(value).all(axis=1)] for value in (turns, rows["rate"]))
+    if not len(turns) or not len(rate):
+        return []
+    is_dead = (np.ptp(rate, axis=0) == 0.0) & (turns.std(axis=0) > CALM_RATE)
+    if not is_dead.any():
+        return []
+    axes = " and ".join(np.array(list("xyz"))[is_dead])
+    text = f"it never changes about {axes}, and the attitude turns there"
+    fix = option(("rate", "drop")) + " or log it again"
+    return [Finding("doubt", "gyro", text, "gyro_axes", None, 0.95, fix)]
 
 
 def lost_samples(
