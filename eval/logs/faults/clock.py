@@ -41,9 +41,10 @@ LATE_S = 0.025
 """Least delay that is a fault [s]. A diagnosis estimates smaller ones itself (effect
 `clock_offset`)."""
 
-ROTATED_DEG = (5.0, 15.0)
-"""Rotation between the body axes of pose and gyro above which it is reported, and above which it is
-a fault [deg]; a smaller one may be a tilt of the markers."""
+ROTATED_DEG = (5.0, 15.0, 120.0)
+"""Rotation between the body axes of pose and gyro above which it is reported, above which it is a
+fault, and its limit [deg]. A smaller one may be a tilt of the markers, a larger one a wrong sign,
+which other checks name."""
 HALF, PRIOR = 0.5, 0.03
 """A rotation must lower the squared misfit of the best delay to this share. The second counts as
 the share of the rates for which the axes are equal, since few axes may turn."""
@@ -239,7 +240,8 @@ def _rotation(turns: np.ndarray, gyros: Sequence[np.ndarray]) -> tuple[np.ndarra
         if (misfit := 2.0 - 2.0 * float(np.sum(rotation * product))) < least:
             least, best = misfit, rotation
     vector = np.rad2deg(Rotation.from_matrix(best).as_rotvec())
-    if least > HALF * alone or np.linalg.norm(vector) < ROTATED_DEG[0]:
+    angle = float(np.linalg.norm(vector))
+    if least > HALF * alone or not ROTATED_DEG[0] < angle < ROTATED_DEG[2]:
         return np.eye(3), np.zeros(3)
     return best, vector
 

@@ -203,7 +203,7 @@ def check_still(rows: Rows) -> list[Finding]:
 
 
 def _dead_axes(rows: Rows) -> list[Finding]:
-    """Return the doubt on axes of the gyro that are constant while the attitude turns about them."""
+    """Return the doubt on axes of the gyro that are constant while the attitude turns there."""
     turns = smooth(rows["time"], turns_of(rows["time"], rows["quat"]), 0.5 * WIDTH_S)
     turns, rate = (value[np.isfinite(value).all(axis=1)] for value in (turns, rows["rate"]))
     if not len(turns) or not len(rate):
