@@ -16,8 +16,7 @@ from eval.importers.rows import continuous
 from eval.importers.signals import MAD_TO_SD, Recording, Signal, median_step
 from eval.logs.faults.clock import LATE_S, LEAST_S, SURE, delay_of
 from eval.logs.faults.finding import Finding
-from eval.logs.faults.position import ACC_MAX
-from eval.logs.faults.relation import rms
+from eval.logs.faults.position import ACC_MAX, is_coarse, lost_samples
 from eval.logs.velocity import velocity_from_position
 
 POS_LEAST, VEL_LEAST = 0.02, 0.1
@@ -30,12 +29,6 @@ MEDIAN_SAMPLES = 7
 """Number of samples of the running median with which a position is compared."""
 REPEATED = 0.02
 """Share of repeated or interpolated samples above which they are removed."""
-LOST_S, LOST_HOLDS, LOST_RATE = 0.2, 5.0, 0.3
-"""A pose that repeats for longer [s], and for so many times the usual hold, is lost where the gyro
-turns faster [rad/s]."""
-COARSE = 4.0
-"""A signal is coarse if its median change between samples is below this many steps of its
-resolution. Repeated samples of a coarse signal may be real."""
 TEXTS = {"pos": "position", "quat": "attitude"}
 """Signals and their names in messages."""
 TURNING = 0.05
@@ -95,7 +88,7 @@ def _drop_repeats(signals: dict[str, Signal]) -> list[Finding]:
         is_new = np.ones(len(samples.time_s), dtype=bool)
         is_new[1:] = np.any(samples.value[1:] != samples.value[:-1], axis=1)
         share = float(np.mean(~is_new))
-        if share < REPEATED or _is_coarse(samples) or not _moves(samples):
+        if share < REPEATED or is_coarse(samples.value) or not _moves(samples):
             continue
         _keep(signals, OF_POSE, samples, is_new)
         text = f"{100 * share:.0f} % of the poses repeat the one before: left out"
@@ -113,33 +106,14 @@ def without_lost(recording: Recording) -> tuple[Recording, list[Finding]]:
         samples = signals.get(name)
         if rate is None or samples is None or len(samples.time_s) <= MEDIAN_SAMPLES:
             continue
-        if _is_coarse(samples):
-            continue
-        time_s, is_lost = samples.time_s, np.zeros(len(samples.time_s), dtype=bool)
-        changes = np.flatnonzero(np.diff(samples.value, axis=0).any(axis=1)) + 1
-        starts, stops = np.append(0, changes), np.append(changes, len(time_s))
-        held_s = time_s[stops - 1] - time_s[starts]
-        longest_s = LOST_S + LOST_HOLDS * np.median(held_s)  # a slow signal is held in fast rows
-        for first, stop, hold_s in zip(starts, stops, held_s, strict=True):
-            if hold_s > longest_s:
-                inside = (rate.time_s >= time_s[first]) & (rate.time_s <= time_s[stop - 1])
-                is_lost[first + 1 : stop] = inside.any() and rms(rate.value[inside]) > LOST_RATE
+        is_lost = lost_samples(*samples, *rate)
+        if is_lost[1:].all():
+            continue  # nothing would be left: `check_still` reports it
         if is_lost.any():
             _keep(signals, (name, "vel"), samples, ~is_lost)
             text = f"{is_lost.sum()} samples stand still while the gyro turns (lost): left out"
             findings.append(Finding("corrected", TEXTS[name], text))
     return replace(recording, signals=signals), findings
-
-
-def _is_coarse(samples: Signal) -> bool:
-    """Return whether changes are a few steps of a coarse resolution, such as 1 mm."""
-    change = np.abs(np.diff(samples.value, axis=0))
-    change = change[change > 0.0]
-    if not len(change):
-        return True
-    # A low quantile, because rounding makes the very smallest change smaller than a step.
-    resolution_step = float(np.quantile(change, 0.02))
-    return float(np.median(change)) < COARSE * resolution_step
 
 
 def _moves(samples: Signal) -> bool:
@@ -217,7 +191,7 @@ def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Findin
         return recording, []
     delay, error = fit.delay_s, fit.error_s
     figures = f"it is {1e3 * delay:+.1f} ms (± {1e3 * error:.1f} ms) late against the gyro"
-    is_late, findings = abs(delay) > max(LEAST_S, SURE * error), []
+    is_late, findings = abs(delay) > max(LEAST_S, SURE * error), fit.rotation_findings()
     option = "leave --no-fix out: the import shifts the pose"
     status = "corrected" if fix else "doubt"
     if fit.drifts:

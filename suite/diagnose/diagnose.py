@@ -87,9 +87,13 @@ def diagnose(
 
 def _diagnose(given: DiagnosisInput, makers: Sequence[SourceMaker], seed: int) -> Diagnosis:
     """Return the diagnosis by the sources that `makers` make."""
-    flights = next(made for make in makers if (made := make(given)) is not None)
+    warnings = list[str]()
+    for flights in filter(None, (make(given) for make in makers)):
+        warnings += flights.warnings
+        if flights.sources:
+            break
     # Search and test with each source; `findings` holds those of the sources before it.
-    findings, warnings = list[Finding](), list(flights.warnings)
+    findings = list[Finding]()
     for source in flights.sources:
         finding, notes = examine(source, findings, given.say, seed)
         findings.append(finding)

@@ -23,7 +23,7 @@ from eval.logs.faults.drive.motor_map import check_motor_map
 from eval.logs.faults.drive.motors import check_lift, check_motors
 from eval.logs.faults.finding import Finding, findings_of
 from eval.logs.faults.pose import Rows, check_pose
-from eval.logs.faults.position import check_height_sign, check_jumps
+from eval.logs.faults.position import check_height_sign, check_jumps, check_still
 from eval.logs.faults.reading import Readings, read_rows, readings_in
 from eval.logs.faults.sensors import check_accelerometer_bias, check_barometer, check_voltage
 from eval.logs.faults.vectors import check_accelerometer, check_gyro, check_velocity
@@ -60,6 +60,7 @@ Check = Callable[[Rows, CheckContext], list[Finding]]
 CLOCK: tuple[Check, ...] = (lambda rows, _: check_time(rows),)
 """The unit of the time, which all other checks need."""
 POSE: tuple[Check, ...] = (
+    lambda rows, _: check_still(rows),
     lambda rows, _: check_pose(rows),
     lambda rows, against: [] if "attitude" in against.found else check_height_sign(rows),
     lambda rows, _: check_gyro(rows),

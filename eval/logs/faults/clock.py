@@ -1,5 +1,7 @@
 """Checks of clocks: the unit of time, and the delay and drift of the pose against the gyro.
 
+A constant rotation between their body axes is found with the delay, since each resembles the other.
+
 The body rate from the attitude over 60 ms is compared with the gyro's mean over the same time,
 shifted by trial delays. The least difference gives the delay. Its standard error comes from
 estimates that leave out one block of the flight at a time (jackknife).
@@ -7,6 +9,7 @@ estimates that leave out one block of the flight at a time (jackknife).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +41,14 @@ LATE_S = 0.025
 """Least delay that is a fault [s]. A diagnosis estimates smaller ones itself (effect
 `clock_offset`)."""
 
+ROTATED_DEG = (5.0, 15.0, 120.0)
+"""Rotation between the body axes of pose and gyro above which it is reported, above which it is a
+fault, and its limit [deg]. A smaller one may be a tilt of the markers, a larger one a wrong sign,
+which other checks name."""
+HALF, PRIOR = 0.5, 0.03
+"""A rotation must lower the squared misfit of the best delay to this share. The second counts as
+the share of the rates for which the axes are equal, since few axes may turn."""
+
 
 class Late(NamedTuple):
     """Delay of an attitude against a gyro, which may drift over the flight."""
@@ -54,12 +65,26 @@ class Late(NamedTuple):
     """Middle of the flight [s]."""
     duration_s: float
     """Duration of the flight [s]."""
+    rotation: np.ndarray
+    """(3,) rotation vector from the attitude's body axes to the gyro's [deg]; 0 if too small."""
 
     @property
     def drifts(self) -> bool:
         """Whether the drift exceeds what two crystals cause, and what its own error can cause."""
         growth_s = abs(self.drift) * self.duration_s
         return growth_s > GROWN_S and abs(self.drift) > max(DRIFT, SURE_DRIFT * self.drift_error)
+
+    def rotation_findings(self) -> list[Finding]:
+        """Return the finding on a rotation between the body axes; none if it is too small."""
+        angle = float(np.linalg.norm(self.rotation))
+        if angle < ROTATED_DEG[0]:
+            return []
+        axis = ", ".join(f"{part / angle:+.2f}" for part in self.rotation)
+        text = f"its body is rotated by {angle:.0f} deg about ({axis}) against the gyro"
+        if angle < ROTATED_DEG[1]:
+            return [Finding("note", "pose axes", text)]
+        fix = "align the body in the motion capture, or the gyro, with the vehicle's axes"
+        return [Finding("doubt", "pose axes", text, "body_frame", angle, 0.95, fix)]
 
     def drift_figures(self) -> str:
         """Return the drift as text."""
@@ -105,13 +130,13 @@ def check_clock(rows: Rows) -> list[Finding]:
     if late is None:
         text = "the flight turns too little to hold its clocks against each other"
         return unseen("pose clock", text, "clock_offset", "clock_drift")
-    drift = []
+    drift = late.rotation_findings()
     if not late.drifts and not SURE_DRIFT * late.drift_error < SEEN:
-        drift = unseen("pose clock", late.drift_figures(), "clock_drift")
+        drift += unseen("pose clock", late.drift_figures(), "clock_drift")
     if late.drifts:
         fix = "suite import of the log that it was made of: the pose is moved"
         about = ("clock_drift", late.drift, 0.95, fix)
-        drift = [Finding("doubt", "pose clock", late.drift_figures(), *about)]
+        drift += [Finding("doubt", "pose clock", late.drift_figures(), *about)]
     figures = f"it is {1e3 * late.delay_s:+.1f} ms (± {1e3 * late.error_s:.1f} ms) late"
     if abs(late.delay_s) < max(LATE_S, SURE * late.error_s):
         return [Finding("ok", "pose delay", figures + " against the gyro"), *drift]
@@ -160,9 +185,11 @@ def delay_of(
         ]
         return (at[1] - at[0]) / (last - first)[:, None]
 
-    if np.sqrt(np.mean(np.sum(gyro(0.0, 0.0) ** 2, axis=1))) < CALM:
+    if np.sqrt(np.mean(np.sum(gyro(0.0, 0.0) ** 2, axis=1))) < CALM or not turns.any():
         return None
     trials = np.arange(-REACH_S, REACH_S + 0.5 * STEP_S, STEP_S)
+    rotation, turned = _rotation(turns, [gyro(late_s, 0.0) for late_s in trials])
+    turns = turns @ rotation.T
     block = np.minimum((np.arange(len(first)) * BLOCKS) // len(first), BLOCKS - 1)
 
     def costs(drift: float) -> np.ndarray:
@@ -187,7 +214,36 @@ def delay_of(
     if delay_s is None or any(one is None for one in without_block):
         return None
     error = jackknife_error(np.array(without_block, dtype=np.float64))
-    return Late(delay_s, error, first_drift + rest_of_drift, drift_error, middle, duration)
+    drift = first_drift + rest_of_drift
+    return Late(delay_s, error, drift, drift_error, middle, duration, turned)
+
+
+def _rotation(turns: np.ndarray, gyros: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rotation (3, 3) from the rates `turns` (N, 3) to the gyro's, and its vector [deg].
+
+    `gyros` are the gyro's rates (N, 3) for each trial delay. It is 0 where a delay alone fits about
+    as well (Kabsch 1976, for every delay).
+    """
+    from scipy.spatial.transform import Rotation
+
+    size = np.linalg.norm(turns, axis=1)
+    kept = size <= 8.0 * np.quantile(size, 0.9)
+    source = turns[kept] - turns[kept].mean(axis=0)
+    source /= max(float(np.linalg.norm(source)), 1e-12)
+    alone, least, best = np.inf, np.inf, np.eye(3)
+    for gyro in gyros:
+        target = gyro[kept] - gyro[kept].mean(axis=0)
+        product = target.T @ source / max(float(np.linalg.norm(target)), 1e-12)
+        u, _, vt = np.linalg.svd(product + PRIOR * np.eye(3))
+        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        alone = min(alone, 2.0 - 2.0 * float(np.trace(product)))
+        if (misfit := 2.0 - 2.0 * float(np.sum(rotation * product))) < least:
+            least, best = misfit, rotation
+    vector = np.rad2deg(Rotation.from_matrix(best).as_rotvec())
+    angle = float(np.linalg.norm(vector))
+    if least > HALF * alone or not ROTATED_DEG[0] < angle < ROTATED_DEG[2]:
+        return np.eye(3), np.zeros(3)
+    return best, vector
 
 
 def _drift(trials: np.ndarray, cost: np.ndarray, duration_s: float) -> tuple[float, float]:

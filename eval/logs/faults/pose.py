@@ -167,7 +167,7 @@ def check_pose(rows: Rows) -> list[Finding]:
         return unseen("attitude", text, *SHOWN)
     if not (best.quat or best.pos or best.length != 1.0):
         if given.misfit < BAD or (given.gyro is not None and given.gyro.is_turned):
-            noisy = given.misfit > GOOD
+            noisy = max(given.misfit, given.turns or 0.0) > GOOD
             found = Finding("note" if noisy else "ok", "attitude", figures)
             return [found, *_same_fit([r for r in fits.rivals if r.quat in ANGLES])]
         text = f"{figures}: no other order, direction, sign or frame of it fits"

@@ -120,11 +120,11 @@ def pooled_scale(found: Match) -> tuple[float, float, float]:
 
     All three are weighted geometric means over the axes; NaN where no axis is identifiable.
     """
-    weight = np.where(found.seen, found.level**2 * found.alike**4, 0.0)
+    weight = (found.level**2 * found.alike**4)[found.seen]  # the scale of an unseen axis may be 0
     if weight.sum() == 0.0:
         return np.nan, np.nan, np.nan
     mean = [
-        float(np.exp(np.sum(weight * np.log(value)) / weight.sum()))
+        float(np.exp(np.sum(weight * np.log(value[found.seen])) / weight.sum()))
         for value in (found.scale, found.low, found.high)
     ]
     return mean[0], mean[1], mean[2]

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eval.effects import EFFECTS
+from suite.diagnose.sources.source import FAR
 from suite.diagnose.verdict.gap import EffectSize
 
 VERDICTS = {
@@ -29,6 +30,11 @@ CHANGES = {
     "explains it.",
 }
 """A sentence for each verdict, if a change since reference flights was searched for."""
+ONLY_VIEWS = (
+    "The forces and torques that were compared agree within the measurement noise, but simulated "
+    "flights of 1 s stay far from the measured ones."
+)
+"""The sentence for `no_gap` if rollouts could not be used."""
 USE = (
     "Use the corrected vehicle: give the new vehicle.toml, in --out, to suite eval, train and loop "
     "(--vehicle)."
@@ -80,6 +86,7 @@ def answer(result: Mapping[str, Any]) -> str:
     effects = [_effect_words(effect) for effect in result["effects"]]
     heading = "Changed in the vehicle:" if is_change else "Wrong or missing in the vehicle file:"
     sentence, rest = (CHANGES if is_change else VERDICTS)[verdict], remaining_words(result)
+    sentence = ONLY_VIEWS if _is_far(result) else sentence
     if rest and (verdict == "named" or (verdict == "no_gap" and not is_change)):
         agreed = sentence.removesuffix(".").removesuffix(" within the measurement noise")
         sentence = f"{agreed}, except for {rest}."
@@ -88,6 +95,11 @@ def answer(result: Mapping[str, Any]) -> str:
         names = ", ".join(entry["name"] for entry in result["negligible"])
         words.append(f"Significant but too small to matter: {names}.")
     return " ".join(words)
+
+
+def _is_far(result: Mapping[str, Any]) -> bool:
+    """Return whether there is no gap in force and torque, but simulated flights diverge."""
+    return result["verdict"] == "no_gap" and FAR in result.get("warnings", ())
 
 
 def remaining_words(result: Mapping[str, Any]) -> str:
@@ -115,6 +127,8 @@ def next_steps(result: Mapping[str, Any]) -> list[str]:
     """Return advice on what to do after the verdict of a diagnosis.json, most useful first."""
     verdict, is_change = result["verdict"], bool(result["reference"])
     search_for = _search_for(result["unexplained"])
+    if _is_far(result):
+        return [CHECK, "Then estimate the rate loop with suite identify, and repeat this."]
     if verdict == "no_gap":
         if is_change:
             return [f"Keep the vehicle file that you use. {UNTESTED}"]

@@ -31,7 +31,7 @@ from suite.diagnose.evidence.rollouts import (
     start_estimate,
 )
 from suite.diagnose.sources.rollout_source import RolloutSource
-from suite.diagnose.sources.source import DiagnosisInput, SourceSet
+from suite.diagnose.sources.source import FAR, DiagnosisInput, SourceSet
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.actuators import (
     flown_by_other_controller,
@@ -56,7 +56,7 @@ LACKING = (
 def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     """Make the source of rollouts; None if the logs lack a signal that a rollout needs.
 
-    Unless it was chosen by name, it is also None if even all effects of the catalogue leave the
+    Unless it was chosen by name, the set is empty if even all effects of the catalogue leave the
     rollouts far from the flights.
 
     Raises:
@@ -130,7 +130,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
             warnings.append(LACKING)
     if not given.chosen and is_hopeless(model, windows, linear, limits):
         given.say("no effect brings rollouts of 1 s near these flights: using force and torque")
-        return None
+        return SourceSet((), (), "", (FAR,))
     # Choose which stretches are held out, by their information on each parameter.
     noise = measured_noise(linear, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)

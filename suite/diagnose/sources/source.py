@@ -35,6 +35,12 @@ LEAST_GAP = 1e-9
 TOO_SMALL = "that is too small to matter"
 """Reason of an error below the thresholds of relevance, see `Remaining.reason`."""
 
+FAR = (
+    "simulated flights of 1 s stay far from these flights, whatever effect is added: only force "
+    "and torque are compared; check the commands' units, and the gains of the rate loop"
+)
+"""Warning if rollouts cannot be used."""
+
 
 class Remaining(NamedTuple):
     """The error that remains with the named effects."""
@@ -230,6 +236,7 @@ class SourceSet:
     """The sources of evidence that flights allow."""
 
     sources: tuple[Source, ...]
+    """None if the flights allow none, for the reason in `warnings`."""
     held_out: Sequence[str]
     """Names of held-out flights or stretches."""
     driven_by: str

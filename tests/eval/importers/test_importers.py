@@ -108,6 +108,12 @@ def test_positions_that_stand_still_in_flight_are_left_out(tmp_path):
     assert "stand still while the gyro turns" in text(findings, "position")
     assert not [f for f in findings if f.status == "doubt"]
     assert np.isnan(log.pos_w[(log.time_s > 3.05) & (log.time_s < 3.45)]).all()
+    # Of an attitude that never turns nothing would be left, so it is kept and in doubt.
+    parts = flight()
+    parts["quat"][:] = [1.0, 0.0, 0.0, 0.0]
+    log, findings = import_log(write(tmp_path / "still.csv", parts))
+    assert [f.signal for f in findings if f.is_open] == ["attitude"]
+    assert np.nanmax(log.pos_w) == pytest.approx(np.max(parts["pos"]), abs=0.05)
     # A slow pose that is held in fast rows was never lost.
     parts, hold = flight(), 25
     for name in ("pos", "vel"):

@@ -55,6 +55,9 @@ THRUST_FITS, THRUST_EFFECT, THRUST_SAME = 1.35, 2.0, 1.15
 """Limits of the commanded thrust over the force that the path needs. Within the first factor of a
 unit's conversion factor, the ratio is explained by that unit. Within the second factor of 1 it may
 be a physical effect or a wrong mass, and within the third it is m/s^2, whatever the mass is."""
+OFFSET, OFFSET_RMS = 3.0, 3.0
+"""Least constant difference of command and gyro that no unit explains: in rad/s, and relative to
+the body rates (root mean square)."""
 RATE_OFF = 0.1
 """Largest relative error of a controller's rate."""
 
@@ -174,8 +177,15 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
         sure = 0.98 if matched.is_turned else 0.9
         return [Finding("doubt" if sure < 0.95 else "corrected", subject, text,
                         "rate_command_sign", None, sure, option(("cmd_rate", axes)))]  # fmt: skip
-    # Unit of the command, then unit of the gyro.
+    # Unit of the command, then unit of the gyro. A unit explains no offset, which sticks have.
     gain, low, high = pooled_scale(matched)
+    middle, turned = (np.nanmedian(value, axis=0) for value in (command, rate))
+    axis = int(np.argmax(np.abs(middle * gain - turned)))
+    if np.abs(middle * gain - turned)[axis] > max(OFFSET, OFFSET_RMS * rms(rate)):
+        text = f"half of its values about {'xyz'[axis]} are below {middle[axis]:.4g}, and the gyro "
+        text += f"turns at {turned[axis]:.2g} rad/s there: stick pulses, or another offset"
+        fix = "the firmware's map from sticks to rates"
+        return [Finding("doubt", subject, text, "rate_command_unit", middle[axis], 0.95, fix)]
     for words, factor in UNITS.items():
         if abs(np.log(gain * factor)) < np.log(1.4) and (factor > 1.0 or _gyro_is_right(rows)):
             text = f"{figures}, by {gain:.3g} of it: it is {words}"

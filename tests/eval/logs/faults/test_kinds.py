@@ -123,6 +123,14 @@ def test_the_fix_names_the_signal_whose_unit_or_order_is_wrong(wrong, signal, fi
     assert (found.signal, found.fix) == (signal, f"--read {fix}")
 
 
+def test_stick_pulses_are_no_degrees_per_second():
+    parts = good(end=8.0)
+    parts["cmd_rate"] = 1500.0 + 50.0 * parts["cmd_rate"]
+    (found,) = [f for f in checked(parts)[0] if f.signal == "rate command"]
+    assert (found.fault, found.is_open) == ("rate_command_unit", True)
+    assert "stick pulses" in found.evidence and "--read" not in found.fix
+
+
 def test_commands_of_swapped_axes_are_not_late():
     """By its own axis the command may fit best after another time."""
     time_s = good(end=10.0)["time"]
@@ -263,6 +271,41 @@ def test_a_calm_flight_says_what_it_does_not_show():
     assert unseen >= {"attitude", "gyro_scale", "velocity_frame", "motor_order"}
     assert unseen <= FAULTS.keys()
     assert not {f.fault for f in findings if f.is_open}
+
+
+@pytest.mark.parametrize("since_s", [0.0, 3.0])
+@pytest.mark.parametrize(("name", "signal"), [("quat", "attitude"), ("pos", "position")])
+def test_a_pose_that_stands_still_while_the_gyro_turns_is_no_other_unit(name, signal, since_s):
+    parts = good(end=8.0)
+    first = int(since_s * HZ)
+    parts[name][first:] = parts[name][first]
+    doubts = [f for f in checked(parts)[0] if f.status in ("corrected", "doubt")]
+    assert [(f.signal, f.is_open) for f in doubts] == [(signal, True)]
+    assert "stands still while the gyro turns" in doubts[0].evidence
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.06])
+@pytest.mark.parametrize(("angle", "status"), [(3.0, ""), (10.0, "note"), (30.0, "doubt")])
+def test_a_body_that_is_defined_askew_is_no_delay(angle, status, late_s):
+    parts = good()
+    parts["quat"] = known_flight.fly(parts["time"] - late_s).quat
+    turn = Rotation.from_euler("z", angle, degrees=True)
+    turned = Rotation.from_quat(parts["quat"], scalar_first=True) * turn
+    parts["quat"] = turned.as_quat(scalar_first=True)
+    found = check_clock(parts)
+    axes = [f for f in found if f.signal == "pose axes"]
+    assert [(f.status, f.is_open) for f in axes] == [(status, status == "doubt")] * bool(status)
+    (delay,) = [f for f in found if f.signal == "pose delay"]
+    ms = float(delay.evidence.split("it is ")[1].split(" ms")[0])
+    assert ms == pytest.approx(1e3 * late_s, abs=6.0)
+
+
+@pytest.mark.parametrize("axes", [[0], [1], [2], [0, 1, 2]])
+def test_an_axis_of_the_gyro_that_is_dead_is_no_order_of_the_motors(axes):
+    parts = good(end=8.0)
+    parts["rate"][:, axes] = 0.0
+    doubts = [f for f in checked(parts)[0] if f.status in ("corrected", "doubt")]
+    assert [(f.fault, f.is_open) for f in doubts] == [("gyro_axes", True)]
 
 
 def test_every_name_is_in_the_catalogue():

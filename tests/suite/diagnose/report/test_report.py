@@ -12,6 +12,7 @@ from suite.common.console import Console
 from suite.common.report import html
 from suite.diagnose import run
 from suite.diagnose.config import Config
+from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import Candidate, make_space
 from suite.diagnose.evidence.moments import centred
 from suite.diagnose.identify.run import is_identified
@@ -20,6 +21,7 @@ from suite.diagnose.report import diagnosis_json as as_json
 from suite.diagnose.report.charts import series_chart
 from suite.diagnose.report.page import channels_grid, page
 from suite.diagnose.search.evaluation import NamedEffect
+from suite.diagnose.sources.source import FAR
 from suite.diagnose.verdict.actuators import actuator_mismatches
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN
@@ -276,6 +278,15 @@ def test_a_file_of_suite_identify_is_not_sent_back_to_it(tmp_path):
     assert not is_identified(str(path))
     steps = summary.next_steps(entries("unknown", identified=True))
     assert "repeat it if the vehicle has changed" in steps[1]
+
+
+def test_flights_that_no_rollout_comes_near_do_not_agree():
+    log = fly(PLAIN, 0, duration_s=4.0, noise=0.1)
+    log = replace(log, rate_cmd_b=log.rate_cmd_b + [20.0, 0.0, 0.0])
+    found = as_json.diagnosis_json(diagnose([log], PLAIN))
+    assert found["verdict"] == "no_gap" and FAR in found["warnings"]
+    assert "stay far from the measured ones" in found["headline"]
+    assert "as it is" not in " ".join(summary.next_steps(found))
 
 
 @pytest.mark.parametrize("verdict", ["no_gap", "named", "partly"])
