@@ -28,6 +28,8 @@ from eval.logs.flight_log import FlightLog, log_from_columns
 
 SLOW_HZ = 40.0
 """A signal below this rate gets a note [Hz]."""
+PAUSE_S = 5.0
+"""After a longer gap there may be another flight [s]."""
 END_S = 0.5
 """A signal that begins or ends this much later or earlier than the others gets a note [s]."""
 SIGNAL_TEXTS = {
@@ -224,6 +226,8 @@ def _notes_on_rates(recording: Recording, time_s: np.ndarray) -> list[Finding]:
         if gaps:
             longest = float(np.max(np.diff(times)))
             text = f"{gaps} gaps, the longest {longest:.2g} s: left empty"
+            if longest > PAUSE_S:
+                text += "; if another flight follows, cut it off with --end"
             findings.append(Finding("note", subject, text))
     return findings
 

@@ -87,10 +87,14 @@ def make_signal(
     backwards = int(np.sum(~forward))
     if backwards > BACKWARDS_MAX * len(time_s):
         row = int(np.flatnonzero(finite)[np.argmin(forward)]) + 1
-        reason = (
-            f"time does not increase in {backwards} of {len(time_s)} samples of {name!r}; "
-            "cut the file to one flight, and check which column is the time"
-        )
+        steps_back = int(np.sum(np.diff(time_s) < 0.0))
+        advice = "cut the file to one flight, and check which column is the time"
+        if not steps_back:
+            advice = "drop repeated rows, or write the time with more digits"
+        elif steps_back > BACKWARDS_MAX * len(time_s):
+            advice = "sort the rows by time, and check which column is the time"
+        reason = f"time does not increase in {backwards} of {len(time_s)} samples of {name!r}; "
+        reason += advice
         raise FlightLogError(file, "time", row, reason)
     note = f"{backwards} samples of {name!r} whose time does not increase are left out"
     finding = Finding("note", "time", note) if backwards else None

@@ -139,7 +139,7 @@ def check_columns(
         _check_quaternion(kept, row_number, name)
     step = float(np.median(np.diff(kept["time"])))
     if step > 0.2:
-        warnings.append(f"{name}: rows are {step:.3g} s apart; `time` should be in seconds")
+        warnings.append(f"{name}: rows are {step:.3g} s apart, if `time` is in seconds")
     return kept, rows, warnings
 
 

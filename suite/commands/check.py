@@ -52,6 +52,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: if there is nothing to check, or a file is refused.
     """
+    from eval.logs.faults.check import NOT_CHECKED
     from suite.judging.checking import check_flight_files, check_policy
 
     if not config.flights and not config.policy and not config.vehicle:
@@ -68,6 +69,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         result = check_flight_files(config.flights, config.vehicle, policy, out, console)
         result["findings"] = [*answer["findings"], *result["findings"]]
         answer |= result
-    if not any(finding["status"] in ("doubt", "corrected") for finding in answer["findings"]):
+    if config.out != Config.out and not config.fix:
+        console.note("--out is not used: nothing is written without --fix")
+    if not any(
+        finding["status"] in ("doubt", "corrected") or finding["signal"] == NOT_CHECKED
+        for finding in answer["findings"]
+    ):
         console.say("no fault found")
     return answer

@@ -38,6 +38,10 @@ from eval.vehicles.vehicle import Vehicle
 
 LEAST_ROWS = 50
 """Least rows for any check."""
+SLOWEST_S = 0.1
+"""Largest time between rows at which the checks find faults [s]."""
+NOT_CHECKED = "not checked"
+"""Subject of the note on a log with too few or too slow rows."""
 
 
 @dataclass(frozen=True)
@@ -174,6 +178,11 @@ def check_log(
     measured = {"time": log.time_s, **action, **signals_of(columns_from_log(log))}
     findings += check_controller_rate(measured, against.policy_hz)
     findings += [] if log.pos_w is None else check_jumps(log.time_s, log.pos_w)
+    step_s = float(np.median(np.diff(read_rows({"time": log.time_s}, readings)["time"])))
+    if len(log.time_s) < LEAST_ROWS or step_s > SLOWEST_S:
+        text = f"{len(log.time_s)} rows, {step_s:.2g} s apart: at least {LEAST_ROWS} rows, "
+        text += f"{SLOWEST_S:g} s apart or less, are needed"
+        findings.append(Finding("note", NOT_CHECKED, text))
     findings += check_vehicle_name(log.about, against.vehicle)
     again = {finding.fault for finding in findings if finding.fault}
     stored = [f for f in findings_of(log.about) if f.status in ("doubt", "corrected")]

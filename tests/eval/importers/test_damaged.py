@@ -14,6 +14,7 @@ import pytest
 from eval.importers import import_log
 from eval.importers.formats import mcap, px4
 from eval.importers.options import ImportOptions
+from eval.importers.signals import make_signal
 from eval.logs.columns import FlightLogError
 from tests.support import foreign_logs as made
 from tests.support import known_flight, raw_logs
@@ -336,3 +337,12 @@ def test_the_crazyflie_clients_csv_has_a_time(tmp_path):
     np.savetxt(path, table, delimiter=",", header=header, comments="", fmt="%.9g")
     log, _ = import_log(path, None, ImportOptions(map=Path("crazyflie")))
     near(log.rate_b, truth.rate, 1e-5)
+
+
+@pytest.mark.parametrize(
+    ("rows", "advice"),
+    [(np.arange(300)[::-1], "sort the rows"), (np.repeat(np.arange(150), 2), "repeated rows")],
+)
+def test_what_is_wrong_with_the_times_is_in_the_advice(rows, advice):
+    with pytest.raises(FlightLogError, match=advice):
+        make_signal(0.01 * rows, np.zeros((300, 3)), "log", "position")

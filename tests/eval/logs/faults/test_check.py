@@ -11,6 +11,9 @@ from eval.logs.faults.checked import check_flights, lines_of
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.position import check_jumps
 from eval.logs.faults.reading import parse_readings, read_rows
+from eval.logs.flight_log import columns_from_log, log_from_columns, write_flight
+from suite.commands.check import Config, run
+from suite.common.console import Console
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN
 
@@ -132,3 +135,14 @@ def test_the_rate_of_slow_commands_is_that_of_their_own_rows():
         return [one.status for one in found if one.signal == "controller"]
 
     assert status(row_hz / 10) == ["ok"] and status(row_hz / 5) == ["doubt"]
+
+
+def test_a_log_that_is_too_slow_to_check_has_no_clean_bill(tmp_path, capsys):
+    log = fly(PLAIN, 0, duration_s=8.0)
+    every = round(0.2 / float(np.median(np.diff(log.time_s))))
+    columns = {name: value[::every] for name, value in columns_from_log(log).items()}
+    path = write_flight(tmp_path / "slow.csv", log_from_columns(columns, {}, "slow"))
+    run(Config((path,), out=tmp_path / "unused"), Console())
+    said = "".join(capsys.readouterr())
+    assert "not checked" in said and "no fault found" not in said
+    assert "nothing is written without --fix" in said
