@@ -77,6 +77,7 @@ def as_a_program(tmp_path, monkeypatch):
         monkeypatch.setattr(EFFECTS, table, dict(getattr(EFFECTS, table)))
 
 
+@pytest.mark.filterwarnings("ignore:.*after a very short training this is no fault")
 @pytest.mark.parametrize("name", EXAMPLES)
 @pytest.mark.parametrize("short", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_example_runs(name, short, tmp_path, monkeypatch, capsys):
