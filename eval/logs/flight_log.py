@@ -33,7 +33,7 @@ QUATERNION_ROUNDING = 1e-12
 """Quaternions closer to unit norm than this are not normalised, so that a log reads back equal."""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class FlightLog:
     """One flight as arrays on its T rows; a value that is missing is NaN.
 
@@ -78,10 +78,6 @@ class FlightLog:
     """True where `vel_w` was computed from `pos_w`."""
     warnings: tuple[str, ...] = ()
     """Oddities of the file that did not prevent its use."""
-
-    def __repr__(self) -> str:
-        """Return the name and the size only, since arrays would fill pages."""
-        return f"<FlightLog {self.name}: {len(self.time_s)} rows>"
 
     @property
     def duration_s(self) -> float:

@@ -40,8 +40,10 @@ def track_notes(name: str, track: Track) -> list[str]:
     length_m = np.linalg.norm(way_w, axis=1)
     way_w = way_w / np.maximum(length_m, 1e-9)[:, None]
     start_deg = np.rad2deg(track.start_yaw)
-    heading = [np.array([np.cos(yaw), np.sin(yaw)]) @ way_w[0, :2]
-               for yaw in np.deg2rad([start_deg, np.rad2deg(start_deg)])]  # fmt: skip
+    # The cosines for the yaw as read, and for radians that were written as degrees.
+    heading = [
+        np.array([np.cos(yaw), np.sin(yaw)]) @ way_w[0, :2] for yaw in (track.start_yaw, start_deg)
+    ]
     if _in_radians(start_deg) and heading[0] < AWAY and heading[1] > TOWARDS:
         notes.append(f"the start has a yaw of {start_deg:.4g} deg; is start.yaw_deg in radians?")
     for gate in np.flatnonzero((length_m[1:] > 1e-3) & (length_m[1:] < STEP_LEAST_M))[:1]:
