@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import get_lapack_funcs, solve_triangular
 from scipy.optimize import minimize, minimize_scalar
+from scipy.special import expit, logit
 
 from suite.diagnose.data.noise import Linearisation, at_least, noise_of, typical_variance
 from suite.diagnose.data.windows import SLICES, FlightWindows
@@ -219,7 +220,8 @@ def _without_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.nd
     degree = stretches.powers.shape[1]
     basis, upper = np.linalg.qr(white[:, :degree])
     values = white[:, degree:]
-    energy = (values**2).sum(axis=0) - ((basis.T @ values) ** 2).sum(axis=0)
+    # Rounding errors can make the energy of a flight at rest negative.
+    energy = np.maximum((values**2).sum(axis=0) - ((basis.T @ values) ** 2).sum(axis=0), 0.0)
     half_log_det = np.log(np.diag(lower)).sum() + np.log(np.abs(np.diag(upper))).sum()
     return energy, len(values) - degree, float(half_log_det)
 
@@ -273,13 +275,13 @@ def _with_drift(
     """Return the process with the best `score` and the T of `begin`, and that score."""
 
     def process_at(x: np.ndarray) -> _Process:
-        share = float(1.0 / (1.0 + np.exp(-x[0])))
-        return begin._replace(share=share, drift=float(np.exp(np.clip(x[1], -12.0, 14.0))))
+        drift = float(np.exp(np.clip(x[1], -12.0, 14.0)))
+        return begin._replace(share=float(expit(x[0])), drift=drift)
 
     share = np.clip(begin.share, 0.01, 0.99)
     best = minimize(
         lambda x: -score(process_at(x)),
-        np.array([np.log(share / (1.0 - share)), np.log(drift)]),
+        np.array([logit(share), np.log(drift)]),
         method="Nelder-Mead",
         options={"maxfev": 30, "xatol": 0.05, "fatol": 0.1},
     )

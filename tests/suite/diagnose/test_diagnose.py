@@ -127,6 +127,8 @@ def outcome(logs, drive="commands"):
     """The JSON of a diagnosis that went through all its steps, or the message of its refusal."""
     try:
         result = diagnose(logs, LAGGED, by="rollouts", drive=drive)
+    except np.linalg.LinAlgError:  # a ValueError too, but no message for a user
+        raise
     except ValueError as error:
         assert len(str(error)) > 20
         return str(error)

@@ -188,6 +188,13 @@ def test_a_colour_is_found_where_it_is(windows, group, share, lasts_s):
     np.testing.assert_allclose(noise.sigma[SLICES["rates"]], 1.0, rtol=0.1)
 
 
+def test_flights_without_noise_beside_noisy_ones_leave_it_finite(windows):
+    values = noise_like(windows, 0.85, 0.02, np.random.default_rng(0), "velocity")
+    values[5:] = np.asarray(windows.row_s)[5:, :, None]  # rounding leaves a negative energy
+    noise = measured(values, windows)
+    assert noise.coloured and np.isfinite(noise.sigma[:12]).all()
+
+
 def test_groups_of_one_estimator_have_one_correlation_time(windows):
     rng = np.random.default_rng(3)
     weak = noise_like(windows, 0.02, 0.05, rng, "velocity")
