@@ -117,6 +117,7 @@ def diagnosed(config, console):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*after a very short training this is no fault")
 def test_the_notebook_runs_from_top_to_bottom():
     cells = json.loads((ROOT / "examples" / "tour.ipynb").read_text(encoding="utf-8"))["cells"]
     spaces = {}

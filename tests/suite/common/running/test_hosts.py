@@ -172,9 +172,15 @@ def test_two_processes_train_as_one_and_go_on_after_a_kill_of_either(trainings, 
         processes[killed].send_signal(signal.SIGKILL)
     finally:
         codes, said = ends(processes)
-    assert codes[killed] == -signal.SIGKILL and codes[1 - killed] == 1, said
-    assert "another process of this training is gone" in said[1 - killed]
-    assert "same command on every host" in said[1 - killed] and "Traceback" not in said[1 - killed]
+    assert codes[killed] == -signal.SIGKILL, said
+    if killed == 0 and codes[1] == -signal.SIGABRT:
+        # JAX may notice first that its coordinator is gone, and ends the process itself.
+        assert "another task died" in said[1]
+    else:
+        assert codes[1 - killed] == 1, said
+        assert "another process of this training is gone" in said[1 - killed]
+        assert "Repeat the command on every host" in said[1 - killed]
+        assert "Traceback" not in said[1 - killed]
     assert 20 <= len(lines(curve)) < 120, "it was cut off on the way"
     codes, said = ends(trainings.both(out))
     assert codes == [0, 0], said
