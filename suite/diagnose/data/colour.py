@@ -72,14 +72,11 @@ class _Process(NamedTuple):
     """Variance of the model's error after a second, over the variance of the noise."""
 
 
-def measured_noise(
-    linear: Linearisation, windows: FlightWindows, limits: Thresholds = THRESHOLDS
-) -> Noise:
-    """Estimate the measurement noise from the residuals of `windows`."""
-    sigma = noise_of(linear.residual, windows, limits=limits)
-    residual = _without_start(linear, np.where(windows.valid, 1.0 / sigma, 0.0))
-    sigma = noise_of(residual, windows, limits=limits)
-    groups = _all_stretches(residual, sigma, windows, ESTIMATED, limits)
+def measured_noise(linear: Linearisation, limits: Thresholds = THRESHOLDS) -> Noise:
+    """Estimate the measurement noise from the residuals of windows."""
+    residual, _ = _without_start(linear, limits)
+    sigma = noise_of(residual, linear.windows, limits=limits)
+    groups = _stretches(residual, sigma, linear.windows, ESTIMATED, limits)
     fits = {name: _fit_by_time(stretches, limits) for name, stretches in groups.items()}
     gains = np.sum([[gain for _, gain in by_time] for by_time in fits.values()], axis=0)
     coloured = {}
@@ -92,18 +89,15 @@ def measured_noise(
     return Noise(at_least(sigma, limits), coloured)
 
 
-def residual_as_noise(
-    linear: Linearisation, windows: FlightWindows, limits: Thresholds = THRESHOLDS
-) -> Noise:
+def residual_as_noise(linear: Linearisation, limits: Thresholds = THRESHOLDS) -> Noise:
     """Return the noise if the whole residual counts as noise, including the model's error.
 
     It is used where even the best model does not fit: intervals then allow for the bias that the
     wrong model causes.
     """
-    sigma = noise_of(linear.residual, windows, limits=limits)
-    residual = _without_start(linear, np.where(windows.valid, 1.0 / sigma, 0.0))
+    residual, sigma = _without_start(linear, limits)
     coloured = {}
-    for name, stretches in _all_stretches(residual, sigma, windows, SLICES, limits).items():
+    for name, stretches in _stretches(residual, sigma, linear.windows, SLICES, limits).items():
         rows = len(stretches.time_s)
         bare = stretches._replace(powers=np.zeros((rows, 0)), drift=np.zeros((rows, rows)))
         process, _ = max(_fit_by_time(bare, limits, MISFIT_TIMES_S), key=lambda fit: fit[1])
@@ -135,76 +129,64 @@ def _correlation(time_s: np.ndarray, share: float, lasts_s: float) -> np.ndarray
     return (1.0 - share) * np.eye(time_s.shape[-1]) + share * np.exp(-lag_s / lasts_s)
 
 
-def _without_start(linear: Linearisation, weight: np.ndarray) -> np.ndarray:
+def _without_start(linear: Linearisation, limits: Thresholds) -> tuple[np.ndarray, np.ndarray]:
     """Return the residuals (W, N, 19) without what an error of each window's start state explains.
 
-    `weight` (W, N, 19) is 1 / noise.
+    They are weighted by the noise (19,) of the residuals with it, which is returned as well.
     """
     residual, slope = linear.residual, linear.start_slope
+    sigma = noise_of(residual, linear.windows, limits=limits)
+    weight = np.where(linear.windows.valid, 1.0 / sigma, 0.0)
     rows = (slope * np.nan_to_num(weight)[..., None]).reshape(len(slope), -1, slope.shape[-1])
     white = (residual * np.nan_to_num(weight)).reshape(len(slope), -1, 1)
     transposed = np.swapaxes(rows, 1, 2)
     size = np.sqrt(np.einsum("wfm,wmf->wf", transposed, rows))[:, :, None] + 1e-30
     gram = (transposed / size) @ (rows / np.swapaxes(size, 1, 2)) + 1e-9 * np.eye(slope.shape[-1])
     change = np.linalg.solve(gram, (transposed / size) @ white) / size
-    return residual - (slope @ change[:, None])[..., 0]
+    return residual - (slope @ change[:, None])[..., 0], sigma
 
 
-def _all_stretches(
+def _stretches(
     residual: np.ndarray,
     sigma: np.ndarray,
     windows: FlightWindows,
     names: Iterable[str],
     limits: Thresholds,
 ) -> dict[str, _Stretches]:
-    """Return the stretches by group of channels, of those in `names` with enough measurements."""
-    measured = (name for name in names if np.isfinite(sigma[SLICES[name]]).all())
-    groups = {name: _stretches(residual, windows, name, limits) for name in measured}
-    return {name: stretches for name, stretches in groups.items() if stretches is not None}
+    """Return the stretches of `residual` (W, N, 19), by group of channels.
 
-
-def _stretches(
-    residual: np.ndarray, windows: FlightWindows, name: str, limits: Thresholds
-) -> _Stretches | None:
-    """Return the stretches of `residual` (W, N, 19) in the group of channels `name`.
-
-    None with too few rows. All stretches get the same number of rows: that which nine of ten usable
-    windows have.
+    They are those of the groups in `names` that have enough rows. All stretches of a group get the
+    same number of rows: that which nine of ten usable windows have.
     """
-    valid = np.asarray(np.all(windows.valid[..., SLICES[name]], axis=-1))
-    count = valid.sum(axis=1)
-    if not len(count) or count.max() < LEAST_ROWS:
-        return None
-    rows = int(np.quantile(count[count >= LEAST_ROWS], 0.1))
-    chosen = np.flatnonzero(count >= rows)
-    first_rows = np.argsort(~valid[chosen], axis=1, kind="stable")[:, :rows]
-    times_s = np.take_along_axis(np.asarray(windows.row_s)[chosen], first_rows, axis=1)
-    time_s = np.median(times_s, axis=0)
-    # Windows with a lost row or jitter stay, since their times differ little from the median times.
-    # Windows with a hole are left out.
-    alike = np.abs(times_s - time_s).max(axis=1) <= limits.colour_aside * np.diff(time_s).mean()
-    values = residual[chosen][..., SLICES[name]]
-    stacked = np.take_along_axis(values, first_rows[..., None], axis=1)[alike]
-    if not len(stacked):
-        return None
-    time = (time_s - time_s.mean()) / (time_s[-1] - time_s[0])
-    return _Stretches(
-        time_s,
-        np.moveaxis(stacked, 1, 0).reshape(rows, -1),
-        time[:, None] ** np.arange(limits.colour_degree + 1),
-        _drift_covariance(time_s - time_s[0], INTEGRATED.get(name, 0)),
-    )
-
-
-def _drift_covariance(time_s: np.ndarray, integrations: int) -> np.ndarray:
-    """Return the covariance (N, N) of white noise that is integrated once or twice; else zeros.
-
-    The variance after a second is 1.
-    """
-    early, late = np.minimum.outer(time_s, time_s), np.maximum.outer(time_s, time_s)
-    if integrations == 2:
-        return 0.5 * early**2 * (3.0 * late - early)
-    return early if integrations == 1 else np.zeros_like(early)
+    groups = {}
+    for name in names:
+        channels = SLICES[name]
+        valid = np.asarray(np.all(windows.valid[..., channels], axis=-1))
+        count = valid.sum(axis=1)
+        if not np.isfinite(sigma[channels]).all() or count.max(initial=0) < LEAST_ROWS:
+            continue
+        rows = int(np.quantile(count[count >= LEAST_ROWS], 0.1))
+        chosen = np.flatnonzero(count >= rows)
+        first_rows = np.argsort(~valid[chosen], axis=1, kind="stable")[:, :rows]
+        times_s = np.take_along_axis(np.asarray(windows.row_s)[chosen], first_rows, axis=1)
+        time_s = np.median(times_s, axis=0)
+        # Windows with a lost row or jitter stay, since their times differ little from the median
+        # times. Windows with a hole are left out.
+        alike = np.abs(times_s - time_s).max(axis=1) <= limits.colour_aside * np.diff(time_s).mean()
+        values = residual[chosen][..., channels]
+        stacked = np.take_along_axis(values, first_rows[..., None], axis=1)[alike]
+        if not len(stacked):
+            continue
+        time = (time_s - time_s.mean()) / (time_s[-1] - time_s[0])
+        powers = time[:, None] ** np.arange(limits.colour_degree + 1)
+        # The drift is white noise that is integrated once or twice.
+        since_s = time_s - time_s[0]
+        early, late = np.minimum.outer(since_s, since_s), np.maximum.outer(since_s, since_s)
+        once_twice = {1: early, 2: 0.5 * early**2 * (3.0 * late - early)}
+        drift = once_twice.get(INTEGRATED.get(name, 0), np.zeros_like(early))
+        residuals = np.moveaxis(stacked, 1, 0).reshape(rows, -1)
+        groups[name] = _Stretches(time_s, residuals, powers, drift)
+    return groups
 
 
 def _without_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.ndarray, int, float]:
@@ -226,16 +208,6 @@ def _without_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.nd
     return energy, len(values) - degree, float(half_log_det)
 
 
-def _likelihood(stretches: _Stretches, process: _Process) -> float:
-    """Return the restricted log-likelihood of `process`.
-
-    Every stretch has a noise variance of its own, so that a few bad stretches do not dominate.
-    """
-    energy, freedom, half_log_det = _without_polynomial(stretches, process)
-    size = 0.5 * freedom * np.log(np.maximum(energy, 1e-300))
-    return -float((half_log_det + size).sum())
-
-
 def _fit_by_time(
     stretches: _Stretches, limits: Thresholds, times_s: Sequence[float] = TIMES_S
 ) -> list[tuple[_Process, float]]:
@@ -246,8 +218,12 @@ def _fit_by_time(
     """
 
     def score(process: _Process) -> float:
+        """Return the restricted log-likelihood, less the cost of a drift."""
+        energy, freedom, half_log_det = _without_polynomial(stretches, process)
+        # Every stretch has a noise variance of its own, so that a few bad ones do not dominate.
+        size = 0.5 * freedom * np.log(np.maximum(energy, 1e-300))
         cost = limits.drift_gain if process.drift else 0.0
-        return _likelihood(stretches, process) - cost
+        return -float((half_log_det + size).sum()) - cost
 
     drifts = DRIFTS if stretches.drift.any() else (0.0,)
     white = max((_Process(0.0, 1.0, drift) for drift in drifts), key=score)

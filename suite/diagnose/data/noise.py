@@ -24,6 +24,8 @@ class Linearisation(NamedTuple):
     numbers."""
     offset: np.ndarray
     """(W, F) correction of each window's start numbers with which the residuals were computed."""
+    windows: FlightWindows
+    """The windows."""
 
     @property
     def start_slope(self) -> np.ndarray:

@@ -174,7 +174,11 @@ def cut(
             continue
         rotors = state.rotor_speed if rotor_input else None
         flown = ~near_ground(state, vehicle, rotors, limits, lasting=True)
-        inputs = [*_input_rows(log, rotor_input), flown]
+        # Each input has rows of its own: a rotor speed, or the commands and the loop's rates.
+        table = log.rotor_speed if rotor_input else log.command
+        assert table is not None
+        parts = [column[:, None] for column in table.T] if rotor_input else [table, log.rate_b]
+        inputs = [*(np.isfinite(part).all(axis=1) for part in parts), flown]
         rows = _start_rows(log, state.whole & flown, inputs, since_s, stride_s, limits)
         if not rows:
             shortest_s = LENGTH_S + BURN_IN_S + HISTORY_S
@@ -202,10 +206,13 @@ def cut(
 def take(data: Any, chosen: Array) -> Any:
     """Return the `chosen` windows of `data`, a named tuple of arrays (W, ...), such as windows.
 
-    They are chosen by indices or by (W,) bool. Fields that are None stay None.
+    They are chosen by indices or by (W,) bool. A field may be None, or such a tuple itself.
     """
-    fields = (None if field is None else np.asarray(field)[chosen] for field in data)
-    return type(data)(*fields)
+    if data is None:
+        return None
+    if not isinstance(data, tuple):
+        return np.asarray(data)[chosen]
+    return type(data)(*(take(field, chosen) for field in data))
 
 
 def _start_rows(
@@ -240,16 +247,6 @@ def _start_rows(
             next_s = begin_s + stride_s
 
 
-def _input_rows(log: FlightLog, rotor_input: bool) -> list[np.ndarray]:
-    """Return for each input, and for the rates of the loop, the rows with a value, (T,) bool."""
-    if rotor_input:
-        assert log.rotor_speed is not None
-        return [np.isfinite(column) for column in log.rotor_speed.T]
-    assert log.thrust_cmd is not None and log.rate_cmd_b is not None
-    command = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
-    return [np.asarray(np.isfinite(part).all(axis=1)) for part in (command, log.rate_b)]
-
-
 class _Input(NamedTuple):
     """Steps and commands of one window, as in `FlightWindows`."""
 
@@ -267,11 +264,9 @@ def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, stri
     begin_s, period_s = log.time_s[row], 1.0 / vehicle.controller.frequency
     length_s = log.time_s[_rows(log, begin_s)[-1]] - begin_s
     time_s, command = log.time_s, np.tile([GRAVITY, 0.0, 0.0, 0.0], (len(log.time_s), 1))
-    if log.thrust_cmd is not None and log.rate_cmd_b is not None:
-        logged = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
-        finite = np.isfinite(logged).all(axis=1)
-        if finite.any():
-            time_s, command = time_s[finite], logged[finite]
+    logged = log.command
+    if logged is not None and (finite := np.isfinite(logged).all(axis=1)).any():
+        time_s, command = time_s[finite], logged[finite]
     first_s, last_s = begin_s - BURN_IN_S - HISTORY_S - 1e-9, begin_s + length_s + 1e-9
     used = slice(max(np.searchsorted(time_s, first_s) - 1, 0), np.searchsorted(time_s, last_s) + 1)
     time_s, command = with_lost_rows(time_s[used] - begin_s, command[used])

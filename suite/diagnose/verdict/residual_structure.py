@@ -77,7 +77,7 @@ def disturbance_equations(
     `windows` are those of the `evidence`, or the same with another input.
     """
     disturbed, knot = evidence.model.respond(estimate, windows)
-    equations = block_of(evidence.whitening, disturbed, range(6 * KNOTS), windows).equations
+    equations = block_of(evidence.whitening, disturbed, range(6 * KNOTS)).equations
     shapes = _shapes(knot, np.asarray(windows.start_s))
     return DisturbanceEquations(
         equations.hessian, equations.gradient, knot, *shapes, evidence.limits

@@ -75,7 +75,7 @@ def refit(model: RolloutModel, task: sysid_baseline.Task) -> tuple[np.ndarray, N
     while True:
         directions = [*indices, *model.starts]
         linear = model.linearise(state, task.windows, directions)
-        evidence, known = rollout_evidence(model, task.windows, linear, along=indices)
+        evidence, known = rollout_evidence(model, linear, along=indices)
         state, block = fit(evidence, state, indices, known=known)
         if evidence.trusted.valid.sum() <= used_values:
             return state.theta[indices], block.equations

@@ -69,8 +69,8 @@ def test_an_error_is_read_where_its_signal_was_measured():
     slope = np.zeros((*valid.shape, 16))
     slope[..., np.arange(12), np.arange(12)] = 1.0
     seen = np.where(valid, residual, 0.0), np.where(valid[..., None], slope, 0.0)
-    linear = Linearisation(*seen, np.zeros((count, 16)))
-    last = gap_of(linear, windows, Noise(sigma, {})).channels["1 s"]
+    linear = Linearisation(*seen, np.zeros((count, 16)), windows)
+    last = gap_of(linear, Noise(sigma, {})).channels["1 s"]
     assert last["position"].error == pytest.approx(0.99**2, rel=1e-6)
     assert last["velocity"].error == pytest.approx(2.0, rel=1e-6)
 
@@ -102,10 +102,10 @@ def test_a_window_that_diverges_is_left_out_and_one_without_an_error_counts(monk
     monkeypatch.setattr(model_error, "block_of", block_of)
     errors = np.ones((3, 5, 19)) * np.array([2.0, 0.0, 1.0])[:, None, None]
     errors[2, 4, 7] = np.inf
-    linear = Linearisation(np.zeros_like(errors), *np.zeros((2, 0)))
-    difference = model_error._difference(linear, errors)
     windows = SimpleNamespace(valid=np.ones(errors.shape, bool))
-    rms = model_error._rms(difference, linear, Noise(np.ones(19), {}), None, windows)
+    linear = Linearisation(np.zeros_like(errors), *np.zeros((2, 0)), windows)
+    difference = model_error._difference(linear, errors)
+    rms = model_error._rms(difference, linear, Noise(np.ones(19), {}), None)
     assert rms == pytest.approx(np.full(6, np.sqrt((2.0**2 + 0.0) / 2.0)))
 
 

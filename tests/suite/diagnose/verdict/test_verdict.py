@@ -103,7 +103,7 @@ def test_a_gap_has_its_interval_its_noise_floor_and_the_share_that_remains_of_it
 def test_a_diagnosis_is_measured_on_what_was_held_out(drag, found_drag, flown):
     assert drag.verdict.label == "named" and drag.flights.driven_by == "commands"
     linear = gaps.from_true_starts(flown.model, found_drag.theta, flown.held)
-    again = gaps.gap_of(linear, flown.held, of_rollouts(found_drag.search.last).noise)
+    again = gaps.gap_of(linear, of_rollouts(found_drag.search.last).noise)
     np.testing.assert_array_equal(again.score, found_drag.after.score)
     assert found_drag.after.rms < 1.3 < found_drag.before.rms
 
