@@ -19,7 +19,7 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.special import expit, logit
 
 from suite.diagnose.data.noise import Linearisation, at_least, noise_of, typical_variance
-from suite.diagnose.data.windows import SLICES, FlightWindows
+from suite.diagnose.data.windows import SLICES, STATE, FlightWindows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 TIMES_S = tuple(np.geomspace(0.012, 0.2, 8).tolist())
@@ -74,9 +74,9 @@ class _Process(NamedTuple):
 
 def measured_noise(linear: Linearisation, limits: Thresholds = THRESHOLDS) -> Noise:
     """Estimate the measurement noise from the residuals of windows."""
-    residual, _ = _without_start(linear, limits)
-    sigma = noise_of(residual, linear.windows, limits=limits)
-    groups = _stretches(residual, sigma, linear.windows, ESTIMATED, limits)
+    linear, _ = _without_start(linear, limits)
+    sigma = noise_of(linear.residual, linear.windows, limits=limits)
+    groups = _stretches(linear, sigma, ESTIMATED, limits)
     fits = {name: _fit_by_time(stretches, limits) for name, stretches in groups.items()}
     gains = np.sum([[gain for _, gain in by_time] for by_time in fits.values()], axis=0)
     coloured = {}
@@ -95,9 +95,9 @@ def residual_as_noise(linear: Linearisation, limits: Thresholds = THRESHOLDS) ->
     It is used where even the best model does not fit: intervals then allow for the bias that the
     wrong model causes.
     """
-    residual, sigma = _without_start(linear, limits)
+    linear, sigma = _without_start(linear, limits)
     coloured = {}
-    for name, stretches in _stretches(residual, sigma, linear.windows, SLICES, limits).items():
+    for name, stretches in _stretches(linear, sigma, SLICES, limits).items():
         rows = len(stretches.time_s)
         bare = stretches._replace(powers=np.zeros((rows, 0)), drift=np.zeros((rows, rows)))
         process, _ = max(_fit_by_time(bare, limits, MISFIT_TIMES_S), key=lambda fit: fit[1])
@@ -129,12 +129,13 @@ def _correlation(time_s: np.ndarray, share: float, lasts_s: float) -> np.ndarray
     return (1.0 - share) * np.eye(time_s.shape[-1]) + share * np.exp(-lag_s / lasts_s)
 
 
-def _without_start(linear: Linearisation, limits: Thresholds) -> tuple[np.ndarray, np.ndarray]:
-    """Return the residuals (W, N, 19) without what an error of each window's start state explains.
+def _without_start(linear: Linearisation, limits: Thresholds) -> tuple[Linearisation, np.ndarray]:
+    """Return the residuals without what an error of each window's start state explains.
 
     They are weighted by the noise (19,) of the residuals with it, which is returned as well.
     """
-    residual, slope = linear.residual, linear.start_slope
+    residual, first = linear.residual, linear.slope.shape[-1] - linear.offset.shape[1]
+    slope = linear.slope[..., first : first + STATE]
     sigma = noise_of(residual, linear.windows, limits=limits)
     weight = np.where(linear.windows.valid, 1.0 / sigma, 0.0)
     rows = (slope * np.nan_to_num(weight)[..., None]).reshape(len(slope), -1, slope.shape[-1])
@@ -143,22 +144,18 @@ def _without_start(linear: Linearisation, limits: Thresholds) -> tuple[np.ndarra
     size = np.sqrt(np.einsum("wfm,wmf->wf", transposed, rows))[:, :, None] + 1e-30
     gram = (transposed / size) @ (rows / np.swapaxes(size, 1, 2)) + 1e-9 * np.eye(slope.shape[-1])
     change = np.linalg.solve(gram, (transposed / size) @ white) / size
-    return residual - (slope @ change[:, None])[..., 0], sigma
+    return linear._replace(residual=residual - (slope @ change[:, None])[..., 0]), sigma
 
 
 def _stretches(
-    residual: np.ndarray,
-    sigma: np.ndarray,
-    windows: FlightWindows,
-    names: Iterable[str],
-    limits: Thresholds,
+    linear: Linearisation, sigma: np.ndarray, names: Iterable[str], limits: Thresholds
 ) -> dict[str, _Stretches]:
-    """Return the stretches of `residual` (W, N, 19), by group of channels.
+    """Return the stretches of the residuals, by group of channels.
 
     They are those of the groups in `names` that have enough rows. All stretches of a group get the
     same number of rows: that which nine of ten usable windows have.
     """
-    groups = {}
+    windows, groups = linear.windows, {}
     for name in names:
         channels = SLICES[name]
         valid = np.asarray(np.all(windows.valid[..., channels], axis=-1))
@@ -173,7 +170,7 @@ def _stretches(
         # Windows with a lost row or jitter stay, since their times differ little from the median
         # times. Windows with a hole are left out.
         alike = np.abs(times_s - time_s).max(axis=1) <= limits.colour_aside * np.diff(time_s).mean()
-        values = residual[chosen][..., channels]
+        values = linear.residual[chosen][..., channels]
         stacked = np.take_along_axis(values, first_rows[..., None], axis=1)[alike]
         if not len(stacked):
             continue

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.data.windows import CHANNELS, SLICES, STATE, FlightWindows
+from suite.diagnose.data.windows import CHANNELS, SLICES, FlightWindows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
@@ -20,18 +20,12 @@ class Linearisation(NamedTuple):
     residual: np.ndarray
     """(W, N, 19) measured - simulated; zero where nothing was measured."""
     slope: np.ndarray
-    """(W, N, 19, K) derivative of the simulated values; often the last F are by the start
-    numbers."""
+    """(W, N, 19, K) derivative of the simulated values; often the last F are by the start numbers,
+    of which the first 12 are the start state."""
     offset: np.ndarray
     """(W, F) correction of each window's start numbers with which the residuals were computed."""
     windows: FlightWindows
     """The windows."""
-
-    @property
-    def start_slope(self) -> np.ndarray:
-        """(W, N, 19, 12) slopes along each window's start state; the last F must be as above."""
-        size = self.offset.shape[1]
-        return self.slope[..., self.slope.shape[-1] - size :][..., :STATE]
 
 
 def rotor_noise(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> float:
@@ -112,23 +106,16 @@ def noise_like(speed: np.ndarray, limits: Thresholds = THRESHOLDS) -> np.ndarray
     """
     draw = np.random.default_rng(0).standard_normal(speed.shape)
     noise = np.full(speed.shape, np.nan)
-    for k, column in enumerate(speed.T):
-        measured_rows = np.flatnonzero(np.isfinite(column))
-        noise[measured_rows, k] = (
-            _rotor_sigma(column[measured_rows], limits) * draw[: len(measured_rows), k]
-        )
-    return noise
-
-
-def _rotor_sigma(speed: np.ndarray, limits: Thresholds) -> float:
-    """Return the standard deviation of the noise of one rotor's `speed` (T,); 0 with few rows."""
     block, degree = limits.rotor_noise_rows, limits.noise_degree
-    blocks = speed[: len(speed) // block * block].reshape(-1, block)
-    if not len(blocks):
-        return 0.0
     basis = np.linalg.qr(_powers(np.arange(block, dtype=float), degree))[0]
-    remainder = blocks - blocks @ basis @ basis.T
-    return float(np.sqrt(typical_variance((remainder**2).sum(axis=1), block - degree - 1)))
+    for k, column in enumerate(speed.T):
+        rows = np.flatnonzero(np.isfinite(column))
+        blocks = column[rows[: len(rows) // block * block]].reshape(-1, block)
+        energy, sigma = ((blocks - blocks @ basis @ basis.T) ** 2).sum(axis=1), 0.0
+        if len(energy):
+            sigma = float(np.sqrt(typical_variance(energy, block - degree - 1)))
+        noise[rows, k] = sigma * draw[: len(rows), k]
+    return noise
 
 
 def _powers(time_s: np.ndarray, degree: int) -> np.ndarray:

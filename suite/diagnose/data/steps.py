@@ -222,9 +222,6 @@ def start_rotor_error(time_s: np.ndarray, rate_b: np.ndarray, vehicle: Vehicle) 
         return LEAST_START_ERROR
     share = ((time_s[1:-1] - time_s[:-2]) / (time_s[2:] - time_s[:-2]))[:, None]
     rate_error = rate_b[1:-1] - (rate_b[:-2] + share * (rate_b[2:] - rate_b[:-2]))
-    rate_error = rate_error[np.isfinite(rate_error).all(axis=1)]
-    if not len(rate_error):
-        return LEAST_START_ERROR
     # From rates to commanded rotor speeds, by finite differences at hover.
     plant = make_plant(vehicle, LONGEST_S)
     hover = Command(np.full(4, GRAVITY), np.zeros((4, 3)))

@@ -248,8 +248,9 @@ def _start_rows(
 
 
 class _Input(NamedTuple):
-    """Steps and commands of one window, as in `FlightWindows`."""
+    """Rows of the log, and steps and commands as in `FlightWindows`, of one window."""
 
+    rows: np.ndarray
     burn_in: StepGrid
     window: StepGrid
     command_s: np.ndarray
@@ -259,11 +260,18 @@ class _Input(NamedTuple):
 def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, stride: int) -> _Input:
     """Return the inputs of the window at `row`; if there are no commands, those of a hover.
 
-    Every `stride`-th command is used, and held until the next one that is.
+    At most `ROWS` rows are compared. Every `stride`-th command is used, and held until the next one
+    that is.
     """
-    begin_s, period_s = log.time_s[row], 1.0 / vehicle.controller.frequency
-    length_s = log.time_s[_rows(log, begin_s)[-1]] - begin_s
-    time_s, command = log.time_s, np.tile([GRAVITY, 0.0, 0.0, 0.0], (len(log.time_s), 1))
+    time_s, begin_s, period_s = log.time_s, log.time_s[row], 1.0 / vehicle.controller.frequency
+    rows = np.flatnonzero((time_s >= begin_s - 1e-9) & (time_s <= begin_s + LENGTH_S + 1e-9))
+    signals = (log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b, log.acc_b, log.rotor_speed)
+    none = np.full((len(time_s), 1), np.nan)
+    values = [(none if signal is None else signal)[rows] for signal in signals]
+    valid = np.stack([np.isfinite(one).all(axis=1) for one in values], axis=1)
+    rows = rows[thinned(valid, time_s[rows], ROWS)]
+    length_s = time_s[rows[-1]] - begin_s
+    command = np.tile([GRAVITY, 0.0, 0.0, 0.0], (len(time_s), 1))
     logged = log.command
     if logged is not None and (finite := np.isfinite(logged).all(axis=1)).any():
         time_s, command = time_s[finite], logged[finite]
@@ -276,7 +284,7 @@ def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, stri
         inside_s = time_s[(time_s > since_s + 1e-6) & (time_s < until_s - 1e-6)]
         return step_grid(np.array([since_s, *inside_s, until_s]), period_s, longest_s)
 
-    return _Input(grid(-BURN_IN_S, 0.0), grid(0.0, length_s), time_s, command)
+    return _Input(rows, grid(-BURN_IN_S, 0.0), grid(0.0, length_s), time_s, command)
 
 
 def _of_one_shape(inputs: Sequence[_Input], like: FlightWindows | None) -> list[_Input]:
@@ -298,6 +306,7 @@ def _of_one_shape(inputs: Sequence[_Input], like: FlightWindows | None) -> list[
         commands = like.command_s.shape[1]
     return [
         _Input(
+            one.rows,
             padded_grid(one.burn_in, burn_in, at_front=True),
             padded_grid(one.window, steps),
             np.pad(one.command_s, (0, commands - len(one.command_s)), constant_values=np.inf),
@@ -305,17 +314,6 @@ def _of_one_shape(inputs: Sequence[_Input], like: FlightWindows | None) -> list[
         )
         for one in inputs
     ]
-
-
-def _rows(log: FlightLog, begin_s: float) -> np.ndarray:
-    """Return the rows of the window that starts at `begin_s` [s], at most `ROWS` of them."""
-    time_s = log.time_s
-    rows = np.flatnonzero((time_s >= begin_s - 1e-9) & (time_s <= begin_s + LENGTH_S + 1e-9))
-    missing = np.full((len(time_s), 1), np.nan)
-    signals = (log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b, log.acc_b, log.rotor_speed)
-    values = [(missing if signal is None else signal)[rows] for signal in signals]
-    valid = np.stack([np.isfinite(one).all(axis=1) for one in values], axis=1)
-    return rows[thinned(valid, time_s[rows], ROWS)]
 
 
 def _window(
@@ -333,7 +331,7 @@ def _window(
     `state` is the log with a state in every row; every `stride`-th rotor speed is used.
     """
     time_s, begin_s = log.time_s, log.time_s[row]
-    before, window = inputs.burn_in, inputs.window
+    rows, before, window = inputs.rows, inputs.burn_in, inputs.window
     sample_s = begin_s + before.edge_s[:-1] + before.lead_s
     middle_s = begin_s + 0.5 * (window.edge_s[:-1] + window.edge_s[1:])
     speed = np.zeros((len(middle_s), 4))
@@ -341,7 +339,6 @@ def _window(
         speed = rotors_at(middle_s, time_s, log.rotor_speed, vehicle, stride)
         if stride > 1:
             speed = with_hidden_torque(speed, vehicle, own_spacing_s(time_s, log.rotor_speed))
-    rows = _rows(log, begin_s)
     none = np.full((len(time_s), 4), np.nan)
     acc_b = none[:, :3] if log.acc_b is None else log.acc_b
     rotors = none if log.rotor_speed is None else log.rotor_speed

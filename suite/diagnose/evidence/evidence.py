@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.estimate.block import Block, Estimate, NormalEquations
+from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.gauss_newton import fit, intervals95
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
 from suite.diagnose.estimate.permutation import CandidateScore, folds_of, permutation_test
@@ -86,7 +86,7 @@ class Evidence(ABC):
         `current` is this evidence, evaluated along all parameters. A candidate without any effect
         on the flights gets no score.
         """
-        equations = current.equations
+        equations = current.block.equations
         along = list(equations.numbers)
         scale, theta = self.space.array("step")[along], current.at.theta
         low, high = ((self.space.array(end) - theta)[along] / scale for end in ("low", "high"))
@@ -130,14 +130,9 @@ class Evaluation(NamedTuple):
     at: Estimate
     block: Block
 
-    @property
-    def equations(self) -> NormalEquations:
-        """The block's normal equations."""
-        return self.block.equations
-
     def half_widths(self, indices: Sequence[int]) -> np.ndarray:
         """Return the half-widths (K,) of the 95 % intervals of the parameters at `indices`."""
-        equations = self.equations.along_numbers(indices)
+        equations = self.block.equations.along_numbers(indices)
         return intervals95(equations, self.evidence.flights_differ_p).half_width
 
 

@@ -171,7 +171,7 @@ def rotor_spread(sets: Sequence[ViewEvidence]) -> RotorSpread:
     return RotorSpread(share, count, along, dict(freedom), prior)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ChangeEvidence(ViewEvidence):
     """Evidence of a change since reference flights: means of flights, and their usual spread.
 
@@ -179,16 +179,16 @@ class ChangeEvidence(ViewEvidence):
     inertia, arms or rotor torque. The noise `weights` of the fits contain this error.
     """
 
-    exact_weights: Weights | None = None
+    exact_weights: Weights
     """Noise without errors of the gains, for the test of the first name. Further names must be
     significant with these errors, since the first change times a wrong gain leaves a residual."""
-    spread: RotorSpread | None = None
+    spread: RotorSpread
     """Spread of flights of the unchanged vehicle."""
 
     @property
     def repeatability(self) -> np.ndarray:
         """(3,) standard deviation of flights' means, without errors of the gains."""
-        return np.full(3, np.inf) if self.exact_weights is None else self.exact_weights.trim
+        return self.exact_weights.trim
 
     @property
     def name_p_value(self) -> float:
@@ -207,7 +207,7 @@ class ChangeEvidence(ViewEvidence):
         The means of few flights contain little information: nearly every candidate is close.
         """
         block, theta = current.block, current.at.theta
-        assert isinstance(block, ViewBlock) and self.spread and self.exact_weights and self.weights
+        assert isinstance(block, ViewBlock) and self.weights
         weights = self.weights if named else self.exact_weights
         equations = block_of(block.data, weights, block.along, self.limits).equations
         without = chi2_fall(equations, theta, self.space, named)
@@ -266,8 +266,8 @@ def change_evidence(
     # even one that explains much less than the best (a share of 1 switches that limit off).
     limits = replace(task.limits, rival_share=1.0)
     evidence = ChangeEvidence(
-        task.view, task.model, flights, task.carried, True, with_gain_error, weights, spread,
-        limits=limits,
+        task.view, task.model, flights, task.carried, True, with_gain_error,
+        exact_weights=weights, spread=spread, limits=limits,
     )  # fmt: skip
     return evidence.relinearise(Estimate(start))
 

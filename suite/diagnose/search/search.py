@@ -132,9 +132,10 @@ def _best_candidate(
             if score.p_value <= evidence.name_p_value and score.gain >= least
         ]
     # ... that could be the best to first order, and of the single effects only the first few.
-    columns, theta = current.equations.columns_of, current.at.theta
+    equations, theta = current.block.equations, current.at.theta
     falls = {
-        c: chi2_fall(current.equations, theta, space, [*others, *columns(c)]) for c in shortlist
+        c: chi2_fall(equations, theta, space, [*others, *equations.columns_of(c)])
+        for c in shortlist
     }
     shortlist = [c for c in shortlist if c == tested or could_be_best(falls, c, limits)]
     if tested is None:
@@ -142,7 +143,7 @@ def _best_candidate(
         shortlist = [c for c in shortlist if c.parts or c in single]
     # Fit each of them, and keep those that pass the tests of the evidence.
     errors_before = cross_validated_chi2(current, others)
-    chi2_before, trials = float(current.equations.chi2.sum()), list[_Trial]()
+    chi2_before, trials = float(equations.chi2.sum()), list[_Trial]()
     for candidate in shortlist:
         fitted = fit_with(current, others, candidate)
         gains = errors_before - cross_validated_chi2(fitted, [*others, *candidate.indices])
@@ -165,7 +166,7 @@ def _best_candidate(
     # Those about as good as the lowest cost are `close`. Of these, the significant one that the
     # evidence prefers is named, and the others are its alternatives.
     lowest = min(trial.cost for trial in trials)
-    explained = chi2_before - chi2_fall(current.equations, theta, space, others) - lowest
+    explained = chi2_before - chi2_fall(equations, theta, space, others) - lowest
     allowed = max(min(limits.rival_chi2, limits.rival_share * explained), 0.0)
     close = [trial for trial in trials if trial.cost - lowest <= allowed]
     significant = [trial for trial in close if trial.name.p_value <= evidence.name_p_value]

@@ -102,7 +102,7 @@ def test_what_the_start_explains_is_projected_out(linearised):
     sigma = np.where(windows.valid.any(axis=(0, 1)), 0.01, np.nan)
     whitening = make_whitening(linear, colour.Noise(sigma, {}))
     moved = np.random.default_rng(0).standard_normal((len(windows.flight), STATE))
-    by_start = np.einsum("wnck,wk->wnc", linear.start_slope, moved)
+    by_start = np.einsum("wnck,wk->wnc", linear.slope[..., model.starts[:STATE]], moved)
     start_only = linear._replace(residual=by_start, offset=0.0 * linear.offset)
     block = block_of(whitening, start_only, range(3))
     assert np.abs(block.residual).max() < 1e-6 * np.abs(by_start * whitening.weight).max()

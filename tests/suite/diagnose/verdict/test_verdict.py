@@ -32,7 +32,7 @@ def left(p_value=0.5, coloured=0.5):
     return structure.ResidualStructure(shapes, dict.fromkeys(structure.AXES, coloured))
 
 
-SWING = Swing(1.4, (1.3, 1.5), 0.5, 1e-6)
+SWING = Swing(1.4, (1.3, 1.5))
 SWUNG = Verdict("partly", 0.1, SWING.words)
 SPEED = {"structured": True, "where": "the speed"}
 TORQUE = {"structured": True, "where": "torque y"}
