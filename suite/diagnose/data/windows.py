@@ -27,7 +27,6 @@ from suite.diagnose.data.sampling import (
 from suite.diagnose.data.steps import (
     LONGEST_S,
     StepGrid,
-    integral_of_held,
     padded_grid,
     rotors_at,
     start_rotor_error,
@@ -362,6 +361,10 @@ def _window(
         padding = np.zeros((ROWS - len(rows), *values.shape[1:]), values.dtype)
         return np.concatenate([np.nan_to_num(values), padding])
 
+    # Infinite times of commands are padding, and add nothing to the integral.
+    command_s = np.minimum(inputs.command_s, inputs.command_s[np.isfinite(inputs.command_s)].max())
+    added = np.diff(command_s)[:, None] * inputs.command[:-1]
+    command_sum = np.concatenate([np.zeros((1, 4)), np.cumsum(added, axis=0)])
     rotor_error = 0.0
     if not rotor_input:
         burn_in = (time_s > begin_s - BURN_IN_S - 1e-9) & (time_s <= begin_s + 1e-9)
@@ -375,7 +378,7 @@ def _window(
         np.concatenate([before.lead_s, window.lead_s]),
         inputs.command_s,
         inputs.command,
-        integral_of_held(inputs.command_s, inputs.command),
+        command_sum,
         interpolate(sample_s, time_s, log.rate_b),
         speed,
         voltage_drop(log, middle_s),

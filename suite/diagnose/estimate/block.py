@@ -55,12 +55,7 @@ class Block:
     @cached_property
     def equations(self) -> NormalEquations:
         """The normal equations of the stretches."""
-        return NormalEquations(
-            *products(self.slope, self.residual[..., None]),
-            (self.residual**2).sum(axis=1),
-            self.flight,
-            self.along,
-        )
+        return normal_equations(self.slope, self.residual, self.flight, self.along)
 
     def acts(self) -> np.ndarray:
         """Return for each column (K,) whether its parameter changes the model at all."""
@@ -147,10 +142,16 @@ class NormalEquations(NamedTuple):
         return self.chi2 - 2.0 * (self.gradient * change).sum(axis=1) + quadratic
 
 
-def products(slope: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return J'J (B, K, K) and J'r (B, K) of `slope` (B, M, K) and `residual` (B, M, 1)."""
+def normal_equations(
+    slope: np.ndarray,
+    residual: np.ndarray,
+    flight: np.ndarray | None = None,
+    along: tuple[int, ...] | None = None,
+) -> NormalEquations:
+    """Return the normal equations of `slope` (B, M, K) and `residual` (B, M)."""
     transposed = np.swapaxes(slope, 1, 2)
-    return transposed @ slope, (transposed @ residual)[..., 0]
+    gradient = (transposed @ residual[..., None])[..., 0]
+    return NormalEquations(transposed @ slope, gradient, (residual**2).sum(axis=1), flight, along)
 
 
 def stacked(rows: np.ndarray, stretch: np.ndarray) -> np.ndarray:

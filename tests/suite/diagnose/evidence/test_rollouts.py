@@ -9,7 +9,7 @@ import pytest
 
 from eval.flights.simulate import SENSORS, fly, log_of
 from suite.diagnose.data import colour
-from suite.diagnose.data.noise import Linearisation
+from suite.diagnose.data.colour import Linearisation
 from suite.diagnose.data.whitening import block_of, make_whitening, orthonormal, slow_energy
 from suite.diagnose.data.windows import KNOTS, SLICES, STATE, cut
 from suite.diagnose.estimate.parameters import candidates, make_space

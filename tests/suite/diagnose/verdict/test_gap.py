@@ -6,8 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from suite.diagnose.data.colour import Noise
-from suite.diagnose.data.noise import Linearisation
+from suite.diagnose.data.colour import Linearisation, Noise
 from suite.diagnose.data.windows import CHANNELS, SLICES, STATE
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.evidence.rollouts import start_estimate
