@@ -66,7 +66,8 @@ class Evidence(ABC):
         known: Block | None = None,
     ) -> Evaluation:
         """Evaluate this evidence at the fit of the parameters at `indices`; see `fit`."""
-        return Evaluation(self, *fit(self, start, indices, rounds, known))
+        best = fit(self.linearise, self.space, self.limits, start, indices, rounds, known)
+        return Evaluation(self, *best)
 
     @property
     def flights_differ_p(self) -> float:
@@ -95,13 +96,10 @@ class Evidence(ABC):
         acting = [c for c in among if information[list(columns(c))].sum() > 1e-9]
         groups = [tuple(sorted({*named, *columns(c)})) for c in acting]
         fold = self.folds(current.block)
-        gains, p_values, chance = permutation_test(
-            hessian, gradient, groups, tuple(named), fold, seed, (low, high), self.limits
+        room = (low, high)
+        return permutation_test(
+            acting, hessian, gradient, groups, tuple(named), fold, seed, room, self.limits
         )
-        scores = [
-            CandidateScore(*values, chance) for values in zip(acting, gains, p_values, strict=True)
-        ]
-        return sorted(scores, key=lambda s: -s.gain)
 
     def folds(self, block: Block) -> np.ndarray:
         """Return the fold (B,) of each stretch; cross-validation leaves out one fold at a time."""

@@ -74,9 +74,9 @@ def search(
         name, at = best
         new_names = _one_name_per_effect(name)
         known = current.evidence.estimate_noise(at)
-        named, at = _drop_unneeded(
-            task, known.evidence, at, [*named, *new_names], len(new_names) == 1
-        )
+        # A single new name has just been tested.
+        count = len(named) + len(new_names) - (len(new_names) == 1)
+        named, at = _tested_again(task, known.evidence, at, [*named, *new_names], count)
         current = with_inactive(known if at is best[1] else known.evidence.relinearise(at), among)
     named, at = _settle(task, current.evidence, current.at, named)
     last = judged = _final_fit(current.evidence, at, named)
@@ -208,21 +208,27 @@ def _replace_or_drop(
     return [*named[:place], *_one_name_per_effect(best[0]), *named[place + 1 :]], best[1]
 
 
-def _drop_unneeded(
-    task: SearchTask, evidence: Evidence, at: Estimate, named: list[NamedEffect], last_tested: bool
+def _tested_again(
+    task: SearchTask,
+    evidence: Evidence,
+    at: Estimate,
+    named: list[NamedEffect],
+    count: int,
+    among: Sequence[Candidate] = (),
 ) -> tuple[list[NamedEffect], Estimate]:
-    """Return the names that are significant in addition to all others, and the fit with them.
+    """Test the first `count` names one after another; return the names and the fit with them.
 
-    With `last_tested` the last name has just been tested, and is not tested again.
+    Candidates of `among` may take the place of a name. Without them, a name is dropped or kept with
+    its fit.
     """
-    place = 0
-    while place < len(named) - last_tested:
+    untested, place = len(named) - count, 0
+    while place < len(named) - untested:
         itself = [named[place].candidate]
-        remaining, refitted = _replace_or_drop(task, evidence, at, named, place, itself)
-        if len(remaining) < len(named):
-            named, at = remaining, refitted
-        else:
-            place += 1
+        tried = _replace_or_drop(task, evidence, at, named, place, among or itself)
+        is_dropped = len(tried[0]) < len(named)
+        if among or is_dropped:
+            named, at = tried
+        place += not is_dropped  # if the name was dropped, the next one is here now
     return named, at
 
 
@@ -235,11 +241,7 @@ def _settle(
         if not before:
             break
         at = evidence.fitted(at, fitted_by(named)).at
-        place = 0
-        while place < len(named):
-            count = len(named)
-            named, at = _replace_or_drop(task, evidence, at, named, place, task.among)
-            place += len(named) >= count  # if the name was dropped, the next one is here now
+        named, at = _tested_again(task, evidence, at, named, len(named), task.among)
         if [name.candidate for name in named] == before:
             break
     return named, at

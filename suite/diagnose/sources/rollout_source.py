@@ -197,7 +197,7 @@ class RolloutSource(Source):
         structure, wind = self._structure(found, seed)
         details = {
             "shapes": [
-                {"label": shape.label, "gain": shape.gain, "p_value": shape.p_value}
+                {"label": shape.candidate.label, "gain": shape.gain, "p_value": shape.p_value}
                 for shape in structure.shapes[:SHAPES]
             ],
             "coloured": structure.coloured,
@@ -365,7 +365,7 @@ def structure_where(
     least = limits.structure_rotor_input if noise_is_uncertain else limits.structure
     if not (shape or coloured or slow.sum() / expected.sum() > least):
         return None
-    where = [shape.label] if shape else []
+    where = [shape.candidate.label] if shape else []
     for quantity in ("force", "torque"):
         axes = [axis[-1] for axis in coloured if axis.startswith(quantity)]
         if axes:

@@ -9,6 +9,8 @@ import pytest
 from suite.diagnose.data.colour import Linearisation, Noise
 from suite.diagnose.data.windows import CHANNELS, SLICES, STATE
 from suite.diagnose.diagnose import diagnose
+from suite.diagnose.estimate.parameters import Candidate
+from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.evidence.rollouts import start_estimate
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.thresholds import THRESHOLDS
@@ -120,11 +122,11 @@ def test_a_shape_that_grows_with_the_models_error_is_left_out_and_one_that_stays
         return structure.DisturbanceEquations(hessian, gradient, None, unit, {})
 
     fine, coarse = of(0.3, 0.2), of(0.9, 0.21)
-    shapes = [structure.ShapeScore(n, 9.0, 5e-4, (k,)) for k, n in enumerate(names)]
+    shapes = [CandidateScore(Candidate(n, (k,), n), 9.0, 5e-4, 0.0) for k, n in enumerate(names)]
     found = structure.ResidualStructure(shapes, {})
     for share, kept in ((0.5, ["torque"]), (0.1, ["force", "torque"])):
         left = structure.beyond_model_error(found, fine, coarse, share)
-        assert [shape.label for shape in left.shapes] == kept
+        assert [shape.candidate.label for shape in left.shapes] == kept
     by_chance = found._replace(shapes=[found.shapes[0]._replace(p_value=0.2)])
     assert structure.beyond_model_error(by_chance, fine, coarse, 0.5) == by_chance
 

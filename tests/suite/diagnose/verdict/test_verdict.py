@@ -9,6 +9,8 @@ import pytest
 
 from suite.diagnose.data.windows import SLICES, STATE
 from suite.diagnose.diagnose import Verdict, verdict_on
+from suite.diagnose.estimate.parameters import Candidate
+from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.examine import confirmed, relevant_part
 from suite.diagnose.sources.rollout_source import of_rollouts, structure_where
@@ -28,7 +30,8 @@ def slow_errors(size=1.0):
 
 
 def left(p_value=0.5, coloured=0.5):
-    shapes = [structure.ShapeScore("force with the speed", 1.0, p_value, ())]
+    shape = Candidate("force with the speed", (), "force with the speed")
+    shapes = [CandidateScore(shape, 1.0, p_value, 0.0)]
     return structure.ResidualStructure(shapes, dict.fromkeys(structure.AXES, coloured))
 
 
