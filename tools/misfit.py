@@ -81,8 +81,8 @@ def rollout_error(
     """
     model, windows, start = rollouts_along(logs, vehicle, rotor_input=False)
     linear = model.linearise(start, windows, model.starts)
-    noise = noise or measured_noise(linear, windows)
-    return gap_of(linear, windows, noise).rms, noise
+    noise = noise or measured_noise(linear)
+    return gap_of(linear, noise).rms, noise
 
 
 def run_case(seed: list[int]) -> Outcome:

@@ -104,11 +104,18 @@ class FlightLog:
         return tuple(str(group) for group in groups) if isinstance(groups, list) else ()
 
     @property
+    def command(self) -> np.ndarray | None:
+        """(T, 4) `thrust_cmd` and `rate_cmd_b` as one array; None where the log lacks one."""
+        if self.thrust_cmd is None or self.rate_cmd_b is None:
+            return None
+        return np.concatenate([self.thrust_cmd[:, None], self.rate_cmd_b], axis=1)
+
+    @property
     def whole(self) -> np.ndarray:
         """(T,) bool: rows with a complete state and a complete command."""
         parts = [self.pos_w, self.quat_wxyz, self.vel_w, self.rate_b]
-        if self.thrust_cmd is not None and self.rate_cmd_b is not None:
-            parts += [self.thrust_cmd[:, None], self.rate_cmd_b]
+        if self.command is not None:
+            parts.append(self.command)
         elif self.thrust_cmd is not None and self.torque_cmd_b is not None:
             parts += [self.thrust_cmd[:, None], self.torque_cmd_b]
         elif self.rotor_speed is not None:

@@ -180,7 +180,7 @@ def linearised(
     sigma = np.array([*np.repeat(vector_sigmas, 3), *[sensors.rotor] * 4])
     row_hz = (row_s > 0.0).sum(axis=1).mean() / LENGTH_S
     sigma = np.where(sigma > 0.0, sigma * np.sqrt(row_hz / sensors.rate_hz), np.nan)
-    return rollout_evidence(model, windows, linear, LIMITS, Noise(sigma, {}), along)[1]
+    return rollout_evidence(model, linear, LIMITS, Noise(sigma, {}), along)[1]
 
 
 def gust_strength(

@@ -120,9 +120,9 @@ def _flight_windows(
 ) -> list[QuadrotorWindows]:
     """Return the windows of one flight; `delay_steps` is the longest delay in physics steps."""
     action, decides = log_decisions(log)
-    assert log.rate_cmd_b is not None and log.thrust_cmd is not None
+    commands = log.command
+    assert commands is not None
     rows, time_s, rot_w = round(duration_s / row_s), log.time_s, log.rot_w
-    commands = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
     # Middle of each physics step before a window, as time before its start.
     ages_s = substeps.dt * (np.arange(delay_steps) + 0.5)
     speed = np.full((len(time_s), 4), np.nan) if log.rotor_speed is None else log.rotor_speed
@@ -163,7 +163,7 @@ def _flight_windows(
                 np.asarray(time_s[first] - time_s[0]),
                 action[span][:-1],
                 decides[span][:-1],
-                log.rate_cmd_b[span][:-1, 2],
+                commands[span][:-1, 3],
                 burn_in,
             )
         )

@@ -9,13 +9,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
+from eval.effects import EFFECTS
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.estimate.parameters import implausible, with_fitted
+from suite.diagnose.estimate.parameters import implausible
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.examine import examine, one_cause, without_names
 from suite.diagnose.sources.rollout_source import pose_delays, rollouts_of
@@ -228,4 +230,12 @@ def with_names(
             indices = list(named.candidate.indices)
             theta[indices] = finding.theta[indices]
             names.append(named.candidate.name)
-    return with_fitted(nominal, space, theta, names, {one.name: one.values for one in tested})
+    fitted, effects = space.effects(theta), dict(nominal.effects)
+    for name in names:
+        values = (np.asarray(value, dtype=float) for value in fitted[name])
+        effects[name] = type(fitted[name])(
+            *(tuple(v.tolist()) if v.ndim else float(v) for v in values)
+        )
+    effects |= {one.name: one.values for one in tested}
+    ordered = {name: effects[name] for name in EFFECTS if name in effects}
+    return replace(nominal, effects=MappingProxyType(ordered))

@@ -1,6 +1,8 @@
-"""Estimates autocorrelated (coloured) measurement noise, such as errors of a state estimator.
+"""Estimates the measurement noise, white and autocorrelated (coloured).
 
-The noise of position, attitude and velocity is modelled as white noise plus a first-order
+A model's error is smooth, noise is not. So a polynomial is subtracted from a few consecutive rows
+at a time, and the remainder is noise. The noise of a state estimator is autocorrelated: that of
+position, attitude and velocity is modelled as white noise plus a first-order
 Gauss-Markov process, whose correlation decays as exp(-t / T). Estimated are T and the share of the
 variance that this process has. They maximise the likelihood of the residuals in windows (1 s
 stretches of flights), after a polynomial is subtracted (restricted likelihood; Patterson & Thompson
@@ -18,8 +20,7 @@ from scipy.linalg import get_lapack_funcs, solve_triangular
 from scipy.optimize import minimize, minimize_scalar
 from scipy.special import expit, logit
 
-from suite.diagnose.data.noise import Linearisation, at_least, noise_of, typical_variance
-from suite.diagnose.data.windows import SLICES, FlightWindows
+from suite.diagnose.data.windows import CHANNELS, SLICES, STATE, FlightWindows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 TIMES_S = tuple(np.geomspace(0.012, 0.2, 8).tolist())
@@ -36,6 +37,20 @@ INTEGRATED = {"position": 2, "attitude": 2, "velocity": 1}
 """Group of channels -> how many times a force or torque is integrated to give it; others: 0."""
 LEAST_ROWS = 30
 """Smallest number of rows of a window from which T is estimated."""
+
+
+class Linearisation(NamedTuple):
+    """Residuals of W windows, and derivatives (slopes) of the simulated values by K numbers."""
+
+    residual: np.ndarray
+    """(W, N, 19) measured - simulated; zero where nothing was measured."""
+    slope: np.ndarray
+    """(W, N, 19, K) derivative of the simulated values; often the last F are by the start numbers,
+    of which the first 12 are the start state."""
+    offset: np.ndarray
+    """(W, F) correction of each window's start numbers with which the residuals were computed."""
+    windows: FlightWindows
+    """The windows."""
 
 
 class Noise(NamedTuple):
@@ -72,14 +87,11 @@ class _Process(NamedTuple):
     """Variance of the model's error after a second, over the variance of the noise."""
 
 
-def measured_noise(
-    linear: Linearisation, windows: FlightWindows, limits: Thresholds = THRESHOLDS
-) -> Noise:
-    """Estimate the measurement noise from the residuals of `windows`."""
-    sigma = noise_of(linear.residual, windows, limits=limits)
-    residual = _without_start(linear, np.where(windows.valid, 1.0 / sigma, 0.0))
-    sigma = noise_of(residual, windows, limits=limits)
-    groups = _all_stretches(residual, sigma, windows, ESTIMATED, limits)
+def measured_noise(linear: Linearisation, limits: Thresholds = THRESHOLDS) -> Noise:
+    """Estimate the measurement noise from the residuals of windows."""
+    linear, _ = _without_start(linear, limits)
+    sigma = noise_of(linear.residual, linear.windows, limits=limits)
+    groups = _stretches(linear, sigma, ESTIMATED, limits)
     fits = {name: _fit_by_time(stretches, limits) for name, stretches in groups.items()}
     gains = np.sum([[gain for _, gain in by_time] for by_time in fits.values()], axis=0)
     coloured = {}
@@ -92,18 +104,15 @@ def measured_noise(
     return Noise(at_least(sigma, limits), coloured)
 
 
-def residual_as_noise(
-    linear: Linearisation, windows: FlightWindows, limits: Thresholds = THRESHOLDS
-) -> Noise:
+def residual_as_noise(linear: Linearisation, limits: Thresholds = THRESHOLDS) -> Noise:
     """Return the noise if the whole residual counts as noise, including the model's error.
 
     It is used where even the best model does not fit: intervals then allow for the bias that the
     wrong model causes.
     """
-    sigma = noise_of(linear.residual, windows, limits=limits)
-    residual = _without_start(linear, np.where(windows.valid, 1.0 / sigma, 0.0))
+    linear, sigma = _without_start(linear, limits)
     coloured = {}
-    for name, stretches in _all_stretches(residual, sigma, windows, SLICES, limits).items():
+    for name, stretches in _stretches(linear, sigma, SLICES, limits).items():
         rows = len(stretches.time_s)
         bare = stretches._replace(powers=np.zeros((rows, 0)), drift=np.zeros((rows, rows)))
         process, _ = max(_fit_by_time(bare, limits, MISFIT_TIMES_S), key=lambda fit: fit[1])
@@ -135,76 +144,61 @@ def _correlation(time_s: np.ndarray, share: float, lasts_s: float) -> np.ndarray
     return (1.0 - share) * np.eye(time_s.shape[-1]) + share * np.exp(-lag_s / lasts_s)
 
 
-def _without_start(linear: Linearisation, weight: np.ndarray) -> np.ndarray:
-    """Return the residuals (W, N, 19) without what an error of each window's start state explains.
+def _without_start(linear: Linearisation, limits: Thresholds) -> tuple[Linearisation, np.ndarray]:
+    """Return the residuals without what an error of each window's start state explains.
 
-    `weight` (W, N, 19) is 1 / noise.
+    They are weighted by the noise (19,) of the residuals with it, which is returned as well.
     """
-    residual, slope = linear.residual, linear.start_slope
+    residual, first = linear.residual, linear.slope.shape[-1] - linear.offset.shape[1]
+    slope = linear.slope[..., first : first + STATE]
+    sigma = noise_of(residual, linear.windows, limits=limits)
+    weight = np.where(linear.windows.valid, 1.0 / sigma, 0.0)
     rows = (slope * np.nan_to_num(weight)[..., None]).reshape(len(slope), -1, slope.shape[-1])
     white = (residual * np.nan_to_num(weight)).reshape(len(slope), -1, 1)
     transposed = np.swapaxes(rows, 1, 2)
     size = np.sqrt(np.einsum("wfm,wmf->wf", transposed, rows))[:, :, None] + 1e-30
     gram = (transposed / size) @ (rows / np.swapaxes(size, 1, 2)) + 1e-9 * np.eye(slope.shape[-1])
     change = np.linalg.solve(gram, (transposed / size) @ white) / size
-    return residual - (slope @ change[:, None])[..., 0]
-
-
-def _all_stretches(
-    residual: np.ndarray,
-    sigma: np.ndarray,
-    windows: FlightWindows,
-    names: Iterable[str],
-    limits: Thresholds,
-) -> dict[str, _Stretches]:
-    """Return the stretches by group of channels, of those in `names` with enough measurements."""
-    measured = (name for name in names if np.isfinite(sigma[SLICES[name]]).all())
-    groups = {name: _stretches(residual, windows, name, limits) for name in measured}
-    return {name: stretches for name, stretches in groups.items() if stretches is not None}
+    return linear._replace(residual=residual - (slope @ change[:, None])[..., 0]), sigma
 
 
 def _stretches(
-    residual: np.ndarray, windows: FlightWindows, name: str, limits: Thresholds
-) -> _Stretches | None:
-    """Return the stretches of `residual` (W, N, 19) in the group of channels `name`.
+    linear: Linearisation, sigma: np.ndarray, names: Iterable[str], limits: Thresholds
+) -> dict[str, _Stretches]:
+    """Return the stretches of the residuals, by group of channels.
 
-    None with too few rows. All stretches get the same number of rows: that which nine of ten usable
-    windows have.
+    They are those of the groups in `names` that have enough rows. All stretches of a group get the
+    same number of rows: that which nine of ten usable windows have.
     """
-    valid = np.asarray(np.all(windows.valid[..., SLICES[name]], axis=-1))
-    count = valid.sum(axis=1)
-    if not len(count) or count.max() < LEAST_ROWS:
-        return None
-    rows = int(np.quantile(count[count >= LEAST_ROWS], 0.1))
-    chosen = np.flatnonzero(count >= rows)
-    first_rows = np.argsort(~valid[chosen], axis=1, kind="stable")[:, :rows]
-    times_s = np.take_along_axis(np.asarray(windows.row_s)[chosen], first_rows, axis=1)
-    time_s = np.median(times_s, axis=0)
-    # Windows with a lost row or jitter stay, since their times differ little from the median times.
-    # Windows with a hole are left out.
-    alike = np.abs(times_s - time_s).max(axis=1) <= limits.colour_aside * np.diff(time_s).mean()
-    values = residual[chosen][..., SLICES[name]]
-    stacked = np.take_along_axis(values, first_rows[..., None], axis=1)[alike]
-    if not len(stacked):
-        return None
-    time = (time_s - time_s.mean()) / (time_s[-1] - time_s[0])
-    return _Stretches(
-        time_s,
-        np.moveaxis(stacked, 1, 0).reshape(rows, -1),
-        time[:, None] ** np.arange(limits.colour_degree + 1),
-        _drift_covariance(time_s - time_s[0], INTEGRATED.get(name, 0)),
-    )
-
-
-def _drift_covariance(time_s: np.ndarray, integrations: int) -> np.ndarray:
-    """Return the covariance (N, N) of white noise that is integrated once or twice; else zeros.
-
-    The variance after a second is 1.
-    """
-    early, late = np.minimum.outer(time_s, time_s), np.maximum.outer(time_s, time_s)
-    if integrations == 2:
-        return 0.5 * early**2 * (3.0 * late - early)
-    return early if integrations == 1 else np.zeros_like(early)
+    windows, groups = linear.windows, {}
+    for name in names:
+        channels = SLICES[name]
+        valid = np.asarray(np.all(windows.valid[..., channels], axis=-1))
+        count = valid.sum(axis=1)
+        if not np.isfinite(sigma[channels]).all() or count.max(initial=0) < LEAST_ROWS:
+            continue
+        rows = int(np.quantile(count[count >= LEAST_ROWS], 0.1))
+        chosen = np.flatnonzero(count >= rows)
+        first_rows = np.argsort(~valid[chosen], axis=1, kind="stable")[:, :rows]
+        times_s = np.take_along_axis(np.asarray(windows.row_s)[chosen], first_rows, axis=1)
+        time_s = np.median(times_s, axis=0)
+        # Windows with a lost row or jitter stay, since their times differ little from the median
+        # times. Windows with a hole are left out.
+        alike = np.abs(times_s - time_s).max(axis=1) <= limits.colour_aside * np.diff(time_s).mean()
+        values = linear.residual[chosen][..., channels]
+        stacked = np.take_along_axis(values, first_rows[..., None], axis=1)[alike]
+        if not len(stacked):
+            continue
+        time = (time_s - time_s.mean()) / (time_s[-1] - time_s[0])
+        powers = time[:, None] ** np.arange(limits.colour_degree + 1)
+        # The drift is white noise that is integrated once or twice.
+        since_s = time_s - time_s[0]
+        early, late = np.minimum.outer(since_s, since_s), np.maximum.outer(since_s, since_s)
+        once_twice = {1: early, 2: 0.5 * early**2 * (3.0 * late - early)}
+        drift = once_twice.get(INTEGRATED.get(name, 0), np.zeros_like(early))
+        residuals = np.moveaxis(stacked, 1, 0).reshape(rows, -1)
+        groups[name] = _Stretches(time_s, residuals, powers, drift)
+    return groups
 
 
 def _without_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.ndarray, int, float]:
@@ -226,16 +220,6 @@ def _without_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.nd
     return energy, len(values) - degree, float(half_log_det)
 
 
-def _likelihood(stretches: _Stretches, process: _Process) -> float:
-    """Return the restricted log-likelihood of `process`.
-
-    Every stretch has a noise variance of its own, so that a few bad stretches do not dominate.
-    """
-    energy, freedom, half_log_det = _without_polynomial(stretches, process)
-    size = 0.5 * freedom * np.log(np.maximum(energy, 1e-300))
-    return -float((half_log_det + size).sum())
-
-
 def _fit_by_time(
     stretches: _Stretches, limits: Thresholds, times_s: Sequence[float] = TIMES_S
 ) -> list[tuple[_Process, float]]:
@@ -246,8 +230,12 @@ def _fit_by_time(
     """
 
     def score(process: _Process) -> float:
+        """Return the restricted log-likelihood, less the cost of a drift."""
+        energy, freedom, half_log_det = _without_polynomial(stretches, process)
+        # Every stretch has a noise variance of its own, so that a few bad ones do not dominate.
+        size = 0.5 * freedom * np.log(np.maximum(energy, 1e-300))
         cost = limits.drift_gain if process.drift else 0.0
-        return _likelihood(stretches, process) - cost
+        return -float((half_log_det + size).sum()) - cost
 
     drifts = DRIFTS if stretches.drift.any() else (0.0,)
     white = max((_Process(0.0, 1.0, drift) for drift in drifts), key=score)
@@ -286,3 +274,99 @@ def _with_drift(
         options={"maxfev": 30, "xatol": 0.05, "fatol": 0.1},
     )
     return process_at(best.x), -float(best.fun)
+
+
+def rotor_noise(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> float:
+    """Return an upper limit of the noise of measured rotor speeds that are an input [rad/s].
+
+    An input has no residuals, so the polynomial is subtracted from the speeds themselves. True
+    changes of the speeds that are too fast for it count as noise; hence an upper limit.
+    """
+    rotors = SLICES["rotor speed"]
+    speeds = np.zeros(np.asarray(windows.valid).shape)
+    speeds[..., rotors] = windows.row_rotor_speed
+    valid = np.zeros(speeds.shape, dtype=bool)
+    valid[..., rotors] = windows.rotor_valid
+    sigma = noise_of(speeds, windows._replace(valid=valid), limits.rotor_noise_rows, limits)
+    return float(np.sqrt((sigma[rotors] ** 2).mean()))
+
+
+def noise_of(
+    residual: np.ndarray,
+    windows: FlightWindows,
+    rows_together: int | None = None,
+    limits: Thresholds = THRESHOLDS,
+) -> np.ndarray:
+    """Return the standard deviation (19,) of each channel's noise in `residual` (W, N, 19).
+
+    NaN where nothing was measured. A channel with too few rows in every window gets the RMS of its
+    residuals, which is an upper limit. One polynomial is subtracted from `rows_together` rows of a
+    channel, by default `limits.noise_rows`, or from all rows of a window with fewer rows.
+    """
+    block_rows, degree = rows_together or limits.noise_rows, limits.noise_degree
+    power: list[list[float]] = [[] for _ in range(CHANNELS)]
+    freedom: list[list[int]] = [[] for _ in range(CHANNELS)]
+    valid = np.asarray(windows.valid)
+    # For each window, and each set of channels that were measured in the same rows.
+    for w in range(len(residual)):
+        for mask in {column.tobytes() for column in valid[w].T}:
+            channel_rows = np.flatnonzero(np.frombuffer(mask, dtype=bool))
+            channels = [c for c in range(CHANNELS) if valid[w, :, c].tobytes() == mask]
+            count = min(block_rows, len(channel_rows))
+            if count < degree + 4:
+                continue
+            for begin in range(0, len(channel_rows) - count + 1, count):
+                rows = channel_rows[begin : begin + count]
+                values = residual[w, rows][:, channels]
+                basis = np.linalg.qr(_powers(np.asarray(windows.row_s)[w, rows], degree))[0]
+                remainder = values - basis @ (basis.T @ values)
+                for channel, energy in zip(channels, (remainder**2).sum(axis=0), strict=True):
+                    power[channel].append(float(energy))
+                    freedom[channel].append(count - degree - 1)
+    sigma = np.full(CHANNELS, np.nan)
+    for c in range(CHANNELS):
+        if power[c]:
+            freedoms = np.array(freedom[c])
+            sigma[c] = np.sqrt(typical_variance(np.array(power[c]), freedoms))
+        elif valid[..., c].any():
+            sigma[c] = np.sqrt((residual[..., c][valid[..., c]] ** 2).mean())
+    return at_least(sigma, limits)
+
+
+def at_least(sigma: np.ndarray, limits: Thresholds = THRESHOLDS) -> np.ndarray:
+    """Return the noise `sigma` (19,), raised to a lower limit by rounding and the model's steps."""
+    return np.maximum(sigma, np.repeat(limits.least_noise, [3, 3, 3, 3, 3, 4]))
+
+
+def typical_variance(energy: np.ndarray, freedom: np.ndarray | int) -> np.ndarray:
+    """Return the variance of noise from sums of squares `energy` (V, ...) with `freedom` each.
+
+    It follows from their median, so that a few bad ones do not matter. The median of chi-square
+    with n degrees of freedom, divided by n, is (1 - 2 / 9n)^3 (Wilson and Hilferty 1931).
+    """
+    return np.median(energy / freedom / (1.0 - 2.0 / (9.0 * freedom)) ** 3, axis=0)
+
+
+def noise_like(speed: np.ndarray, limits: Thresholds = THRESHOLDS) -> np.ndarray:
+    """Return simulated noise (T, R) of the same size as the noise of rotor speeds `speed` (T, R).
+
+    It is zero with too few rows, and NaN where the speed is NaN.
+    """
+    draw = np.random.default_rng(0).standard_normal(speed.shape)
+    noise = np.full(speed.shape, np.nan)
+    block, degree = limits.rotor_noise_rows, limits.noise_degree
+    basis = np.linalg.qr(_powers(np.arange(block, dtype=float), degree))[0]
+    for k, column in enumerate(speed.T):
+        rows = np.flatnonzero(np.isfinite(column))
+        blocks = column[rows[: len(rows) // block * block]].reshape(-1, block)
+        energy, sigma = ((blocks - blocks @ basis @ basis.T) ** 2).sum(axis=1), 0.0
+        if len(energy):
+            sigma = float(np.sqrt(typical_variance(energy, block - degree - 1)))
+        noise[rows, k] = sigma * draw[: len(rows), k]
+    return noise
+
+
+def _powers(time_s: np.ndarray, degree: int) -> np.ndarray:
+    """Return the powers (N, degree + 1) of scaled times, the terms of a polynomial."""
+    span = max(float(time_s[-1] - time_s[0]), 1e-9)
+    return np.vander((time_s - time_s.mean()) / span, degree + 1)

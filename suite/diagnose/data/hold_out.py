@@ -6,13 +6,13 @@ Held-out flights test whether the named effects explain flights that no fit has 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from suite.diagnose.data.flights import ViewFlights
-from suite.diagnose.data.view import SmoothedFlight, smoothed
+from suite.diagnose.data.view import smoothed
 from suite.diagnose.data.windows import LENGTH_S
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
@@ -53,33 +53,24 @@ def choose_held_out(
     return ~np.isin(flight, held), [logs[int(k)].name for k in sorted(held)]
 
 
-class Parted(NamedTuple):
-    """Flights that are fitted and those that are held out, each by name of the view."""
-
-    fitted: dict[str, list[SmoothedFlight]]
-    held: dict[str, list[SmoothedFlight]]
-    names: list[str]
-    """Names of the held-out flights or stretches."""
-    notes: tuple[str, ...]
-    """Views that were left out and why, in words."""
-
-
-def parted(flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRESHOLDS) -> Parted:
+def parted(
+    flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRESHOLDS
+) -> tuple[ViewFlights, ViewFlights]:
     """Return the fitted flights and the held-out ones; a single flight is split in time.
 
-    `held` are the numbers of the flights to hold out. A second view is left out if a part of it is
-    too short.
+    `held` are the numbers of the flights to hold out. A second view is left out, with a note, if a
+    part of it is too short.
 
     Raises:
         ValueError: if a part of the first view is too short.
     """
-    count, names = len(flights.names), [flights.names[k] for k in held]
-    fitted_part, held_part = dict[str, list[SmoothedFlight]](), dict[str, list[SmoothedFlight]]()
-    if count > 1:
-        for name, part in flights.smoothed.items():
-            fitted_part[name] = [part[k] for k in range(count) if k not in held]
-            held_part[name] = [part[k] for k in held]
-    else:
+    fitted = [k for k in range(len(flights.names)) if k not in held]
+    fitted_part, held_part = (
+        {name: [part[k] for k in numbers] for name, part in flights.smoothed.items()}
+        for numbers in (fitted, held)
+    )
+    names = [flights.names[k] for k in held]
+    if len(flights.names) == 1:
         # The share is of the time in flight, since a log may begin or end on the ground.
         flown_s = flights.smoothed[flights.views[0].name][0].form.middle_s
         until_s = float(np.quantile(flown_s, limits.lone_fitted_share))
@@ -91,7 +82,7 @@ def parted(flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRES
                 rows = single.rows._replace(good=np.asarray(single.rows.good) & chosen)
                 split = smoothed(view, rows, limits)._replace(reliability=single.reliability)
                 part[view.name] = [split]
-    notes = list[str]()
+    notes, views = list(flights.notes), list(flights.views)
     for number, view in enumerate(flights.views):
         for what, part in (("to fit", fitted_part), ("held out", held_part)):
             flown_s = sum(len(one.form.middle_s) for one in part[view.name]) * view.spacing_s
@@ -104,6 +95,12 @@ def parted(flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRES
             if number == 0:
                 raise ValueError(f"{', '.join(flights.names)}: {need}")
             notes.append(f"{view.name}: not examined, {need}")
+            views.remove(view)
             del fitted_part[view.name], held_part[view.name]
             break
-    return Parted(fitted_part, held_part, names, tuple(notes))
+    both = replace(flights, views=tuple(views), notes=tuple(notes))
+    fitted_names = tuple(flights.names[k] for k in fitted)
+    return (
+        replace(both, names=fitted_names, smoothed=fitted_part),
+        replace(both, names=tuple(names), smoothed=held_part),
+    )

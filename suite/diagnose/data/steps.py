@@ -108,16 +108,6 @@ def with_lost_rows(time_s: np.ndarray, command: np.ndarray) -> tuple[np.ndarray,
     return filled_s, command[before] + share[:, None] * (command[after] - command[before])
 
 
-def integral_of_held(time_s: np.ndarray, command: np.ndarray) -> np.ndarray:
-    """Return the integral (K, 4) to each `time_s` (K,) of `command` (K, 4), held until the next.
-
-    Infinite times are padding and add nothing.
-    """
-    finite = np.isfinite(time_s)
-    span_s = np.diff(np.where(finite, time_s, time_s[finite].max()))
-    return np.concatenate([np.zeros((1, 4)), np.cumsum(span_s[:, None] * command[:-1], axis=0)])
-
-
 def padded_grid(grid: StepGrid, count: int, at_front: bool = False) -> StepGrid:
     """Return `grid` with `count` steps; the added ones have zero length, and so no effect."""
     missing = count - len(grid.sample_s)
@@ -222,9 +212,6 @@ def start_rotor_error(time_s: np.ndarray, rate_b: np.ndarray, vehicle: Vehicle) 
         return LEAST_START_ERROR
     share = ((time_s[1:-1] - time_s[:-2]) / (time_s[2:] - time_s[:-2]))[:, None]
     rate_error = rate_b[1:-1] - (rate_b[:-2] + share * (rate_b[2:] - rate_b[:-2]))
-    rate_error = rate_error[np.isfinite(rate_error).all(axis=1)]
-    if not len(rate_error):
-        return LEAST_START_ERROR
     # From rates to commanded rotor speeds, by finite differences at hover.
     plant = make_plant(vehicle, LONGEST_S)
     hover = Command(np.full(4, GRAVITY), np.zeros((4, 3)))

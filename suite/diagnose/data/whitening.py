@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import eval_legendre
 
-from suite.diagnose.data.colour import Noise, colour_filter
-from suite.diagnose.data.noise import Linearisation, rotor_noise
+from suite.diagnose.data.colour import Linearisation, Noise, colour_filter, rotor_noise
 from suite.diagnose.data.windows import KNOTS, SLICES, STATE, FlightWindows
 from suite.diagnose.estimate.block import Block
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
@@ -45,12 +44,13 @@ class Whitening(NamedTuple):
 
 
 def make_whitening(
-    linear: Linearisation, noise: Noise, windows: FlightWindows, limits: Thresholds = THRESHOLDS
+    linear: Linearisation, noise: Noise, limits: Thresholds = THRESHOLDS
 ) -> Whitening:
-    """Return the whitening of `windows` by `noise`.
+    """Return the whitening of the windows in `linear` by `noise`.
 
     The last F slopes in `linear` must be those along the start numbers.
     """
+    windows = linear.windows
     sigma = np.where(np.isfinite(noise.sigma), noise.sigma, 1.0)
     weight = np.where(windows.valid, 1.0 / sigma, 0.0)
     filters = {name: colour_filter(noise, name, windows) for name in noise.coloured}
@@ -113,9 +113,7 @@ def rotor_spread(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> flo
     return limits.rotor_knot_excess * noise * float(np.sqrt((KNOTS - 1) / max(rows, 1.0)))
 
 
-def block_of(
-    whitening: Whitening, linear: Linearisation, along: Sequence[int], windows: FlightWindows
-) -> Block:
+def block_of(whitening: Whitening, linear: Linearisation, along: Sequence[int]) -> Block:
     """Return the block of `linear`, without the part that start numbers explain.
 
     `along` are the parameters of its first slopes.
@@ -135,8 +133,8 @@ def block_of(
         rows[..., 0],
         rows[..., 1:],
         tuple(along),
-        np.asarray(windows.flight),
-        np.asarray(windows.start_s),
+        np.asarray(linear.windows.flight),
+        np.asarray(linear.windows.start_s),
         start_change[..., 0],
         start_change[..., 1:],
     )

@@ -27,7 +27,6 @@ from suite.diagnose.data.sampling import (
 from suite.diagnose.data.steps import (
     LONGEST_S,
     StepGrid,
-    integral_of_held,
     padded_grid,
     rotors_at,
     start_rotor_error,
@@ -174,7 +173,11 @@ def cut(
             continue
         rotors = state.rotor_speed if rotor_input else None
         flown = ~near_ground(state, vehicle, rotors, limits, lasting=True)
-        inputs = [*_input_rows(log, rotor_input), flown]
+        # Each input has rows of its own: a rotor speed, or the commands and the loop's rates.
+        table = log.rotor_speed if rotor_input else log.command
+        assert table is not None
+        parts = [column[:, None] for column in table.T] if rotor_input else [table, log.rate_b]
+        inputs = [*(np.isfinite(part).all(axis=1) for part in parts), flown]
         rows = _start_rows(log, state.whole & flown, inputs, since_s, stride_s, limits)
         if not rows:
             shortest_s = LENGTH_S + BURN_IN_S + HISTORY_S
@@ -202,10 +205,13 @@ def cut(
 def take(data: Any, chosen: Array) -> Any:
     """Return the `chosen` windows of `data`, a named tuple of arrays (W, ...), such as windows.
 
-    They are chosen by indices or by (W,) bool. Fields that are None stay None.
+    They are chosen by indices or by (W,) bool. A field may be None, or such a tuple itself.
     """
-    fields = (None if field is None else np.asarray(field)[chosen] for field in data)
-    return type(data)(*fields)
+    if data is None:
+        return None
+    if not isinstance(data, tuple):
+        return np.asarray(data)[chosen]
+    return type(data)(*(take(field, chosen) for field in data))
 
 
 def _start_rows(
@@ -240,19 +246,10 @@ def _start_rows(
             next_s = begin_s + stride_s
 
 
-def _input_rows(log: FlightLog, rotor_input: bool) -> list[np.ndarray]:
-    """Return for each input, and for the rates of the loop, the rows with a value, (T,) bool."""
-    if rotor_input:
-        assert log.rotor_speed is not None
-        return [np.isfinite(column) for column in log.rotor_speed.T]
-    assert log.thrust_cmd is not None and log.rate_cmd_b is not None
-    command = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
-    return [np.asarray(np.isfinite(part).all(axis=1)) for part in (command, log.rate_b)]
-
-
 class _Input(NamedTuple):
-    """Steps and commands of one window, as in `FlightWindows`."""
+    """Rows of the log, and steps and commands as in `FlightWindows`, of one window."""
 
+    rows: np.ndarray
     burn_in: StepGrid
     window: StepGrid
     command_s: np.ndarray
@@ -262,16 +259,21 @@ class _Input(NamedTuple):
 def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, stride: int) -> _Input:
     """Return the inputs of the window at `row`; if there are no commands, those of a hover.
 
-    Every `stride`-th command is used, and held until the next one that is.
+    At most `ROWS` rows are compared. Every `stride`-th command is used, and held until the next one
+    that is.
     """
-    begin_s, period_s = log.time_s[row], 1.0 / vehicle.controller.frequency
-    length_s = log.time_s[_rows(log, begin_s)[-1]] - begin_s
-    time_s, command = log.time_s, np.tile([GRAVITY, 0.0, 0.0, 0.0], (len(log.time_s), 1))
-    if log.thrust_cmd is not None and log.rate_cmd_b is not None:
-        logged = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
-        finite = np.isfinite(logged).all(axis=1)
-        if finite.any():
-            time_s, command = time_s[finite], logged[finite]
+    time_s, begin_s, period_s = log.time_s, log.time_s[row], 1.0 / vehicle.controller.frequency
+    rows = np.flatnonzero((time_s >= begin_s - 1e-9) & (time_s <= begin_s + LENGTH_S + 1e-9))
+    signals = (log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b, log.acc_b, log.rotor_speed)
+    none = np.full((len(time_s), 1), np.nan)
+    values = [(none if signal is None else signal)[rows] for signal in signals]
+    valid = np.stack([np.isfinite(one).all(axis=1) for one in values], axis=1)
+    rows = rows[thinned(valid, time_s[rows], ROWS)]
+    length_s = time_s[rows[-1]] - begin_s
+    command = np.tile([GRAVITY, 0.0, 0.0, 0.0], (len(time_s), 1))
+    logged = log.command
+    if logged is not None and (finite := np.isfinite(logged).all(axis=1)).any():
+        time_s, command = time_s[finite], logged[finite]
     first_s, last_s = begin_s - BURN_IN_S - HISTORY_S - 1e-9, begin_s + length_s + 1e-9
     used = slice(max(np.searchsorted(time_s, first_s) - 1, 0), np.searchsorted(time_s, last_s) + 1)
     time_s, command = with_lost_rows(time_s[used] - begin_s, command[used])
@@ -281,7 +283,7 @@ def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, stri
         inside_s = time_s[(time_s > since_s + 1e-6) & (time_s < until_s - 1e-6)]
         return step_grid(np.array([since_s, *inside_s, until_s]), period_s, longest_s)
 
-    return _Input(grid(-BURN_IN_S, 0.0), grid(0.0, length_s), time_s, command)
+    return _Input(rows, grid(-BURN_IN_S, 0.0), grid(0.0, length_s), time_s, command)
 
 
 def _of_one_shape(inputs: Sequence[_Input], like: FlightWindows | None) -> list[_Input]:
@@ -303,6 +305,7 @@ def _of_one_shape(inputs: Sequence[_Input], like: FlightWindows | None) -> list[
         commands = like.command_s.shape[1]
     return [
         _Input(
+            one.rows,
             padded_grid(one.burn_in, burn_in, at_front=True),
             padded_grid(one.window, steps),
             np.pad(one.command_s, (0, commands - len(one.command_s)), constant_values=np.inf),
@@ -310,17 +313,6 @@ def _of_one_shape(inputs: Sequence[_Input], like: FlightWindows | None) -> list[
         )
         for one in inputs
     ]
-
-
-def _rows(log: FlightLog, begin_s: float) -> np.ndarray:
-    """Return the rows of the window that starts at `begin_s` [s], at most `ROWS` of them."""
-    time_s = log.time_s
-    rows = np.flatnonzero((time_s >= begin_s - 1e-9) & (time_s <= begin_s + LENGTH_S + 1e-9))
-    missing = np.full((len(time_s), 1), np.nan)
-    signals = (log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b, log.acc_b, log.rotor_speed)
-    values = [(missing if signal is None else signal)[rows] for signal in signals]
-    valid = np.stack([np.isfinite(one).all(axis=1) for one in values], axis=1)
-    return rows[thinned(valid, time_s[rows], ROWS)]
 
 
 def _window(
@@ -338,7 +330,7 @@ def _window(
     `state` is the log with a state in every row; every `stride`-th rotor speed is used.
     """
     time_s, begin_s = log.time_s, log.time_s[row]
-    before, window = inputs.burn_in, inputs.window
+    rows, before, window = inputs.rows, inputs.burn_in, inputs.window
     sample_s = begin_s + before.edge_s[:-1] + before.lead_s
     middle_s = begin_s + 0.5 * (window.edge_s[:-1] + window.edge_s[1:])
     speed = np.zeros((len(middle_s), 4))
@@ -346,7 +338,6 @@ def _window(
         speed = rotors_at(middle_s, time_s, log.rotor_speed, vehicle, stride)
         if stride > 1:
             speed = with_hidden_torque(speed, vehicle, own_spacing_s(time_s, log.rotor_speed))
-    rows = _rows(log, begin_s)
     none = np.full((len(time_s), 4), np.nan)
     acc_b = none[:, :3] if log.acc_b is None else log.acc_b
     rotors = none if log.rotor_speed is None else log.rotor_speed
@@ -370,6 +361,10 @@ def _window(
         padding = np.zeros((ROWS - len(rows), *values.shape[1:]), values.dtype)
         return np.concatenate([np.nan_to_num(values), padding])
 
+    # Infinite times of commands are padding, and add nothing to the integral.
+    command_s = np.minimum(inputs.command_s, inputs.command_s[np.isfinite(inputs.command_s)].max())
+    added = np.diff(command_s)[:, None] * inputs.command[:-1]
+    command_sum = np.concatenate([np.zeros((1, 4)), np.cumsum(added, axis=0)])
     rotor_error = 0.0
     if not rotor_input:
         burn_in = (time_s > begin_s - BURN_IN_S - 1e-9) & (time_s <= begin_s + 1e-9)
@@ -383,7 +378,7 @@ def _window(
         np.concatenate([before.lead_s, window.lead_s]),
         inputs.command_s,
         inputs.command,
-        integral_of_held(inputs.command_s, inputs.command),
+        command_sum,
         interpolate(sample_s, time_s, log.rate_b),
         speed,
         voltage_drop(log, middle_s),

@@ -10,12 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
-from suite.diagnose.thresholds import Thresholds
+from suite.diagnose.estimate.parameters import Candidate
 
 
 class Estimate(NamedTuple):
@@ -55,34 +54,11 @@ class Block:
     @cached_property
     def equations(self) -> NormalEquations:
         """The normal equations of the stretches."""
-        return NormalEquations(
-            *products(self.slope, self.residual[..., None]),
-            (self.residual**2).sum(axis=1),
-            self.flight,
-            self.along,
-        )
+        return normal_equations(self.slope, self.residual, self.flight, self.along)
 
     def acts(self) -> np.ndarray:
         """Return for each column (K,) whether its parameter changes the model at all."""
         return np.abs(self.slope).max(axis=(0, 1), initial=0.0) > 0.0
-
-
-class Linearised(Protocol):
-    """Evidence whose noise is known: all that a fit needs."""
-
-    @property
-    def limits(self) -> Thresholds:
-        """Number of steps of a fit, and the fall of chi-square at which it has converged."""
-        ...
-
-    @property
-    def space(self) -> ParameterSpace:
-        """The parameters."""
-        ...
-
-    def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
-        """Return the block at `at`, with slopes at least along `indices`, or along all."""
-        ...
 
 
 class NormalEquations(NamedTuple):
@@ -147,24 +123,16 @@ class NormalEquations(NamedTuple):
         return self.chi2 - 2.0 * (self.gradient * change).sum(axis=1) + quadratic
 
 
-def products(slope: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return J'J (B, K, K) and J'r (B, K) of `slope` (B, M, K) and `residual` (B, M, 1)."""
+def normal_equations(
+    slope: np.ndarray,
+    residual: np.ndarray,
+    flight: np.ndarray | None = None,
+    along: tuple[int, ...] | None = None,
+) -> NormalEquations:
+    """Return the normal equations of `slope` (B, M, K) and `residual` (B, M)."""
     transposed = np.swapaxes(slope, 1, 2)
-    return transposed @ slope, (transposed @ residual)[..., 0]
-
-
-def stacked(rows: np.ndarray, stretch: np.ndarray) -> np.ndarray:
-    """Return `rows` (R, ...) arranged by stretch (B, M, ...), padded with zeros.
-
-    `stretch` (R,) is the number of each row's stretch: 0, 1, 2 and so on, none left out.
-    """
-    count = np.bincount(stretch) if len(stretch) else np.zeros(0, int)
-    order = np.argsort(stretch, kind="stable")
-    first_row = np.cumsum(count) - count
-    place_in_stretch = np.arange(len(rows)) - np.repeat(first_row, count)
-    table = np.zeros((len(count), count.max(initial=0), *rows.shape[1:]))
-    table[stretch[order], place_in_stretch] = rows[order]
-    return table
+    gradient = (transposed @ residual[..., None])[..., 0]
+    return NormalEquations(transposed @ slope, gradient, (residual**2).sum(axis=1), flight, along)
 
 
 def without_nuisance(
@@ -178,12 +146,20 @@ def without_nuisance(
     """Return the block of rows that have no nuisance parameters.
 
     `residual` (R, C) and `slope` (R, C, K), of R rows and C channels, are divided by the noise.
-    `stretch` (R,) is the number of each row's stretch, as in `stacked`; see `Block` for the others.
+    `stretch` (R,) is the number of each row's stretch: 0, 1, 2 and so on, none left out. See
+    `Block` for the others.
     """
-    count, size = len(flight), slope.shape[2]
-    residual = stacked(residual, stretch).reshape(count, -1)
-    slope = stacked(slope, stretch).reshape(count, residual.shape[1], size)
-    no_nuisance = np.zeros((count, 0))
-    return Block(
-        residual, slope, tuple(along), flight, start_s, no_nuisance, np.zeros((count, 0, size))
-    )
+    count, rows = len(flight), np.bincount(stretch)
+    order = np.argsort(stretch, kind="stable")
+    place_in_stretch = np.arange(len(stretch)) - np.repeat(np.cumsum(rows) - rows, rows)
+    shape = (count, rows.max(initial=0) * residual.shape[1])
+
+    def arranged(values: np.ndarray) -> np.ndarray:
+        """Return `values` (R, C, ...) by stretch (B, M, ...), padded with zeros."""
+        table = np.zeros((count, rows.max(initial=0), *values.shape[1:]))
+        table[stretch[order], place_in_stretch] = values[order]
+        return table.reshape(*shape, *values.shape[2:])
+
+    free, free_slope = np.zeros((count, 0)), np.zeros((count, 0, slope.shape[2]))
+    residual, slope = arranged(residual), arranged(slope)
+    return Block(residual, slope, tuple(along), flight, start_s, free, free_slope)

@@ -6,7 +6,7 @@ the model and r the residual; chi-square is the squared error over the noise var
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,8 +14,9 @@ from scipy.optimize import lsq_linear
 from scipy.stats import chi2
 from scipy.stats import t as student
 
-from suite.diagnose.estimate.block import Block, Estimate, Linearised, NormalEquations
+from suite.diagnose.estimate.block import Block, Estimate, NormalEquations
 from suite.diagnose.estimate.parameters import ParameterSpace
+from suite.diagnose.thresholds import Thresholds
 
 
 def solve(
@@ -77,7 +78,9 @@ def chi2_fall(
 
 
 def fit(
-    evidence: Linearised,
+    linearise: Callable[[Estimate, Sequence[int]], Block],
+    space: ParameterSpace,
+    limits: Thresholds,
     start: Estimate,
     indices: Sequence[int],
     rounds: int | None = None,
@@ -85,15 +88,16 @@ def fit(
 ) -> tuple[Estimate, Block]:
     """Fit the parameters at `indices` and the nuisance parameters of every stretch, from `start`.
 
-    It takes at most `rounds` steps, by default those of the evidence's `limits`. `known` is the
-    block at `start`, if it was computed before.
+    `linearise` returns the block at an estimate, with slopes at least along `indices`. At most
+    `rounds` steps are taken, by default those of `limits`. `known` is the block at `start`, if it
+    was computed before.
 
     Returns:
         The best estimate, and the block at this estimate.
     """
-    places, space, limits = np.array(indices, dtype=int), evidence.space, evidence.limits
+    places = np.array(indices, dtype=int)
     low, high = space.array("low")[places], space.array("high")[places]
-    best, block = start, known or evidence.linearise(start, indices)
+    best, block = start, known or linearise(start, indices)
     for steps_done in range(limits.fit_rounds if rounds is None else rounds):
         equations = block.equations.along_numbers(indices)
         change, expected_fall = gauss_newton_step(equations, best.theta, space)
@@ -109,7 +113,7 @@ def fit(
             theta[places] = np.clip(theta[places] + share * change, low, high)
             free = best.free + share * free_change if free_change.size else best.free
             trial = Estimate(theta, free)
-            trial_block = evidence.linearise(trial, indices)
+            trial_block = linearise(trial, indices)
             chi2 = float((trial_block.residual**2).sum())
             if np.isfinite(chi2) and chi2 <= chi2_before + 1e-6:
                 break

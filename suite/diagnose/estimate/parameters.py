@@ -8,8 +8,7 @@ one motor, or several effects as one hypothesis (a composite).
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
-from types import MappingProxyType
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -163,28 +162,6 @@ def make_space(vehicle: Vehicle) -> ParameterSpace:
                     )
                 )
     return ParameterSpace(tuple(entries), base)
-
-
-def with_fitted(
-    vehicle: Vehicle,
-    space: ParameterSpace,
-    theta: np.ndarray,
-    names: Collection[str],
-    further: Mapping[str, Any] | None = None,
-) -> Vehicle:
-    """Return `vehicle` whose effects `names` have their values in `theta` (P,).
-
-    `further` holds values of other effects, by name, which the result has as well.
-    """
-    fitted, effects = space.effects(theta), dict(vehicle.effects)
-    for name in set(names):
-        values = (np.asarray(value, dtype=float) for value in fitted[name])
-        effects[name] = type(fitted[name])(
-            *(tuple(v.tolist()) if v.ndim else float(v) for v in values)
-        )
-    effects |= further or {}
-    ordered = {name: effects[name] for name in EFFECTS if name in effects}
-    return replace(vehicle, effects=MappingProxyType(ordered))
 
 
 def candidates(space: ParameterSpace, voltage: bool, has: Collection[str]) -> list[Candidate]:

@@ -24,7 +24,7 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
 class CandidateScore(NamedTuple):
-    """How much a candidate (effect) explains in addition to the effects that are already named."""
+    """How much a candidate explains in addition to the effects that are already named."""
 
     candidate: Candidate
     gain: float
@@ -48,6 +48,7 @@ def folds_of(flight: np.ndarray, start_s: np.ndarray, folds: int = THRESHOLDS.fo
 
 
 def permutation_test(
+    among: Sequence[Candidate],
     hessian: np.ndarray,
     gradient: np.ndarray,
     groups: Sequence[tuple[int, ...]],
@@ -56,8 +57,8 @@ def permutation_test(
     seed: int,
     room: tuple[np.ndarray, np.ndarray] | None = None,
     limits: Thresholds = THRESHOLDS,
-) -> tuple[list[float], list[float], float]:
-    """Return gains and p-values of groups of columns, and the 99 % quantile of the null.
+) -> list[CandidateScore]:
+    """Return the scores of candidates, best first.
 
     The null is the distribution of the largest gain of all groups if each window's residual gets a
     random sign. A sign for a whole window keeps the correlation within it. First the part that the
@@ -67,12 +68,13 @@ def permutation_test(
     noise instead.
 
     The columns of `hessian` (W, K, K) and `gradient` (W, K) are scaled to similar size. `groups`
-    contain the columns `always`; gains are relative to a fit of these alone. `fold` (W,) is the
+    are those of the candidates `among`. They contain the columns `always`, and gains are relative
+    to a fit of these alone. `fold` (W,) is the
     cross-validation fold of each window, and `room` the lowest and highest change (K,) of each
     column.
     """
     if not groups:
-        return [], [], 0.0
+        return []
     draws = limits.sign_draws
     folds = [(fold != f, fold == f) for f in np.unique(fold)]
     hessians = [(hessian[fitted].sum(0), hessian[tested].sum(0)) for fitted, tested in folds]
@@ -132,7 +134,12 @@ def permutation_test(
         noise = (root @ rng.standard_normal((draws, *gradient.shape, 1)))[..., 0]
         drawn = [(noise[:, i].sum(axis=1), noise[:, o].sum(axis=1)) for i, o in folds]
     null = np.max([gain_by_chance(group) for group in groups], axis=0) - gain_by_chance(always)
-    return falls, [_p_value(null >= fall) for fall in falls], float(np.quantile(null, 0.99))
+    chance = float(np.quantile(null, 0.99))
+    scores = [
+        CandidateScore(one, fall, _p_value(null >= fall), chance)
+        for one, fall in zip(among, falls, strict=True)
+    ]
+    return sorted(scores, key=lambda s: -s.gain)
 
 
 def _p_value(as_extreme: np.ndarray) -> float:

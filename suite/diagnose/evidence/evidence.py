@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.estimate.block import Block, Estimate, NormalEquations
+from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.gauss_newton import fit, intervals95
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
 from suite.diagnose.estimate.permutation import CandidateScore, folds_of, permutation_test
@@ -66,7 +66,8 @@ class Evidence(ABC):
         known: Block | None = None,
     ) -> Evaluation:
         """Evaluate this evidence at the fit of the parameters at `indices`; see `fit`."""
-        return Evaluation(self, *fit(self, start, indices, rounds, known))
+        best = fit(self.linearise, self.space, self.limits, start, indices, rounds, known)
+        return Evaluation(self, *best)
 
     @property
     def flights_differ_p(self) -> float:
@@ -86,7 +87,7 @@ class Evidence(ABC):
         `current` is this evidence, evaluated along all parameters. A candidate without any effect
         on the flights gets no score.
         """
-        equations = current.equations
+        equations = current.block.equations
         along = list(equations.numbers)
         scale, theta = self.space.array("step")[along], current.at.theta
         low, high = ((self.space.array(end) - theta)[along] / scale for end in ("low", "high"))
@@ -95,13 +96,10 @@ class Evidence(ABC):
         acting = [c for c in among if information[list(columns(c))].sum() > 1e-9]
         groups = [tuple(sorted({*named, *columns(c)})) for c in acting]
         fold = self.folds(current.block)
-        gains, p_values, chance = permutation_test(
-            hessian, gradient, groups, tuple(named), fold, seed, (low, high), self.limits
+        room = (low, high)
+        return permutation_test(
+            acting, hessian, gradient, groups, tuple(named), fold, seed, room, self.limits
         )
-        scores = [
-            CandidateScore(*values, chance) for values in zip(acting, gains, p_values, strict=True)
-        ]
-        return sorted(scores, key=lambda s: -s.gain)
 
     def folds(self, block: Block) -> np.ndarray:
         """Return the fold (B,) of each stretch; cross-validation leaves out one fold at a time."""
@@ -130,14 +128,9 @@ class Evaluation(NamedTuple):
     at: Estimate
     block: Block
 
-    @property
-    def equations(self) -> NormalEquations:
-        """The block's normal equations."""
-        return self.block.equations
-
     def half_widths(self, indices: Sequence[int]) -> np.ndarray:
         """Return the half-widths (K,) of the 95 % intervals of the parameters at `indices`."""
-        equations = self.equations.along_numbers(indices)
+        equations = self.block.equations.along_numbers(indices)
         return intervals95(equations, self.evidence.flights_differ_p).half_width
 
 

@@ -146,29 +146,21 @@ def weights_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> Weights:
     count = sum(len(f) for f in flights)
     power = np.sum([(f**2).sum(axis=0) for f in deviations], axis=0)
     scatter = np.maximum(np.sqrt(power / max(count - len(flights), 1)), 1e-6)
-    memory = np.maximum(1.0, _autocorrelation_time(deviations, limits))
+    # The autocorrelation time in moments is a sum up to the first uncorrelated lag.
+    memory, correlated = np.ones(3), np.ones(3, bool)
+    for lag in range(1, limits.longest_memory):
+        product = np.sum([(f[lag:] * f[:-lag]).sum(axis=0) for f in deviations], axis=0)
+        correlation = product / np.maximum(power, 1e-300)
+        correlated &= correlation > LEAST_CORRELATION
+        memory += np.where(correlated, 2.0 * correlation, 0.0)
+        if not correlated.any():
+            break
     trim = np.full(3, np.inf)
     if len(flights) >= limits.least_flights:
         means = means_of(data.residual, data.flight)
         of_noise = np.mean([scatter**2 * memory / len(f) for f in flights], axis=0)
         trim = np.sqrt(np.maximum(means.var(axis=0, ddof=1) - of_noise, 0.0))
     return Weights(scatter, memory, trim)
-
-
-def _autocorrelation_time(deviations: list[np.ndarray], limits: Thresholds) -> np.ndarray:
-    """Return the autocorrelation time (3,) in moments: a sum up to the first uncorrelated lag."""
-    power = np.sum([(series**2).sum(axis=0) for series in deviations], axis=0)
-    total, correlated = np.ones(3), np.ones(3, bool)
-    for lag in range(1, limits.longest_memory):
-        product = np.sum(
-            [(series[lag:] * series[:-lag]).sum(axis=0) for series in deviations], axis=0
-        )
-        correlation = product / np.maximum(power, 1e-300)
-        correlated &= correlation > LEAST_CORRELATION
-        total += np.where(correlated, 2.0 * correlation, 0.0)
-        if not correlated.any():
-            break
-    return total
 
 
 def whitened(data: ViewData, weights: Weights) -> tuple[np.ndarray, np.ndarray]:

@@ -66,7 +66,9 @@ def fly_windows(
         lambda field: jnp.swapaxes(field, 0, 1),
         (spans, _acting_commands(windows, plant.constants.delay)),
     )
-    start = to_true(values, _sample(windows.rate_b, windows.pos_w, windows.rot_w, windows.vel_w))
+    rate_b = jnp.asarray(windows.rate_b)
+    logged = Sample(windows.pos_w, windows.rot_w, windows.vel_w, rate_b, jnp.zeros_like(rate_b))
+    start = to_true(values, logged)
     motion = Motion(
         start.pos_w + offset[:, :3],
         jnp.matmul(start.rot_w, exp_rot(offset[:, 3:6])),
@@ -153,7 +155,9 @@ def _speeds_after_burn_in(
     must not have a state of its own (integrators or filters).
     """
     # Of the motion in the burn-in only the rates are needed.
-    rates_b = to_true(values, _sample(jnp.swapaxes(windows.burn_in_rate_b, 0, 1))).rate_b
+    rates_b = jnp.swapaxes(windows.burn_in_rate_b, 0, 1)
+    zeros, level = jnp.zeros_like(rates_b), jnp.broadcast_to(jnp.eye(3), (*rates_b.shape, 3))
+    rates_b = to_true(values, Sample(zeros, level, zeros, rates_b, zeros)).rate_b
     speed = wanted_speed(plant, unpack_command(command[0]), rates_b[0])
 
     def burn_in_step(carry: Carry, row: Any) -> tuple[Carry, None]:
@@ -166,15 +170,6 @@ def _speeds_after_burn_in(
     carry = Carry(speed, speed, zeros, Wrench(zeros, zeros))
     carry, _ = jax.lax.scan(burn_in_step, carry, (spans, command, rates_b))
     return carry.rotor_speed
-
-
-def _sample(rate_b: Any, pos_w: Any = None, rot_w: Any = None, vel_w: Any = None) -> Sample:
-    """Return a sample (..., 3) with specific force 0; without a pose, at rest in the origin."""
-    rate_b = jnp.asarray(rate_b)
-    zeros = jnp.zeros_like(rate_b)
-    if pos_w is None:
-        pos_w, rot_w, vel_w = zeros, jnp.broadcast_to(jnp.eye(3), (*zeros.shape, 3)), zeros
-    return Sample(pos_w, rot_w, vel_w, rate_b, zeros)
 
 
 def _acting_commands(windows: FlightWindows, delay: Any) -> Any:

@@ -20,8 +20,7 @@ from eval.effects.log_faults import pose_delay
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import assemble
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.colour import Noise, measured_noise, residual_as_noise
-from suite.diagnose.data.noise import Linearisation
+from suite.diagnose.data.colour import Linearisation, Noise, measured_noise, residual_as_noise
 from suite.diagnose.data.steps import LONGEST_S, step_s
 from suite.diagnose.data.whitening import Whitening, block_of, make_whitening, slow_energy
 from suite.diagnose.data.windows import KNOTS, LENGTH_S, SLICES, STATE, FlightWindows, cut, take
@@ -73,19 +72,19 @@ class RolloutEvidence(Evidence):
         """Return the block at `at`, with slopes along `indices`; see `Evidence`."""
         linear = self.model.linearise(at, self.trusted, indices)
         along = range(self.model.size) if indices is None else indices
-        return block_of(self.whitening, linear, along, self.windows)
+        return block_of(self.whitening, linear, along)
 
     def estimate_noise(self, at: Estimate) -> Evaluation:
         """Evaluate this evidence with its noise estimated at `at`; see `Evidence`."""
         # The trusted windows are chosen again, as a better model stays near the flight for longer.
         linear = self.model.linearise(at, self.windows)
-        new, block = rollout_evidence(self.model, self.windows, linear, self.limits)
+        new, block = rollout_evidence(self.model, linear, self.limits)
         return Evaluation(new, at, block)
 
     def relinearise(self, at: Estimate) -> Evaluation:
         """Evaluate this evidence with its noise unchanged; see `Evidence`."""
         linear = self.model.linearise(at, self.windows)
-        new, block = rollout_evidence(self.model, self.windows, linear, self.limits, self.noise)
+        new, block = rollout_evidence(self.model, linear, self.limits, self.noise)
         return Evaluation(replace(new, misfit_is_noise=self.misfit_is_noise), at, block)
 
     def misfit_as_noise(self, best: Evaluation) -> RolloutEvidence | None:
@@ -93,9 +92,9 @@ class RolloutEvidence(Evidence):
         slow, expected = self.slow_errors(best.block)
         if slow.sum() <= self.limits.structure_rotor_input * expected.sum():
             return None
-        linear = self.model.linearise(best.at, self.windows)
-        noise = residual_as_noise(linear, self.trusted, self.limits)
-        whitening = make_whitening(linear, noise, self.trusted, self.limits)
+        linear = self.model.linearise(best.at, self.windows)._replace(windows=self.trusted)
+        noise = residual_as_noise(linear, self.limits)
+        whitening = make_whitening(linear, noise, self.limits)
         return replace(self, noise=noise, whitening=whitening, misfit_is_noise=True)
 
     def explained_share(
@@ -182,7 +181,6 @@ def trusted(
 
 def rollout_evidence(
     model: RolloutModel,
-    windows: FlightWindows,
     linear: Linearisation,
     limits: Thresholds = THRESHOLDS,
     noise: Noise | None = None,
@@ -193,23 +191,21 @@ def rollout_evidence(
     The slopes of `linear` are along the parameters `along` (default: all), then along the start
     numbers. If no `noise` is given, it is estimated from `linear`.
     """
-    near = trusted(windows, linear.residual, limits)
-    noise = noise or measured_noise(linear, near, limits)
-    whitening = make_whitening(linear, noise, near, limits)
-    evidence = RolloutEvidence(model, windows, near, noise, whitening, limits=limits)
+    near = linear._replace(windows=trusted(linear.windows, linear.residual, limits))
+    noise = noise or measured_noise(near, limits)
+    whitening = make_whitening(near, noise, limits)
+    evidence = RolloutEvidence(model, linear.windows, near.windows, noise, whitening, limits=limits)
     indices = range(model.size) if along is None else along
-    return evidence, block_of(whitening, linear, indices, windows)
+    return evidence, block_of(whitening, linear, indices)
 
 
-def is_hopeless(
-    model: RolloutModel, windows: FlightWindows, linear: Linearisation, limits: Thresholds
-) -> bool:
+def is_hopeless(model: RolloutModel, linear: Linearisation, limits: Thresholds) -> bool:
     """Return whether even a fit of all parameters leaves the rollouts far from the flights.
 
     The fit uses `linear`, which has slopes along all parameters. It is inexact for large effects,
     so if its error is too large, some windows are fitted with the full model.
     """
-    evidence, block = rollout_evidence(model, windows, linear, limits)
+    evidence, block = rollout_evidence(model, linear, limits)
 
     def is_far(chi2: float) -> bool:
         return chi2 > limits.hopeless_chi2 * max(int(evidence.trusted.valid.sum()), 1)
@@ -219,8 +215,8 @@ def is_hopeless(
     _, fall = gauss_newton_step(equations.take(informed), start, model.space)
     if not is_far(float(equations.chi2.sum()) - fall):
         return False
-    few = np.unique(np.linspace(0, len(windows.flight) - 1, limits.hopeless_windows).astype(int))
-    evidence, block = rollout_evidence(model, take(windows, few), take(linear, few), limits)
+    few = np.unique(np.linspace(0, len(linear.offset) - 1, limits.hopeless_windows).astype(int))
+    evidence, block = rollout_evidence(model, take(linear, few), limits)
     at = Estimate(start, linear.offset[few])
     best = evidence.fitted(at, informed, limits.hopeless_rounds, block)
     return is_far(float((best.block.residual**2).sum()))
@@ -279,7 +275,7 @@ class RolloutModel:
                 for x, w, own in batches(at.free, windows)
             ]
         residual, slope, knot = jax.tree.map(lambda *p: np.concatenate(p), *parts)
-        return Linearisation(residual, slope, at.free), knot
+        return Linearisation(residual, slope, at.free, windows), knot
 
     def linearise(
         self, at: Estimate, windows: FlightWindows, indices: Sequence[int] | None = None
@@ -290,7 +286,7 @@ class RolloutModel:
         With None they are along all parameters and then all start numbers.
         """
         values, slope = linearised(self._linear, self.given, *at, windows, indices, BATCH)
-        return Linearisation(-values, slope, at.free)
+        return Linearisation(-values, slope, at.free, windows)
 
 
 @cache

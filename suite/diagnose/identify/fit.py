@@ -144,7 +144,7 @@ class Fitted:
 
 @dataclass(frozen=True)
 class ResidualEvidence:
-    """Residuals of flights as input of the Gauss-Newton fit (`estimate.block.Linearised`)."""
+    """Residuals of flights as input of the Gauss-Newton fit (`estimate/gauss_newton.py`)."""
 
     residuals: Residuals
     unknowns: tuple[Unknown, ...]
@@ -154,7 +154,6 @@ class ResidualEvidence:
     """(C,) standard deviation of the residuals, by channel; None to estimate it."""
     weights: tuple[np.ndarray, ...] = ()
     """Weights (N, C) of the residuals, one array for each flight."""
-    limits = LIMITS
 
     @property
     def space(self) -> ParameterSpace:
@@ -251,7 +250,7 @@ def fit(
         # Fit the free numbers; each round has new weights.
         for _ in range(ROUNDS if free else 0):
             before, evidence = at, evidence.weighed(at)
-            at, _ = fit_numbers(evidence, at, free)
+            at, _ = fit_numbers(evidence.linearise, evidence.space, LIMITS, at, free)
             if (at.theta == before.theta).all():
                 break
         # Reset the number with the widest interval to its start, until all intervals are narrow.

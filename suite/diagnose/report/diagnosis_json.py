@@ -148,37 +148,26 @@ def effects_json(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 def _effect(finding: Finding, name: str, names: Sequence[NamedEffect]) -> dict[str, Any]:
     """Return the entry of the effect `name`; `names` are its named effects, one for each motor."""
     indices = sorted(index for named in names for index in named.candidate.indices)
-    width, undecided = finding.half_width, _undecided(finding, names)
-    size = finding.sizes.get(name)
+    space, width, size = finding.source.space, finding.half_width, finding.sizes.get(name)
+    # The same effect of another motor may fit about as well: the flights do not decide which.
+    rises = [rise for named in names for rise in named.worse_by.items()]
+    close = {label for label, rise in rises if rise <= finding.source.limits.rival_chi2}
+    undecided = [
+        index
+        for index, entry in enumerate(space.entries)
+        if entry.effect == name
+        and index not in indices
+        and f"{name} {_motor_number(space, index)}" in close
+    ]
     return {
         "name": name,
         "alternatives": sorted({rival for named in names for rival in named.rivals} - {name}),
-        "parameters": parameters_json(
-            finding.source.space, name, indices, finding.theta, width, undecided
-        ),
+        "parameters": parameters_json(space, name, indices, finding.theta, width, undecided),
         "gap_removed": finding.removed(names),
         "p_value": max(named.p_value for named in names),
         "size": size and size._asdict(),
         "view": finding.source.name,
     }
-
-
-def _undecided(finding: Finding, names: Sequence[NamedEffect]) -> list[int]:
-    """Return the indices of the same effect's parameters for other motors that fit about as well.
-
-    The flights then do not decide which motor has the effect.
-    """
-    name, space = names[0].candidate.name, finding.source.space
-    fitted = {index for named in names for index in named.candidate.indices}
-    rises = [rise for named in names for rise in named.worse_by.items()]
-    close = {label for label, rise in rises if rise <= finding.source.limits.rival_chi2}
-    return [
-        index
-        for index, entry in enumerate(space.entries)
-        if entry.effect == name
-        and index not in fitted
-        and f"{name} {_motor_number(space, index)}" in close
-    ]
 
 
 def parameters_json(

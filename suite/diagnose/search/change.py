@@ -38,6 +38,7 @@ from suite.diagnose.evidence.moments import (
 )
 from suite.diagnose.evidence.views import ViewBlock, ViewEvidence, view_candidates
 from suite.diagnose.search.evaluation import NamedEffect, SearchResult
+from suite.diagnose.thresholds import Thresholds
 
 
 def _motion_inputs(task: ViewEvidence, theta: np.ndarray) -> np.ndarray:
@@ -106,8 +107,6 @@ class RotorSpread:
     estimate of the axis alone and the pooled estimate."""
     freedom_along: Mapping[str, np.ndarray]
     """(3,) degrees of freedom of the estimate of each axis alone, by view."""
-    prior: int
-    """Weight of the pooled estimate in `along`, in degrees of freedom."""
 
     def words(self, count: int) -> tuple[str, ...]:
         """Return a text for people on how much the `count` reference flights differ."""
@@ -118,24 +117,26 @@ class RotorSpread:
             "differences significantly.",
         )
 
-    def variance_ratios(self, view: str, draws: int, rng: np.random.Generator) -> np.ndarray:
+    def variance_ratios(
+        self, view: str, limits: Thresholds, rng: np.random.Generator
+    ) -> np.ndarray:
         """Return draws (D, 3) of the estimated variance over the true one, by axis of `view`.
 
         All axes have the same true variance here. Where the estimate is too small by chance, any
         change seems too large, which the draws take into account.
         """
         freedom = np.concatenate(list(self.freedom_along.values()))
-        square = rng.chisquare(np.maximum(freedom, 1e-9), (draws, len(freedom)))
+        square = rng.chisquare(np.maximum(freedom, 1e-9), (limits.change_draws, len(freedom)))
         pooled = square.sum(axis=1, keepdims=True) / max(self.freedom, 1)
         axes = 3 * list(self.freedom_along).index(view) + np.arange(3)
-        return _moderated(pooled, square[:, axes], freedom[axes], self.prior)
+        return _moderated(pooled, square[:, axes], freedom[axes], limits)
 
 
 def _moderated(
-    pooled: np.ndarray | float, square: np.ndarray, freedom: np.ndarray, prior: int
+    pooled: np.ndarray | float, square: np.ndarray, freedom: np.ndarray, limits: Thresholds
 ) -> np.ndarray:
     """Return a weighted mean of the pooled variance and of each axis's own (Smyth 2004)."""
-    return (prior * pooled + square) / (prior + freedom)
+    return (limits.spread_freedom * pooled + square) / (limits.spread_freedom + freedom)
 
 
 def rotor_gain(task: ViewEvidence) -> np.ndarray:
@@ -164,14 +165,14 @@ def rotor_spread(sets: Sequence[ViewEvidence]) -> RotorSpread:
         freedom[task.view.name] += axes * (len(means) - 1)
     count = int(sum(by_axis.sum() for by_axis in freedom.values()))
     share = float(np.sqrt(sum(by_axis.sum() for by_axis in square.values()) / max(count, 1)))
-    prior = sets[0].limits.spread_freedom
+    limits = sets[0].limits
     along = {
-        name: np.sqrt(_moderated(share**2, square[name], freedom[name], prior)) for name in square
+        name: np.sqrt(_moderated(share**2, square[name], freedom[name], limits)) for name in square
     }
-    return RotorSpread(share, count, along, dict(freedom), prior)
+    return RotorSpread(share, count, along, dict(freedom))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ChangeEvidence(ViewEvidence):
     """Evidence of a change since reference flights: means of flights, and their usual spread.
 
@@ -179,16 +180,16 @@ class ChangeEvidence(ViewEvidence):
     inertia, arms or rotor torque. The noise `weights` of the fits contain this error.
     """
 
-    exact_weights: Weights | None = None
+    exact_weights: Weights
     """Noise without errors of the gains, for the test of the first name. Further names must be
     significant with these errors, since the first change times a wrong gain leaves a residual."""
-    spread: RotorSpread | None = None
+    spread: RotorSpread
     """Spread of flights of the unchanged vehicle."""
 
     @property
     def repeatability(self) -> np.ndarray:
         """(3,) standard deviation of flights' means, without errors of the gains."""
-        return np.full(3, np.inf) if self.exact_weights is None else self.exact_weights.trim
+        return self.exact_weights.trim
 
     @property
     def name_p_value(self) -> float:
@@ -207,7 +208,7 @@ class ChangeEvidence(ViewEvidence):
         The means of few flights contain little information: nearly every candidate is close.
         """
         block, theta = current.block, current.at.theta
-        assert isinstance(block, ViewBlock) and self.spread and self.exact_weights and self.weights
+        assert isinstance(block, ViewBlock) and self.weights
         weights = self.weights if named else self.exact_weights
         equations = block_of(block.data, weights, block.along, self.limits).equations
         without = chi2_fall(equations, theta, self.space, named)
@@ -215,7 +216,7 @@ class ChangeEvidence(ViewEvidence):
         gains = [chi2_fall(equations, theta, self.space, [*named, *g]) - without for g in groups]
         rng = np.random.default_rng([seed, len(named)])
         slope = whitened(block.data, weights)[1]
-        ratios = self.spread.variance_ratios(self.view.name, self.limits.change_draws, rng)
+        ratios = self.spread.variance_ratios(self.view.name, self.limits, rng)
         views = len(self.spread.along)  # Bonferroni's correction for the views
         p_values = [
             min(views * p, 1.0)
@@ -266,8 +267,8 @@ def change_evidence(
     # even one that explains much less than the best (a share of 1 switches that limit off).
     limits = replace(task.limits, rival_share=1.0)
     evidence = ChangeEvidence(
-        task.view, task.model, flights, task.carried, True, with_gain_error, weights, spread,
-        limits=limits,
+        task.view, task.model, flights, task.carried, True, with_gain_error,
+        exact_weights=weights, spread=spread, limits=limits,
     )  # fmt: skip
     return evidence.relinearise(Estimate(start))
 

@@ -101,7 +101,7 @@ def fit_with(start: Evaluation, others: Sequence[int], candidate: Candidate) -> 
     """Fit `candidate` together with the parameters at `others`, from the estimate of `start`."""
     evidence, limits, estimate = start.evidence, start.evidence.limits, start.at
     indices = sorted({*others, *candidate.indices})
-    numbers = start.equations.numbers  # those of inactive parameters have two columns
+    numbers = start.block.equations.numbers  # those of inactive parameters have two columns
     inactive = [n for k, n in enumerate(numbers) if n in numbers[:k] and n in candidate.indices]
     if not candidate.parts or not inactive:
         rounds = limits.bilinear_rounds if acts_through(candidate) else None
@@ -119,7 +119,7 @@ def linear_change(
 
     Only the parameters of `candidate` and those at `others` are fitted; the others do not change.
     """
-    equations, theta = start.equations, start.at.theta
+    equations, theta = start.block.equations, start.at.theta
     fitted = equations.take(sorted({*others, *equations.columns_of(candidate)}))
     step, _ = gauss_newton_step(fitted, theta, start.evidence.space)
     change, information = np.zeros_like(theta), np.zeros_like(theta)
@@ -133,7 +133,7 @@ def cross_validated_chi2(current: Evaluation, indices: Sequence[int]) -> np.ndar
 
     The fit is linear about the estimate of `current`. Fitted are the parameters at `indices`.
     """
-    equations = current.equations.along_numbers(sorted(indices))
+    equations = current.block.equations.along_numbers(sorted(indices))
     theta, space, errors = current.at.theta, current.evidence.space, []
     group = validation_groups(current.block.flight)
     for number in np.unique(group):

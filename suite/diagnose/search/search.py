@@ -74,9 +74,9 @@ def search(
         name, at = best
         new_names = _one_name_per_effect(name)
         known = current.evidence.estimate_noise(at)
-        named, at = _drop_unneeded(
-            task, known.evidence, at, [*named, *new_names], len(new_names) == 1
-        )
+        # A single new name has just been tested.
+        count = len(named) + len(new_names) - (len(new_names) == 1)
+        named, at = _tested_again(task, known.evidence, at, [*named, *new_names], count)
         current = with_inactive(known if at is best[1] else known.evidence.relinearise(at), among)
     named, at = _settle(task, current.evidence, current.at, named)
     last = judged = _final_fit(current.evidence, at, named)
@@ -132,9 +132,10 @@ def _best_candidate(
             if score.p_value <= evidence.name_p_value and score.gain >= least
         ]
     # ... that could be the best to first order, and of the single effects only the first few.
-    columns, theta = current.equations.columns_of, current.at.theta
+    equations, theta = current.block.equations, current.at.theta
     falls = {
-        c: chi2_fall(current.equations, theta, space, [*others, *columns(c)]) for c in shortlist
+        c: chi2_fall(equations, theta, space, [*others, *equations.columns_of(c)])
+        for c in shortlist
     }
     shortlist = [c for c in shortlist if c == tested or could_be_best(falls, c, limits)]
     if tested is None:
@@ -142,7 +143,7 @@ def _best_candidate(
         shortlist = [c for c in shortlist if c.parts or c in single]
     # Fit each of them, and keep those that pass the tests of the evidence.
     errors_before = cross_validated_chi2(current, others)
-    chi2_before, trials = float(current.equations.chi2.sum()), list[_Trial]()
+    chi2_before, trials = float(equations.chi2.sum()), list[_Trial]()
     for candidate in shortlist:
         fitted = fit_with(current, others, candidate)
         gains = errors_before - cross_validated_chi2(fitted, [*others, *candidate.indices])
@@ -165,7 +166,7 @@ def _best_candidate(
     # Those about as good as the lowest cost are `close`. Of these, the significant one that the
     # evidence prefers is named, and the others are its alternatives.
     lowest = min(trial.cost for trial in trials)
-    explained = chi2_before - chi2_fall(current.equations, theta, space, others) - lowest
+    explained = chi2_before - chi2_fall(equations, theta, space, others) - lowest
     allowed = max(min(limits.rival_chi2, limits.rival_share * explained), 0.0)
     close = [trial for trial in trials if trial.cost - lowest <= allowed]
     significant = [trial for trial in close if trial.name.p_value <= evidence.name_p_value]
@@ -207,21 +208,27 @@ def _replace_or_drop(
     return [*named[:place], *_one_name_per_effect(best[0]), *named[place + 1 :]], best[1]
 
 
-def _drop_unneeded(
-    task: SearchTask, evidence: Evidence, at: Estimate, named: list[NamedEffect], last_tested: bool
+def _tested_again(
+    task: SearchTask,
+    evidence: Evidence,
+    at: Estimate,
+    named: list[NamedEffect],
+    count: int,
+    among: Sequence[Candidate] = (),
 ) -> tuple[list[NamedEffect], Estimate]:
-    """Return the names that are significant in addition to all others, and the fit with them.
+    """Test the first `count` names one after another; return the names and the fit with them.
 
-    With `last_tested` the last name has just been tested, and is not tested again.
+    Candidates of `among` may take the place of a name. Without them, a name is dropped or kept with
+    its fit.
     """
-    place = 0
-    while place < len(named) - last_tested:
+    untested, place = len(named) - count, 0
+    while place < len(named) - untested:
         itself = [named[place].candidate]
-        remaining, refitted = _replace_or_drop(task, evidence, at, named, place, itself)
-        if len(remaining) < len(named):
-            named, at = remaining, refitted
-        else:
-            place += 1
+        tried = _replace_or_drop(task, evidence, at, named, place, among or itself)
+        is_dropped = len(tried[0]) < len(named)
+        if among or is_dropped:
+            named, at = tried
+        place += not is_dropped  # if the name was dropped, the next one is here now
     return named, at
 
 
@@ -234,11 +241,7 @@ def _settle(
         if not before:
             break
         at = evidence.fitted(at, fitted_by(named)).at
-        place = 0
-        while place < len(named):
-            count = len(named)
-            named, at = _replace_or_drop(task, evidence, at, named, place, task.among)
-            place += len(named) >= count  # if the name was dropped, the next one is here now
+        named, at = _tested_again(task, evidence, at, named, len(named), task.among)
         if [name.candidate for name in named] == before:
             break
     return named, at

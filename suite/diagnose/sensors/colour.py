@@ -25,7 +25,7 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from eval.judging.statistics import Interval
-from suite.diagnose.estimate.block import NormalEquations, products
+from suite.diagnose.estimate.block import normal_equations
 from suite.diagnose.estimate.gauss_newton import intervals95
 from suite.diagnose.identify.fit import DIFFER_P
 from suite.diagnose.sensors.errors import ZERO, significant, stretches
@@ -309,9 +309,7 @@ def _half_widths(slope: np.ndarray, residual: np.ndarray, flight: np.ndarray) ->
     `slope` (B, L, K) and `residual` (B * L,) are those of the fit, and `flight` (B,) is the number
     of each stretch's flight.
     """
-    residual = residual.reshape(*slope.shape[:2], 1)
-    chi2 = (residual[..., 0] ** 2).sum(axis=1)
-    equations = NormalEquations(*products(slope, residual), chi2, flight)
+    equations = normal_equations(slope, residual.reshape(slope.shape[:2]), flight)
     return intervals95(equations, DIFFER_P, leave_out=True, noise_share=0.0).half_width
 
 

@@ -158,7 +158,7 @@ def confirmed(
         while lost:
             withdrawn += [candidate.label for candidate in lost]
             found = found.refitted([one for one in found.named if one.candidate not in lost])
-            equations = found.judged.equations.along_numbers(found.indices)
+            equations = found.judged.block.equations.along_numbers(found.indices)
             information = np.einsum("wkk->k", equations.hessian)
             informed = {i for i, v in zip(found.indices, information, strict=True) if v > 0.0}
             lost = [one for one in found.candidates if not informed & set(one.indices)]

@@ -120,7 +120,7 @@ class RolloutSource(Source):
     def gap(self, found: SearchResult, theta: np.ndarray) -> Gap:
         """Return the gap on the held-out flights, see `Source`."""
         linear = from_true_starts(self.model, theta, self.held)
-        return gap_of(linear, self.held, of_rollouts(found.last).noise, self.limits)
+        return gap_of(linear, of_rollouts(found.last).noise, self.limits)
 
     def is_worse(self, before: Gap, after: Gap) -> bool:
         """Return whether the gap has grown by more than chance, see `Source`."""
@@ -133,8 +133,8 @@ class RolloutSource(Source):
         """
         theta, indices = found.estimate.theta, list(candidate.indices)
         linear = from_true_starts(self.model, theta, self.held, indices)
-        whitening = make_whitening(linear, of_rollouts(found.last).noise, self.held, self.limits)
-        slope = block_of(whitening, linear, indices, self.held).slope
+        whitening = make_whitening(linear, of_rollouts(found.last).noise, self.limits)
+        slope = block_of(whitening, linear, indices).slope
         change = (theta - self.start.theta)[indices]
         # Windows overlap, and `overlap` makes each row count once. Gaps compare slow errors only.
         expected_chi2 = float(slow_energy(whitening, slope @ change).sum()) * overlap(self.held)
@@ -183,7 +183,7 @@ class RolloutSource(Source):
             directions = [*indices, *model.starts]
             linear = model.linearise(estimate, self.coarser, directions)
             options = (found.last.evidence.limits, of_rollouts(found.last).noise, indices)
-            equations = rollout_evidence(model, self.coarser, linear, *options)[1].equations
+            equations = rollout_evidence(model, linear, *options)[1].equations
             change, _ = gauss_newton_step(equations, estimate.theta, model.space)
             model_error = self.coarser_share * np.abs(change)
         return sizes_by_effect(found, slope, lambda c: rollout_size(c, windows), model_error)
@@ -197,7 +197,7 @@ class RolloutSource(Source):
         structure, wind = self._structure(found, seed)
         details = {
             "shapes": [
-                {"label": shape.label, "gain": shape.gain, "p_value": shape.p_value}
+                {"label": shape.candidate.label, "gain": shape.gain, "p_value": shape.p_value}
                 for shape in structure.shapes[:SHAPES]
             ],
             "coloured": structure.coloured,
@@ -365,7 +365,7 @@ def structure_where(
     least = limits.structure_rotor_input if noise_is_uncertain else limits.structure
     if not (shape or coloured or slow.sum() / expected.sum() > least):
         return None
-    where = [shape.label] if shape else []
+    where = [shape.candidate.label] if shape else []
     for quantity in ("force", "torque"):
         axes = [axis[-1] for axis in coloured if axis.startswith(quantity)]
         if axes:

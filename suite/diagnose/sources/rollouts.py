@@ -13,9 +13,8 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.colour import measured_noise
+from suite.diagnose.data.colour import Linearisation, measured_noise
 from suite.diagnose.data.hold_out import choose_held_out
-from suite.diagnose.data.noise import Linearisation
 from suite.diagnose.data.sampling import own_spacing_s
 from suite.diagnose.data.steps import has_firmware_loop, rows_show_torque
 from suite.diagnose.data.whitening import block_of, make_whitening
@@ -108,10 +107,10 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     # Flights that a simulator flew with Euler steps, driven by commands, have no such error.
     has_error = integrator != "euler" or rotor_input
     coarser = take(windows_of(coarser=windows)[0], is_finite) if has_error else None
-    all_windows, windows, linear = windows, take(windows, is_finite), take(linear, is_finite)
+    linear = take(linear, is_finite)
     if coarser is not None:
         other = model.residual(Estimate(start.theta, linear.offset), coarser)
-        limits = with_model_error(windows, linear, other, limits)
+        limits = with_model_error(linear, other, limits)
     # See `RolloutSource.sizes` for these shares.
     dense = all(
         log.rotor_speed is None
@@ -122,19 +121,19 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     commands = [(log.time_s, log.rate_cmd_b) for log in logs if log.rate_cmd_b is not None]
     are_slow = any(own_spacing_s(*command) > limits.command_spacing_s for command in commands)
     if are_slow and not rotor_input:
-        fewer = take(windows_of(fewer_commands=all_windows)[0], is_finite)
+        fewer = take(windows_of(fewer_commands=windows)[0], is_finite)
         other = model.residual(Estimate(start.theta, linear.offset), fewer)
-        held = with_held_commands(windows, linear, other, limits)
+        held = with_held_commands(linear, other, limits)
         if held is not None:
             limits, coarser, coarser_share = held, fewer, 1.0
             warnings.append(LACKING)
-    if not given.chosen and is_hopeless(model, windows, linear, limits):
+    if not given.chosen and is_hopeless(model, linear, limits):
         given.say("no effect brings rollouts of 1 s near these flights: using force and torque")
         return SourceSet((), (), "", (FAR,))
     # Choose which stretches are held out, by their information on each parameter.
-    noise = measured_noise(linear, windows, limits)
-    whitening = make_whitening(linear, noise, windows, limits)
-    informed = (block_of(whitening, linear, range(model.size), windows).slope ** 2).sum(axis=1)
+    windows = linear.windows
+    whitening = make_whitening(linear, measured_noise(linear, limits), limits)
+    informed = (block_of(whitening, linear, range(model.size)).slope ** 2).sum(axis=1)
     is_fitted, names = choose_held_out(logs, windows.flight, windows.start_s, informed, limits)
     count = int(is_fitted.sum())
     _check_count(count, limits)
@@ -159,7 +158,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     # Effects on a signal that the logs lack, or that the model does not use, are not candidates.
     signals = {"acc_b"} if any(log.acc_b is not None for log in logs) else set()
     single = candidates(model.space, voltage, signals if rotor_input else signals | {"command"})
-    evidence, block = rollout_evidence(model, fitted, take(linear, is_fitted), limits)
+    evidence, block = rollout_evidence(model, take(linear, is_fitted), limits)
     source = RolloutSource(
         name="whole",
         about="whole flights, in rollouts of a second",

@@ -85,18 +85,18 @@ def by_views(given: DiagnosisInput) -> SourceSet:
     start_s = np.zeros(len(information))
     is_fitted, _ = choose_held_out(logs, block.flight, start_s, information, limits)
     held_numbers = sorted({*block.flight.tolist()} - {*block.flight[is_fitted].tolist()})
-    parts = parted(flights, held_numbers, limits)
+    fitted, held = parted(flights, held_numbers, limits)
     # Of partial logs or a single flight to fit, only the means of flights are compared.
     untested = list[str]()
     if references and any(log.partial for log in [*logs, *references]):
         untested = [UNTESTED.format("some logs are partial")]
-    elif references and len(next(iter(parts.fitted.values()))) < 2:
+    elif references and len(next(iter(fitted.smoothed.values()))) < 2:
         untested = [UNTESTED.format("this needs 3 new flights or more, as one is held out")]
     # Make one source for each view.
     sources = []
-    for name in parts.fitted:
+    for name in fitted.smoothed:
         one = evidence[name]
-        to_fit, held_out = (replace(one, flights=p[name]) for p in (parts.fitted, parts.held))
+        to_fit, held_out = (replace(one, flights=part.smoothed[name]) for part in (fitted, held))
         view, unit = one.view, "m/s^2" if one.view.in_world else "rad/s^2"
         shared: dict[str, Any] = {
             "name": name,
@@ -125,9 +125,9 @@ def by_views(given: DiagnosisInput) -> SourceSet:
     lag = None if references else find_rotor_lag(logs, vehicle, limits)
     return SourceSet(
         tuple(sources),
-        parts.names,
+        held.names,
         flights.source,
-        (*flights.notes, *parts.notes, *not_shown, *left_out, *untested),
+        (*held.notes, *not_shown, *left_out, *untested),
         (lag,) if lag else (),
         spread.words(len(references)) if spread else (),
     )

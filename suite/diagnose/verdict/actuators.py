@@ -108,38 +108,25 @@ RATE_LOOP, LOGGED = "nominal rate loop", "logged motor commands"
 """What commands rotor speeds: the rate loop at the measured body rates, or the log's commands."""
 
 
-def _commanded(
-    commanded_by: str, log: FlightLog, step_time_s: np.ndarray, plant: Plant
-) -> Callable[[float], np.ndarray] | None:
-    """Return the commanded rotor speeds of `log`; None where it has no such commands.
-
-    `step_time_s` (S,) are the starts of the time steps [s]. The rate loop is that of `plant`, the
-    model of the vehicle.
-    """
-    if commanded_by == LOGGED:
-        logged = log.rotor_speed_cmd
-        if logged is None:
-            return None
-        return lambda delay_s: hold(step_time_s - delay_s, log.time_s, logged)
-    if log.thrust_cmd is None or log.rate_cmd_b is None:
-        return None
-    command = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
-    rate_b = interpolate(step_time_s, log.time_s, log.rate_b)
-
-    def commanded(delay_s: float) -> np.ndarray:
-        # The loop uses the current rates; only the command is delayed.
-        delayed = hold(step_time_s - delay_s, log.time_s, command)
-        return np.asarray(wanted_speed(plant, Command(delayed[:, 0], delayed[:, 1:]), rate_b))
-
-    return commanded
-
-
 def _stretches(
     log: FlightLog, plant: Plant, commanded_by: str, limits: Thresholds
 ) -> list[_Stretch]:
-    """Return the stretches of `log` that have measured and commanded rotor speeds."""
-    if log.rotor_speed is None:
+    """Return the stretches of `log` that have measured and commanded rotor speeds.
+
+    The rate loop is that of `plant`, the model of the vehicle.
+    """
+    command = log.command if commanded_by == RATE_LOOP else log.rotor_speed_cmd
+    if log.rotor_speed is None or command is None:
         return []
+
+    def commanded(step_time_s: np.ndarray, loop_rate_b: np.ndarray, delay_s: float) -> np.ndarray:
+        delayed = hold(step_time_s - delay_s, log.time_s, command)
+        if commanded_by == LOGGED:
+            return delayed
+        # The loop uses the current rates; only the command is delayed.
+        wanted = wanted_speed(plant, Command(delayed[:, 0], delayed[:, 1:]), loop_rate_b)
+        return np.asarray(wanted)
+
     dt, stretches = plant.dt, []
     rate_b = on_every_row(log, limits).rate_b
     complete = np.isfinite(log.rotor_speed).all(axis=1) & np.isfinite(rate_b).all(axis=1)
@@ -152,13 +139,14 @@ def _stretches(
         if time_s[-1] < 4.0 * limits.lag_settled_s:  # too short next to the time left out below
             continue
         step_time_s = log.time_s[rows[0]] + dt * np.arange(int(time_s[-1] / dt) + 1)
-        commanded = _commanded(commanded_by, log, step_time_s, plant)
-        if commanded is None or not np.isfinite(commanded(0.0)).all():
+        loop_rate_b = interpolate(step_time_s, log.time_s, log.rate_b)
+        speed_after = partial(commanded, step_time_s, loop_rate_b)
+        if not np.isfinite(speed_after(0.0)).all():
             continue
         step = np.round(time_s / dt).astype(int)
         # The rotor speeds before the stretch are unknown; their effect decays first.
         settled = (step * dt >= limits.lag_settled_s) & (step <= len(step_time_s))
-        stretches.append(_Stretch(commanded, step[settled], log.rotor_speed[rows[settled]]))
+        stretches.append(_Stretch(speed_after, step[settled], log.rotor_speed[rows[settled]]))
     return stretches
 
 
@@ -260,7 +248,7 @@ def rotors_are_input(logs: Sequence[FlightLog], drive: str, vehicle: Vehicle) ->
     Raises:
         ValueError: for an unknown `drive`, or one that the logs or the rate loop do not allow.
     """
-    commands = all(log.thrust_cmd is not None and log.rate_cmd_b is not None for log in logs)
+    commands = all(log.command is not None for log in logs)
     motors = all(log.rotor_speed is not None for log in logs)
     if drive not in ("auto", "commands", "motors"):
         raise ValueError(f"drive = {drive!r}; allowed: auto, commands, motors")

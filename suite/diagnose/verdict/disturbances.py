@@ -55,10 +55,6 @@ class Swing(NamedTuple):
     period_s: float
     ci95: tuple[float, float]
     """95 % interval of the period [s]."""
-    share: float
-    """Share of the residual force's power within `BAND_HZ` that is in the peak."""
-    p_value: float
-    """p-value after Bonferroni's correction for all tested periods and widths."""
 
     @property
     def length_m(self) -> float:
@@ -112,6 +108,7 @@ def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
         return None
     largest = float(gain[width, best])
     independent = (frequency_hz[-1] - frequency_hz[0]) / np.mean([s.width_hz for s in spectra])
+    # Bonferroni's correction for all tested periods and widths.
     p_value = float(chi2.sf(2.0 * largest, 2 * len(spectra))) * independent * len(WIDTHS)
     # Reject a peak that is not significant, small, or small next to the acceleration there.
     centre_hz = float(frequency_hz[best])
@@ -126,7 +123,7 @@ def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
     likely = frequency_hz[gain[width] >= largest - limits.profile_fall]
     likely = likely[np.abs(likely - centre_hz) < 0.5 * centre_hz]
     low, high = likely.min() - STEP_HZ, likely.max() + STEP_HZ
-    return Swing(1.0 / centre_hz, (1.0 / high, 1.0 / low), share, min(p_value, 1.0))
+    return Swing(1.0 / centre_hz, (1.0 / high, 1.0 / low))
 
 
 def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None:
@@ -208,7 +205,7 @@ def _fit_spectrum(power: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np
 def _peak_shares(
     spectra: Sequence[Spectrum], centre_hz: float, heights: Sequence[float]
 ) -> tuple[float, float]:
-    """Return the residual force over the acceleration at a peak, and the peak's share of power."""
+    """Return the residual force over the acceleration at a peak, and its share of the power."""
     residual = measured = peak = total = 0.0
     for spectrum, height in zip(spectra, heights, strict=True):
         in_peak = np.abs(spectrum.frequency_hz - centre_hz) <= spectrum.width_hz

@@ -23,8 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.data.colour import Noise
-from suite.diagnose.data.noise import Linearisation
+from suite.diagnose.data.colour import Linearisation, Noise
 from suite.diagnose.data.whitening import block_of, make_whitening, rotor_spread, slow_energy
 from suite.diagnose.data.windows import (
     LENGTH_S,
@@ -148,25 +147,22 @@ def start_correction(
     flies &= np.isfinite(linear.slope).all(axis=(1, 2, 3))
     correction = np.zeros_like(linear.offset)
     if flies.any():
-        linear, windows = take(linear, flies), take(windows, flies)
-        whitening = make_whitening(linear, noise, windows, limits)
-        best = block_of(whitening, linear, (), windows).free[:, :STATE]
+        linear = take(linear, flies)
+        whitening = make_whitening(linear, noise, limits)
+        best = block_of(whitening, linear, ()).free[:, :STATE]
         most = 3.0 * np.nan_to_num(noise.sigma[:STATE], nan=np.inf)
         correction[flies, :STATE] = np.clip(best, -most, most)
     return correction
 
 
-def gap_of(
-    linear: Linearisation, windows: FlightWindows, noise: Noise, limits: Thresholds = THRESHOLDS
-) -> Gap:
+def gap_of(linear: Linearisation, noise: Noise, limits: Thresholds = THRESHOLDS) -> Gap:
     """Return the gap of the residuals in `linear`, which has slopes along the start states only.
 
     The score contains pose, velocity and rates only. The energy, by which models are compared,
     contains every fitted channel, because a bias of the accelerometer changes no other channel.
     """
-    whitening = make_whitening(linear, noise, windows, limits)
-    residual = block_of(whitening, linear, (), windows).residual
-    slow = slow_energy(whitening, residual)
+    windows, whitening = linear.windows, make_whitening(linear, noise, limits)
+    slow = slow_energy(whitening, block_of(whitening, linear, ()).residual)
     score = slow[:, :STATE].sum(axis=1) / whitening.slow_freedom[:, :STATE].sum(axis=1)
     # Noise of the start numbers: the state, and then errors of the rotor speeds.
     rotors = np.full(linear.offset.shape[1] - STATE, rotor_spread(windows, limits))

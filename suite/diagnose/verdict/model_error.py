@@ -17,29 +17,25 @@ from dataclasses import replace
 
 import numpy as np
 
-from suite.diagnose.data.colour import Noise, measured_noise
-from suite.diagnose.data.noise import Linearisation, at_least
+from suite.diagnose.data.colour import Linearisation, Noise, at_least, measured_noise
 from suite.diagnose.data.whitening import Whitening, block_of, make_whitening, slow_energy
-from suite.diagnose.data.windows import SLICES, FlightWindows
+from suite.diagnose.data.windows import SLICES
 from suite.diagnose.thresholds import Thresholds
 
 
-def with_model_error(
-    windows: FlightWindows, linear: Linearisation, coarser: np.ndarray, limits: Thresholds
-) -> Thresholds:
+def with_model_error(linear: Linearisation, coarser: np.ndarray, limits: Thresholds) -> Thresholds:
     """Return `limits` with the lower limits of the noise raised to the model's error.
 
     `linear` has the residuals of W windows, and slopes along all parameters and start numbers.
     `coarser` (W, N, 19) are the residuals with longer steps and fewer rotor speeds.
     """
-    noise = measured_noise(linear, windows, limits)
-    whitening = make_whitening(linear, noise, windows, limits)
-    difference = _difference(linear, coarser)
-    return _raised(_rms(difference, linear, noise, whitening, windows), limits)
+    noise = measured_noise(linear, limits)
+    whitening = make_whitening(linear, noise, limits)
+    return _raised(_rms(_difference(linear, coarser), linear, noise, whitening), limits)
 
 
 def with_held_commands(
-    windows: FlightWindows, linear: Linearisation, fewer: np.ndarray, limits: Thresholds
+    linear: Linearisation, fewer: np.ndarray, limits: Thresholds
 ) -> Thresholds | None:
     """Return `limits` with the noise raised to the error of held commands; None without the error.
 
@@ -49,12 +45,11 @@ def with_held_commands(
 
     Args: see `with_model_error`; `fewer` are the residuals with every second command.
     """
-    noise = measured_noise(linear, windows, limits)
-    whitening = make_whitening(linear, noise, windows, limits)
+    noise = measured_noise(linear, limits)
+    whitening = make_whitening(linear, noise, limits)
     difference = _difference(linear, fewer)
-    rms, residual = (
-        _rms(errors, linear, noise, whitening, windows) for errors in (difference, linear.residual)
-    )
+    rms = _rms(difference, linear, noise, whitening)
+    residual = _rms(linear.residual, linear, noise, whitening)
     shares = residual / np.maximum(rms, 1e-12)
     by_group = dict(zip(SLICES, shares, strict=True))
     fast = (by_group["rates"], by_group["rotor speed"])
@@ -66,8 +61,8 @@ def with_held_commands(
     rms, difference = share * rms, np.nan_to_num(share * difference)
     raised = _raised(rms, limits)
     noise = Noise(at_least(noise.sigma, raised), {})
-    whitening = make_whitening(linear, noise, windows, raised)
-    block = block_of(whitening, linear._replace(residual=difference), (), windows)
+    whitening = make_whitening(linear, noise, raised)
+    block = block_of(whitening, linear._replace(residual=difference), ())
     slow = slow_energy(whitening, block.residual).sum(axis=0)
     expected = np.maximum(whitening.slow_freedom.sum(axis=0), 1e-9)
     factor = [np.sqrt(max(slow[c].sum() / expected[c].sum(), 1.0)) for c in SLICES.values()]
@@ -95,11 +90,7 @@ def _difference(linear: Linearisation, other: np.ndarray) -> np.ndarray:
 
 
 def _rms(
-    errors: np.ndarray,
-    linear: Linearisation,
-    noise: Noise,
-    whitening: Whitening,
-    windows: FlightWindows,
+    errors: np.ndarray, linear: Linearisation, noise: Noise, whitening: Whitening
 ) -> np.ndarray:
     """Return the RMS (6,) of the unexplained part of `errors` (W, N, 19), by sensor.
 
@@ -108,11 +99,11 @@ def _rms(
     """
     known = np.isfinite(errors).all(axis=(1, 2), keepdims=True)
     errors = np.where(known, errors, 0.0)
-    unexplained = block_of(whitening, linear._replace(residual=errors), (), windows).residual
+    unexplained = block_of(whitening, linear._replace(residual=errors), ()).residual
     _, rows, channels = errors.shape
     over_noise = unexplained[:, : rows * channels].reshape(errors.shape)
     sigma = np.where(np.isfinite(noise.sigma), noise.sigma, 0.0)
-    valid = np.asarray(windows.valid) & known
+    valid = np.asarray(linear.windows.valid) & known
     energy = (np.where(valid, over_noise * sigma, 0.0) ** 2).sum(axis=(0, 1))
     # Mean of each channel, and then of each group of channels (three or four of one sensor).
     power = energy / np.maximum(valid.sum(axis=(0, 1)), 1)

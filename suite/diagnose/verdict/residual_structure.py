@@ -10,7 +10,7 @@ energy than noise gives (a score test of a smooth random disturbance).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +21,8 @@ from suite.diagnose.data.whitening import block_of
 from suite.diagnose.data.windows import KNOTS, FlightWindows
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.gauss_newton import Z95
-from suite.diagnose.estimate.permutation import permutation_test
+from suite.diagnose.estimate.parameters import Candidate
+from suite.diagnose.estimate.permutation import CandidateScore, permutation_test
 from suite.diagnose.evidence.rollout import Flown
 from suite.diagnose.evidence.rollouts import RolloutEvidence
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
@@ -45,25 +46,15 @@ class DisturbanceEquations(NamedTuple):
     unit: np.ndarray
     """(W, 6 KNOTS, J) linear [m/s^2] and angular [rad/s^2] acceleration in body axes that each of
     the J columns of all shapes gives with a coefficient of 1."""
-    groups: Mapping[str, tuple[int, ...]]
-    """Columns of each shape, by its name for people such as "force with the speed"."""
+    shapes: Sequence[Candidate]
+    """The shapes, with labels such as "force with the speed". Their indices are the columns."""
     limits: Thresholds = THRESHOLDS
-
-
-class ShapeScore(NamedTuple):
-    """How much of the residual one shape explains; fields as in `permutation.CandidateScore`."""
-
-    label: str
-    gain: float
-    p_value: float
-    columns: tuple[int, ...]
-    """Numbers of its columns in `DisturbanceEquations.unit`."""
 
 
 class ResidualStructure(NamedTuple):
     """Results of both tests."""
 
-    shapes: list[ShapeScore]
+    shapes: list[CandidateScore]
     """Scores of all shapes, the best first."""
     coloured: dict[str, float]
     """p-value of a smooth (autocorrelated) random disturbance along each of `AXES`, by axis."""
@@ -77,7 +68,7 @@ def disturbance_equations(
     `windows` are those of the `evidence`, or the same with another input.
     """
     disturbed, knot = evidence.model.respond(estimate, windows)
-    equations = block_of(evidence.whitening, disturbed, range(6 * KNOTS), windows).equations
+    equations = block_of(evidence.whitening, disturbed, range(6 * KNOTS)).equations
     shapes = _shapes(knot, np.asarray(windows.start_s))
     return DisturbanceEquations(
         equations.hessian, equations.gradient, knot, *shapes, evidence.limits
@@ -92,26 +83,20 @@ def residual_structure(
     `fold` (W,) is the cross-validation fold of each window; one fold is left out at a time.
     """
     # From forces and torques at the knots to coefficients of the shapes.
-    groups = equations.groups
     hessian, gradient = _along(equations, equations.unit)
     size = np.sqrt(np.maximum(np.einsum("wjj->j", hessian), 1e-12))
-    gains, p_values, _ = permutation_test(
+    scores = permutation_test(
+        equations.shapes,
         hessian / np.outer(size, size),
         gradient / size,
-        list(groups.values()),
+        [shape.indices for shape in equations.shapes],
         (),
         fold,
         seed,
         limits=equations.limits,
     )
-    scores = [
-        ShapeScore(label.rstrip(), gain, p_value, columns)
-        for (label, columns), gain, p_value in zip(groups.items(), gains, p_values, strict=True)
-    ]
-    return ResidualStructure(
-        sorted(scores, key=lambda shape: -shape.gain),
-        {axis: _energy_p_value(equations, i) for i, axis in enumerate(AXES)},
-    )
+    coloured = {axis: _energy_p_value(equations, i) for i, axis in enumerate(AXES)}
+    return ResidualStructure(scores, coloured)
 
 
 def beyond_model_error(
@@ -126,11 +111,12 @@ def beyond_model_error(
     of the change of a shape's coefficients counts as the error.
     """
 
-    def is_kept(shape: ShapeScore) -> bool:
+    def is_kept(shape: CandidateScore) -> bool:
         if shape.p_value > equations.limits.shape_p_value:
             return True
-        value, width = _fit(equations, shape.columns)
-        error = share * np.abs(_fit(coarse, shape.columns)[0] - value)
+        columns = shape.candidate.indices
+        value, width = _fit(equations, columns)
+        error = share * np.abs(_fit(coarse, columns)[0] - value)
         return beyond_error(value, error, width)
 
     return structure._replace(shapes=[shape for shape in structure.shapes if is_kept(shape)])
@@ -194,8 +180,8 @@ def _energy_p_value(equations: DisturbanceEquations, axis: int) -> float:
     return min(1.0, len(p_values) * min(p_values))
 
 
-def _shapes(knot: Flown, start_s: np.ndarray) -> tuple[np.ndarray, dict[str, tuple[int, ...]]]:
-    """Return `unit` and `groups` of all shapes at the knots, as in `DisturbanceEquations`.
+def _shapes(knot: Flown, start_s: np.ndarray) -> tuple[np.ndarray, list[Candidate]]:
+    """Return `unit` and `shapes` at the knots, as in `DisturbanceEquations`.
 
     `start_s` (W,) is the start of each window, from the start of its flight [s].
     """
@@ -231,11 +217,12 @@ def _shapes(knot: Flown, start_s: np.ndarray) -> tuple[np.ndarray, dict[str, tup
         "twice the heading": np.cos(2.0 * yaw),
         "twice the heading ": np.sin(2.0 * yaw),
     }
-    columns, groups = list[np.ndarray](), dict[str, tuple[int, ...]]()
+    columns, shapes = list[np.ndarray](), list[Candidate]()
 
-    def add(label: str, shapes: list[np.ndarray]) -> None:
-        groups[label] = tuple(range(len(columns), len(columns) + len(shapes)))
-        columns.extend(shapes)
+    def add(label: str, own: list[np.ndarray]) -> None:
+        indices, label = tuple(range(len(columns), len(columns) + len(own))), label.rstrip()
+        shapes.append(Candidate(label, indices, label))
+        columns.extend(own)
 
     # Each scalar times a force along each body axis, and times a torque about each body axis.
     unit_axes = np.eye(6)
@@ -263,7 +250,7 @@ def _shapes(knot: Flown, start_s: np.ndarray) -> tuple[np.ndarray, dict[str, tup
     radial = np.concatenate([from_centre_b, np.zeros_like(from_centre_b)], axis=-1)
     add("force towards a place", [radial])
     stacked = np.stack(columns, axis=-1)
-    return stacked.reshape(len(stacked), KNOTS * 6, -1), groups
+    return stacked.reshape(len(stacked), KNOTS * 6, -1), shapes
 
 
 def _hats(scalar: np.ndarray) -> list[np.ndarray]:

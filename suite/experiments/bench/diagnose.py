@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from suite.common.errors import WorkFailed
-from suite.diagnose.data.noise import noise_of
+from suite.diagnose.data.colour import noise_of
 from suite.diagnose.estimate.block import NormalEquations
-from suite.diagnose.estimate.gauss_newton import fit, intervals95
+from suite.diagnose.estimate.gauss_newton import intervals95
 from suite.diagnose.evidence.rollouts import RolloutModel, rollout_evidence, start_estimate
 from suite.experiments.bench import sysid_baseline
 from suite.experiments.bench.compare import Comparison, compare_times, in_turn
@@ -75,8 +75,8 @@ def refit(model: RolloutModel, task: sysid_baseline.Task) -> tuple[np.ndarray, N
     while True:
         directions = [*indices, *model.starts]
         linear = model.linearise(state, task.windows, directions)
-        evidence, known = rollout_evidence(model, task.windows, linear, along=indices)
-        state, block = fit(evidence, state, indices, known=known)
+        evidence, known = rollout_evidence(model, linear, along=indices)
+        _, state, block = evidence.fitted(state, indices, known=known)
         if evidence.trusted.valid.sum() <= used_values:
             return state.theta[indices], block.equations
         used_values = evidence.trusted.valid.sum()

@@ -133,10 +133,10 @@ def test_the_noise_of_a_slow_signal_is_that_of_its_own_rows(pair):
 
 @pytest.mark.parametrize("ground_s", [(0.0, 0.0), (0.0, 6.0), (30.0, 0.0)])
 def test_of_a_single_flight_the_end_of_what_flew_is_held_out(pair, ground_s):
-    parts = parted(ready([on_the_ground(pair[0], *ground_s)], VEHICLE), [])
-    fitted, held, (words,), _ = parts
+    fitted, held = parted(ready([on_the_ground(pair[0], *ground_s)], VEHICLE), [])
+    (words,) = held.names
     for name in (FORCE.name, TORQUE.name):
-        first, last = (part[name][0].form.middle_s for part in (fitted, held))
+        first, last = (part.smoothed[name][0].form.middle_s for part in (fitted, held))
         assert first.max() < last.min()
         share = len(first) / (len(first) + len(last))
         assert share == pytest.approx(THRESHOLDS.lone_fitted_share, abs=0.1)
@@ -149,9 +149,9 @@ def test_a_second_must_be_held_out_or_the_flight_is_refused_or_a_second_view_lef
     with pytest.raises(ValueError, match="s of usable flight held out, at least 1 s"):
         parted(ready([short], VEHICLE), [])
     without = replace(longer, about={"partial": ["quat", "rate"]})
-    parts = parted(ready([without], VEHICLE), [])
-    assert set(parts.fitted) == set(parts.held) == {FORCE.name}
-    (note,) = parts.notes
+    fitted, held = parted(ready([without], VEHICLE), [])
+    assert set(fitted.smoothed) == set(held.smoothed) == {FORCE.name}
+    (note,) = held.notes
     assert note.startswith("torque: not examined, ") and "held out, at least 1 s" in note
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from eval.flights.simulate import SENSORS, fly, log_of
 from suite.diagnose.data import colour
-from suite.diagnose.data.noise import Linearisation
+from suite.diagnose.data.colour import Linearisation
 from suite.diagnose.data.whitening import block_of, make_whitening, orthonormal, slow_energy
 from suite.diagnose.data.windows import KNOTS, SLICES, STATE, cut
 from suite.diagnose.estimate.parameters import candidates, make_space
@@ -100,11 +100,11 @@ def test_slopes_are_those_of_small_changes_and_a_disturbance_pushes_the_windows(
 def test_what_the_start_explains_is_projected_out(linearised):
     model, windows, linear = linearised
     sigma = np.where(windows.valid.any(axis=(0, 1)), 0.01, np.nan)
-    whitening = make_whitening(linear, colour.Noise(sigma, {}), windows)
+    whitening = make_whitening(linear, colour.Noise(sigma, {}))
     moved = np.random.default_rng(0).standard_normal((len(windows.flight), STATE))
-    by_start = np.einsum("wnck,wk->wnc", linear.start_slope, moved)
+    by_start = np.einsum("wnck,wk->wnc", linear.slope[..., model.starts[:STATE]], moved)
     start_only = linear._replace(residual=by_start, offset=0.0 * linear.offset)
-    block = block_of(whitening, start_only, range(3), windows)
+    block = block_of(whitening, start_only, range(3))
     assert np.abs(block.residual).max() < 1e-6 * np.abs(by_start * whitening.weight).max()
     np.testing.assert_allclose(block.free[:, :STATE], moved, atol=1e-6)
     assert (whitening.slow_freedom >= -1e-9).all()
@@ -112,7 +112,7 @@ def test_what_the_start_explains_is_projected_out(linearised):
     def energy(seed):
         noise = np.random.default_rng(seed).standard_normal(linear.residual.shape)
         white = linear._replace(residual=np.nan_to_num(sigma) * noise)
-        return slow_energy(whitening, block_of(whitening, white, (), windows).residual).sum()
+        return slow_energy(whitening, block_of(whitening, white, ()).residual).sum()
 
     # Noise alone gives one for each degree of freedom that the start leaves.
     mean = np.mean([energy(seed) for seed in range(10)])
@@ -146,14 +146,15 @@ def windows():
     return found
 
 
-def linear_of(residual):
+def linear_of(residual, windows):
     """Return residuals that do not depend on the start."""
-    return Linearisation(residual, np.zeros((*residual.shape, 12)), np.zeros((len(residual), 12)))
+    slope = np.zeros((*residual.shape, 12))
+    return Linearisation(residual, slope, np.zeros((len(residual), 12)), windows)
 
 
 def measured(residual, windows):
     """Return the noise of residuals that do not depend on the start."""
-    return colour.measured_noise(linear_of(residual), windows)
+    return colour.measured_noise(linear_of(residual, windows))
 
 
 def noise_like(windows, share, lasts_s, rng, group=GROUP):
@@ -228,7 +229,7 @@ def test_where_the_model_lacks_something_the_whole_residual_counts_as_noise(wind
     residual = noise_like(windows, 0.0, 1.0, rng)
     swing = np.sin(6.0 * windows.row_s[..., None] + rng.uniform(0.0, 6.0, (len(residual), 1, 3)))
     residual[..., SLICES["velocity"]] += 8.0 * swing
-    noise = colour.residual_as_noise(linear_of(residual), windows)
+    noise = colour.residual_as_noise(linear_of(residual, windows))
     np.testing.assert_allclose(noise.sigma[SLICES["velocity"]], 8.0 / np.sqrt(2.0), rtol=0.3)
     share, lasts_s = noise.coloured["velocity"]
     assert share > 0.95 and lasts_s > 0.1

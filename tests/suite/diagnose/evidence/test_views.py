@@ -16,7 +16,7 @@ from suite.diagnose.evidence.evidence import validation_groups
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.search import change
 from suite.diagnose.search.search import search
-from suite.diagnose.thresholds import THRESHOLDS
+from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tests.support.real_flights import VEHICLE, flights
 
 SPACE = parameters.make_space(VEHICLE)
@@ -209,8 +209,9 @@ def test_an_axis_along_which_flights_are_alike_has_a_spread_of_its_own():
 
 def test_sizes_are_drawn_as_the_spread_is_estimated():
     along = {"force": np.array([0, 0, 2]), "torque": np.full(3, 2)}
-    spread = change.RotorSpread(0.01, 8, {}, along, 4)
-    sizes = {view: spread.variance_ratios(view, 20000, np.random.default_rng(1)) for view in along}
+    spread = change.RotorSpread(0.01, 8, {}, along)
+    limits = Thresholds(change_draws=20_000)
+    sizes = {view: spread.variance_ratios(view, limits, np.random.default_rng(1)) for view in along}
     assert sizes["force"].mean(axis=0) == pytest.approx(np.ones(3), rel=0.02)
     # Axes without an estimate have the spread of all: a chi-square of 8 degrees over 8.
     assert sizes["force"][:, 0].var() == pytest.approx(2.0 / 8.0, rel=0.05)

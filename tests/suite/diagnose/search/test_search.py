@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.stats import kstest
 
 from suite.diagnose.estimate import composites
-from suite.diagnose.estimate.block import Block, Estimate, NormalEquations, products
+from suite.diagnose.estimate.block import Block, Estimate, normal_equations
 from suite.diagnose.estimate.gauss_newton import chi2_fall, intervals95, solve
 from suite.diagnose.estimate.parameters import ParameterSpace, candidates, effects_in, make_space
 from suite.diagnose.estimate.permutation import folds_of
@@ -36,11 +36,6 @@ def places(effect):
     return [i for i, entry in enumerate(SPACE.entries) if entry.effect == effect]
 
 
-def equations_of(slope, residual, **more):
-    """Return the normal equations of windows with `slope` (W, N, K) and `residual` (W, N)."""
-    return NormalEquations(*products(slope, residual[..., None]), (residual**2).sum(1), **more)
-
-
 def test_bounds_hold_and_the_free_solution_is_exact():
     square, cross = np.array([[4.0, 1.0], [1.0, 3.0]]), np.array([1.0, -2.0])
     wide, scale = np.full(2, 10.0), np.ones(2)
@@ -55,9 +50,9 @@ def test_bounds_hold_and_the_free_solution_is_exact():
 
 def remaining(slope, residual, flight=None):
     """Return the solution, and the normal equations of what it leaves."""
-    hessian, gradient = products(slope, residual)
-    best = np.linalg.solve(hessian.sum(0), gradient.sum(0))
-    return best, NormalEquations(hessian, gradient - hessian @ best, np.zeros(len(slope)), flight)
+    made = normal_equations(slope, residual[..., 0], flight)
+    best = np.linalg.solve(*made.sums())
+    return best, made._replace(gradient=made.gradient - made.hessian @ best)
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say():
@@ -103,7 +98,7 @@ def equations(rng, colour=0.0, truth=None, size=0.0, alike=0.0):
         true = next(c for c in AMONG if c.name == truth).indices[0]
         slope += alike * slope[..., true, None] * (np.arange(count) != true)
         noise = noise + size * slope[..., true]
-    return equations_of(slope / STEP, noise)
+    return normal_equations(slope / STEP, noise)
 
 
 def scores_of(made, named=(), among=AMONG, seed=0):
@@ -191,7 +186,8 @@ def test_a_linear_fit_of_a_composite_uses_the_second_columns_of_its_inactive_par
     size, wind = len(START), tuple(places("constant_wind"))
     slope = np.random.default_rng(0).standard_normal((5, 40, size + 3)) / [*STEP, 1.0, 1.0, 1.0]
     slope[..., list(wind)] = 0.0
-    made = equations_of(slope, slope[..., size:] @ [1.0, -2.0, 0.5], along=(*range(size), *wind))
+    residual = slope[..., size:] @ [1.0, -2.0, 0.5]
+    made = normal_equations(slope, residual, along=(*range(size), *wind))
     assert tuple(made.columns_of(WIND.parts[0])) == wind
     assert sorted(made.numbers[c] for c in made.columns_of(WIND)) == list(WIND.indices)
     named: Any = SimpleNamespace(space=SPACE, theta=START, equations=made)
@@ -216,7 +212,7 @@ def test_flights_agree_on_what_all_of_them_have(sizes, agree):
     slope = rng.standard_normal((24, 40, len(START))) / STEP
     residual = 0.1 * rng.standard_normal((24, 40))
     residual += np.array(sizes)[flight, None] * slope[..., 0] * STEP[0]
-    made = equations_of(slope, residual)
+    made = normal_equations(slope, residual)
     assert chi2_fall(made, MIDDLE, SPACE, [0]) > 10.0 > chi2_fall(made, MIDDLE, SPACE, []) == 0.0
     current = at_middle(made, flight=flight)
     without, with_it = (cross_validated_chi2(current, at) for at in ([1], [0, 1]))

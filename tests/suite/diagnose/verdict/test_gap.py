@@ -6,10 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from suite.diagnose.data.colour import Noise
-from suite.diagnose.data.noise import Linearisation
+from suite.diagnose.data.colour import Linearisation, Noise
 from suite.diagnose.data.windows import CHANNELS, SLICES, STATE
 from suite.diagnose.diagnose import diagnose
+from suite.diagnose.estimate.parameters import Candidate
+from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.evidence.rollouts import start_estimate
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.thresholds import THRESHOLDS
@@ -69,8 +70,8 @@ def test_an_error_is_read_where_its_signal_was_measured():
     slope = np.zeros((*valid.shape, 16))
     slope[..., np.arange(12), np.arange(12)] = 1.0
     seen = np.where(valid, residual, 0.0), np.where(valid[..., None], slope, 0.0)
-    linear = Linearisation(*seen, np.zeros((count, 16)))
-    last = gap_of(linear, windows, Noise(sigma, {})).channels["1 s"]
+    linear = Linearisation(*seen, np.zeros((count, 16)), windows)
+    last = gap_of(linear, Noise(sigma, {})).channels["1 s"]
     assert last["position"].error == pytest.approx(0.99**2, rel=1e-6)
     assert last["velocity"].error == pytest.approx(2.0, rel=1e-6)
 
@@ -102,10 +103,10 @@ def test_a_window_that_diverges_is_left_out_and_one_without_an_error_counts(monk
     monkeypatch.setattr(model_error, "block_of", block_of)
     errors = np.ones((3, 5, 19)) * np.array([2.0, 0.0, 1.0])[:, None, None]
     errors[2, 4, 7] = np.inf
-    linear = Linearisation(np.zeros_like(errors), *np.zeros((2, 0)))
-    difference = model_error._difference(linear, errors)
     windows = SimpleNamespace(valid=np.ones(errors.shape, bool))
-    rms = model_error._rms(difference, linear, Noise(np.ones(19), {}), None, windows)
+    linear = Linearisation(np.zeros_like(errors), *np.zeros((2, 0)), windows)
+    difference = model_error._difference(linear, errors)
+    rms = model_error._rms(difference, linear, Noise(np.ones(19), {}), None)
     assert rms == pytest.approx(np.full(6, np.sqrt((2.0**2 + 0.0) / 2.0)))
 
 
@@ -121,11 +122,11 @@ def test_a_shape_that_grows_with_the_models_error_is_left_out_and_one_that_stays
         return structure.DisturbanceEquations(hessian, gradient, None, unit, {})
 
     fine, coarse = of(0.3, 0.2), of(0.9, 0.21)
-    shapes = [structure.ShapeScore(n, 9.0, 5e-4, (k,)) for k, n in enumerate(names)]
+    shapes = [CandidateScore(Candidate(n, (k,), n), 9.0, 5e-4, 0.0) for k, n in enumerate(names)]
     found = structure.ResidualStructure(shapes, {})
     for share, kept in ((0.5, ["torque"]), (0.1, ["force", "torque"])):
         left = structure.beyond_model_error(found, fine, coarse, share)
-        assert [shape.label for shape in left.shapes] == kept
+        assert [shape.candidate.label for shape in left.shapes] == kept
     by_chance = found._replace(shapes=[found.shapes[0]._replace(p_value=0.2)])
     assert structure.beyond_model_error(by_chance, fine, coarse, 0.5) == by_chance
 

@@ -9,6 +9,8 @@ import pytest
 
 from suite.diagnose.data.windows import SLICES, STATE
 from suite.diagnose.diagnose import Verdict, verdict_on
+from suite.diagnose.estimate.parameters import Candidate
+from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.examine import confirmed, relevant_part
 from suite.diagnose.sources.rollout_source import of_rollouts, structure_where
@@ -28,11 +30,12 @@ def slow_errors(size=1.0):
 
 
 def left(p_value=0.5, coloured=0.5):
-    shapes = [structure.ShapeScore("force with the speed", 1.0, p_value, ())]
+    shape = Candidate("force with the speed", (), "force with the speed")
+    shapes = [CandidateScore(shape, 1.0, p_value, 0.0)]
     return structure.ResidualStructure(shapes, dict.fromkeys(structure.AXES, coloured))
 
 
-SWING = Swing(1.4, (1.3, 1.5), 0.5, 1e-6)
+SWING = Swing(1.4, (1.3, 1.5))
 SWUNG = Verdict("partly", 0.1, SWING.words)
 SPEED = {"structured": True, "where": "the speed"}
 TORQUE = {"structured": True, "where": "torque y"}
@@ -103,7 +106,7 @@ def test_a_gap_has_its_interval_its_noise_floor_and_the_share_that_remains_of_it
 def test_a_diagnosis_is_measured_on_what_was_held_out(drag, found_drag, flown):
     assert drag.verdict.label == "named" and drag.flights.driven_by == "commands"
     linear = gaps.from_true_starts(flown.model, found_drag.theta, flown.held)
-    again = gaps.gap_of(linear, flown.held, of_rollouts(found_drag.search.last).noise)
+    again = gaps.gap_of(linear, of_rollouts(found_drag.search.last).noise)
     np.testing.assert_array_equal(again.score, found_drag.after.score)
     assert found_drag.after.rms < 1.3 < found_drag.before.rms
 
