@@ -191,5 +191,8 @@ def test_odd_inputs_are_used_or_refused_in_a_line(kind, tmp_path, capfd):
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "part"), FULL)
 def test_many_odd_inputs_are_used_or_refused_in_a_line(kind, part, tmp_path):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     fuzz(kind, tmp_path, EACH, part)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 < MEMORY_BYTES
+    # Other tests of this process may have needed more before.
+    most = max(before, MEMORY_BYTES)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 <= most

@@ -53,7 +53,7 @@ class PolicyContent:
     """The content of a policy's files; a call returns the policy, loaded once in each process."""
 
     name: str
-    """Name of the policy's folder, from which its label may be made."""
+    """Names of the policy's folder and the one around it, from which its label is made."""
     file: str
     """Name of the file that is loaded; "" loads the folder."""
     files: tuple[tuple[str, bytes], ...] = field(repr=False)
@@ -68,7 +68,8 @@ class PolicyContent:
         folder, file = (path, "") if path.is_dir() else (path.parent, path.name)
         contents = policy_files(name_or_path).items()
         files = tuple((name, entry.read_bytes()) for name, entry in contents)
-        return cls(folder.resolve().name, file, files, trust)
+        real = folder.resolve()
+        return cls(str(Path(real.parent.name, real.name)), file, files, trust)
 
     def __call__(self) -> Policy:
         """Return the policy.

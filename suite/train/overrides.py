@@ -134,7 +134,7 @@ def _with_value(config: T, path: list[str], text: str, change: str) -> T:
     allowed_types = get_args(get_type_hints(type(config))[name])
     if type(None) in allowed_types and text == "None":
         return dataclasses.replace(config, **{name: None})
-    if old is None and allowed_types[0] in (int, float, str):
+    if old is None and allowed_types and allowed_types[0] in (int, float, str):
         old = allowed_types[0]()
     return dataclasses.replace(config, **{name: _value(old, text, change)})
 

@@ -58,6 +58,8 @@ def test_settings_that_would_do_nothing_or_that_the_command_sets_itself_are_refu
         with pytest.raises(ValueError, match=r"is of the point mass.*set one of quadrotor\."):
             with_changes(run, [change])
     assert with_changes(run, ["physics.image_delay=2"]).physics.image_delay == 2
+    with pytest.raises(ValueError, match="'0' does not fit, the setting is like None"):
+        with_changes(run, ["quadrotor.vehicle.controller.settings=0"])
     run = named_recipe("race-paper")
     for change, need, given in (
         ("loss.projection_decay=1", "loss.projection", "3"),

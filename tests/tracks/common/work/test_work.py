@@ -115,13 +115,15 @@ print(digest.hexdigest())
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores are chosen as on Linux")
 def test_the_encoders_gradient_has_the_same_bits_on_any_number_of_cores():
     """One core and all, and as many threads as larger machines have."""
-    one = min(os.sched_getaffinity(0))
-    found = set()
+    cores, found = os.sched_getaffinity(0), set()
     for number, pinned in ((None, True), (None, False), ("8", False), ("64", False)):
         environment = {**os.environ, **({} if number is None else {"NPROC": number})}
-        on_one = (lambda: os.sched_setaffinity(0, [one])) if pinned else None
-        done = python(GRADIENT, env=environment, check=True, preexec_fn=on_one)
-        found.add(done.stdout)
+        # Not in the child: with JAX loaded here, code between fork and exec may block for ever.
+        os.sched_setaffinity(0, [min(cores)] if pinned else cores)
+        try:
+            found.add(python(GRADIENT, env=environment, check=True).stdout)
+        finally:
+            os.sched_setaffinity(0, cores)
     assert len(found) == 1
 
 
