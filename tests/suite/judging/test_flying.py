@@ -267,8 +267,7 @@ def test_a_policy_that_came_as_content_keeps_its_name_and_is_the_same_without_it
     content = PolicyContent.of(folder)
     assert [name for name, _ in content.files] == ["config.json", "weights.safetensors"]
     packed, expected = pack(content), answers(load_policy(folder))
-    for path in folder.iterdir():
-        path.unlink()
+    shutil.rmtree(folder)
     found = unpack(packed)()
     assert found.name == "mine" and unpack(packed)() is found, "loaded once"
     assert np.array_equal(answers(found), expected)
