@@ -16,7 +16,8 @@ from eval.importers.rows import continuous
 from eval.importers.signals import MAD_TO_SD, Recording, Signal, median_step
 from eval.logs.faults.clock import LATE_S, LEAST_S, SURE, delay_of
 from eval.logs.faults.finding import Finding
-from eval.logs.faults.position import ACC_MAX, is_coarse, lost_samples
+from eval.logs.faults.position import ACC_MAX
+from eval.logs.faults.sensors import is_coarse, lost_samples
 from eval.logs.velocity import velocity_from_position
 
 POS_LEAST, VEL_LEAST = 0.02, 0.1

@@ -23,9 +23,14 @@ from eval.logs.faults.drive.motor_map import check_motor_map
 from eval.logs.faults.drive.motors import check_lift, check_motors
 from eval.logs.faults.finding import Finding, findings_of
 from eval.logs.faults.pose import Rows, check_pose
-from eval.logs.faults.position import check_height_sign, check_jumps, check_still
+from eval.logs.faults.position import check_height_sign, check_jumps
 from eval.logs.faults.reading import Readings, read_rows, readings_in
-from eval.logs.faults.sensors import check_accelerometer_bias, check_barometer, check_voltage
+from eval.logs.faults.sensors import (
+    check_accelerometer_bias,
+    check_barometer,
+    check_still,
+    check_voltage,
+)
 from eval.logs.faults.vectors import check_accelerometer, check_gyro, check_velocity
 from eval.logs.faults.vehicle import (
     LIFT,

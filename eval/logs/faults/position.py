@@ -1,4 +1,4 @@
-"""Checks of a position: the sign of its z by the vertical force, jumps, and lost tracking.
+"""Checks of a position: the sign of its z by the vertical force, and jumps.
 
 Gravity dominates the force, so `pose.check_pose` hardly depends on this sign: with z inverted, the
 force still points along body z. But the vertical acceleration of the path then has the wrong sign.
@@ -17,9 +17,9 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import rotate
 from eval.logs.faults.finding import Finding, unseen
-from eval.logs.faults.pose import CALM_RATE, Rows, turns_of
+from eval.logs.faults.pose import Rows
 from eval.logs.faults.reading import option
-from eval.logs.faults.relation import jackknife_error, rms, smooth
+from eval.logs.faults.relation import jackknife_error, smooth
 from eval.logs.velocity import velocity_from_position
 
 WIDTH_S = 0.4
@@ -42,14 +42,6 @@ STEPS = 5
 """Number of steps before and after, of which the median is the velocity."""
 FAULT_M = 0.5
 """A jump below this size is a note [m]: the estimators of real vehicles correct themselves so."""
-LOST_S, LOST_HOLDS, LOST_RATE = 0.2, 5.0, 0.3
-"""A pose that repeats for longer [s], and for so many times the usual hold, is lost where the gyro
-turns faster [rad/s]."""
-LOST_SHARE = 0.1
-"""Share of lost rows above which the signal is doubtful."""
-COARSE = 4.0
-"""A signal is coarse if its median change between samples is below this many steps of its
-resolution. Repeated samples of a coarse signal may be real."""
 
 
 class Slope(NamedTuple):
@@ -179,76 +171,3 @@ def check_jumps(time_s: np.ndarray, pos: np.ndarray) -> list[Finding]:
     text += ", or two flights in one file"
     fix = "cut the log there with --start or --end of suite import"
     return [Finding("doubt", "position", text, "position_jump", jump_m, 0.95, fix)]
-
-
-def check_still(rows: Rows) -> list[Finding]:
-    """Return doubts on a pose that is lost for much of the flight, and on a gyro's dead axes."""
-    findings = _dead_axes(rows) if {"quat", "rate"} <= rows.keys() else []
-    for name, subject, fault in (
-        ("quat", "attitude", "attitude"),
-        ("pos", "position", "position_jump"),
-    ):
-        if not {name, "rate"} <= rows.keys():
-            continue
-        known, turned = (np.isfinite(rows[n]).all(axis=1) for n in (name, "rate"))
-        time_s, value = rows["time"][known], rows[name][known]
-        is_lost = lost_samples(time_s, value, rows["time"][turned], rows["rate"][turned])
-        share = float(np.mean(is_lost)) if len(is_lost) else 0.0
-        if share > LOST_SHARE:
-            text = f"{100 * share:.0f} % of it stands still while the gyro turns"
-            fix = option((name, "drop"))
-            fix += "" if is_lost[1:].all() else " or suite import, which leaves this part out"
-            findings.append(Finding("doubt", subject, text, fault, share, 0.95, fix))
-    return findings
-
-
-def _dead_axes(rows: Rows) -> list[Finding]:
-    """Return the doubt on axes of the gyro that are constant while the attitude turns there."""
-    turns = smooth(rows["time"], turns_of(rows["time"], rows["quat"]), 0.5 * WIDTH_S)
-    turns, rate = (value[np.isfinite(value).all(axis=1)] for value in (turns, rows["rate"]))
-    if not len(turns) or not len(rate):
-        return []
-    is_dead = (np.ptp(rate, axis=0) == 0.0) & (turns.std(axis=0) > CALM_RATE)
-    if not is_dead.any():
-        return []
-    axes = " and ".join(np.array(list("xyz"))[is_dead])
-    text = f"it never changes about {axes}, and the attitude turns there"
-    fix = option(("rate", "drop")) + " or log it again"
-    return [Finding("doubt", "gyro", text, "gyro_axes", None, 0.95, fix)]
-
-
-def lost_samples(
-    time_s: np.ndarray, value: np.ndarray, rate_time_s: np.ndarray, rate: np.ndarray
-) -> np.ndarray:
-    """Return which samples (N,) bool of a pose stand still while the gyro turns.
-
-    Args:
-        time_s: (N,) times of the pose [s].
-        value: (N, C) positions or attitudes.
-        rate_time_s: (M,) times of the gyro, on the same clock [s].
-        rate: (M, 3) body rates [rad/s].
-    """
-    is_lost = np.zeros(len(time_s), dtype=bool)
-    changes = np.flatnonzero(np.diff(value, axis=0).any(axis=1)) + 1
-    if not len(time_s) or (len(changes) and is_coarse(value)):
-        return is_lost
-    starts, stops = np.append(0, changes), np.append(changes, len(time_s))
-    held_s = time_s[stops - 1] - time_s[starts]
-    usual_s = np.median(held_s) if len(changes) else 0.0
-    longest_s = LOST_S + LOST_HOLDS * usual_s  # a slow signal is held in fast rows
-    for first, stop, hold_s in zip(starts, stops, held_s, strict=True):
-        if hold_s > longest_s:
-            inside = (rate_time_s >= time_s[first]) & (rate_time_s <= time_s[stop - 1])
-            is_lost[first + 1 : stop] = inside.any() and rms(rate[inside]) > LOST_RATE
-    return is_lost
-
-
-def is_coarse(value: np.ndarray) -> bool:
-    """Return whether changes of `value` (N, C) are a few steps of a coarse resolution (1 mm)."""
-    change = np.abs(np.diff(value, axis=0))
-    change = change[change > 0.0]
-    if not len(change):
-        return True
-    # A low quantile, because rounding makes the very smallest change smaller than a step.
-    resolution_step = float(np.quantile(change, 0.02))
-    return float(np.median(change)) < COARSE * resolution_step

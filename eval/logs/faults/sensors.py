@@ -1,4 +1,4 @@
-"""Checks of battery voltage, barometer and the accelerometer under vibration."""
+"""Checks of single sensors: voltage, barometer, vibration, and signals that stand still."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import rotate
 from eval.logs.faults.finding import Finding, unseen
-from eval.logs.faults.pose import Rows
+from eval.logs.faults.pose import CALM_RATE, Rows, turns_of
 from eval.logs.faults.reading import option
-from eval.logs.faults.relation import forward_mean
+from eval.logs.faults.relation import forward_mean, rms, smooth
 from eval.logs.velocity import velocity_from_position
 
 LEAST_V, MOST_V = 2.5, 70.0
@@ -21,6 +21,16 @@ SPAN_S = 0.6
 BIAS, ALIKE = 0.15, 0.6
 """Least median error of the accelerometer that the throttle causes [m/s^2], and least size of the
 correlation of the accelerometer's error with the squared throttle."""
+LOST_S, LOST_HOLDS, LOST_RATE = 0.2, 5.0, 0.3
+"""A pose that repeats for longer [s], and for so many times the usual hold, is lost where the gyro
+turns faster [rad/s]."""
+LOST_SHARE = 0.1
+"""Share of lost rows above which the signal is doubtful."""
+COARSE = 4.0
+"""A signal is coarse if its median change between samples is below this many steps of its
+resolution. Repeated samples of a coarse signal may be real."""
+TURN_S = 0.2
+"""Averaging time of the attitude's turns, next to which an axis of the gyro is constant [s]."""
 
 
 def check_voltage_fails(value: np.ndarray) -> bool:
@@ -122,3 +132,76 @@ def check_barometer(rows: Rows) -> list[Finding]:
         fix = "foam over the barometer, or a height from elsewhere; leave baro out"
         return [Finding("doubt", "barometer", text, "barometer_spin_up", fall, 0.95, fix)]
     return [Finding("ok", "barometer", f"it moves by {fall:+.2g} m as the motors start")]
+
+
+def check_still(rows: Rows) -> list[Finding]:
+    """Return doubts on a pose that is lost for much of the flight, and on a gyro's dead axes."""
+    findings = _dead_axes(rows) if {"quat", "rate"} <= rows.keys() else []
+    for name, subject, fault in (
+        ("quat", "attitude", "attitude"),
+        ("pos", "position", "position_jump"),
+    ):
+        if not {name, "rate"} <= rows.keys():
+            continue
+        known, turned = (np.isfinite(rows[n]).all(axis=1) for n in (name, "rate"))
+        time_s, value = rows["time"][known], rows[name][known]
+        is_lost = lost_samples(time_s, value, rows["time"][turned], rows["rate"][turned])
+        share = float(np.mean(is_lost)) if len(is_lost) else 0.0
+        if share > LOST_SHARE:
+            text = f"{100 * share:.0f} % of it stands still while the gyro turns"
+            fix = option((name, "drop"))
+            fix += "" if is_lost[1:].all() else " or suite import, which leaves this part out"
+            findings.append(Finding("doubt", subject, text, fault, share, 0.95, fix))
+    return findings
+
+
+def _dead_axes(rows: Rows) -> list[Finding]:
+    """Return the doubt on axes of the gyro that are constant while the attitude turns there."""
+    turns = smooth(rows["time"], turns_of(rows["time"], rows["quat"]), TURN_S)
+    turns, rate = (value[np.isfinite(value).all(axis=1)] for value in (turns, rows["rate"]))
+    if not len(turns) or not len(rate):
+        return []
+    is_dead = (np.ptp(rate, axis=0) == 0.0) & (turns.std(axis=0) > CALM_RATE)
+    if not is_dead.any():
+        return []
+    axes = " and ".join(np.array(list("xyz"))[is_dead])
+    text = f"it never changes about {axes}, and the attitude turns there"
+    fix = option(("rate", "drop")) + " or log it again"
+    return [Finding("doubt", "gyro", text, "gyro_axes", None, 0.95, fix)]
+
+
+def lost_samples(
+    time_s: np.ndarray, value: np.ndarray, rate_time_s: np.ndarray, rate: np.ndarray
+) -> np.ndarray:
+    """Return which samples (N,) bool of a pose stand still while the gyro turns.
+
+    Args:
+        time_s: (N,) times of the pose [s].
+        value: (N, C) positions or attitudes.
+        rate_time_s: (M,) times of the gyro, on the same clock [s].
+        rate: (M, 3) body rates [rad/s].
+    """
+    is_lost = np.zeros(len(time_s), dtype=bool)
+    changes = np.flatnonzero(np.diff(value, axis=0).any(axis=1)) + 1
+    if not len(time_s) or (len(changes) and is_coarse(value)):
+        return is_lost
+    starts, stops = np.append(0, changes), np.append(changes, len(time_s))
+    held_s = time_s[stops - 1] - time_s[starts]
+    usual_s = np.median(held_s) if len(changes) else 0.0
+    longest_s = LOST_S + LOST_HOLDS * usual_s  # a slow signal is held in fast rows
+    for first, stop, hold_s in zip(starts, stops, held_s, strict=True):
+        if hold_s > longest_s:
+            inside = (rate_time_s >= time_s[first]) & (rate_time_s <= time_s[stop - 1])
+            is_lost[first + 1 : stop] = inside.any() and rms(rate[inside]) > LOST_RATE
+    return is_lost
+
+
+def is_coarse(value: np.ndarray) -> bool:
+    """Return whether changes of `value` (N, C) are a few steps of a coarse resolution (1 mm)."""
+    change = np.abs(np.diff(value, axis=0))
+    change = change[change > 0.0]
+    if not len(change):
+        return True
+    # A low quantile, because rounding makes the very smallest change smaller than a step.
+    resolution_step = float(np.quantile(change, 0.02))
+    return float(np.median(change)) < COARSE * resolution_step

@@ -21,7 +21,7 @@ from policies.formats.c.forward import Observed
 from policies.formats.c.project import actions_of, native_actions, random_observations
 from policies.formats.policy_file import PolicyCheckpoint
 from policies.policy import Hidden, Policy
-from policies.spec import PolicyError, PolicySpec
+from policies.spec import PolicyError
 from suite.judging.deploy.latency import Timing, c_step, time_in_turn
 
 STEPS = 1000
@@ -91,22 +91,9 @@ class Recorder:
 
     def __init__(self, policy: Policy) -> None:
         """Record the inputs of `policy`."""
+        self.name, self.spec, self.start = policy.name, policy.spec, policy.start
         self._policy = policy
         self._inputs: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-
-    @property
-    def name(self) -> str:
-        """The policy's label."""
-        return self._policy.name
-
-    @property
-    def spec(self) -> PolicySpec:
-        """The policy's spec."""
-        return self._policy.spec
-
-    def start(self, n: int) -> Hidden:
-        """Return the policy's memory for n trials."""
-        return self._policy.start(n)
 
     def act(
         self, hidden: Hidden, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
