@@ -2,12 +2,12 @@
 
 A model's error is smooth, noise is not. So a polynomial is subtracted from a few consecutive rows
 at a time, and the remainder is noise. The noise of a state estimator is autocorrelated: that of
-position, attitude and velocity is modelled as white noise plus a first-order
-Gauss-Markov process, whose correlation decays as exp(-t / T). Estimated are T and the share of the
-variance that this process has. They maximise the likelihood of the residuals in windows (1 s
-stretches of flights), after a polynomial is subtracted (restricted likelihood; Patterson & Thompson
-1971). An error of the model, in contrast to noise, accumulates along a window (drift). So the
-likelihood also contains a drift by random force and torque; it would count as noise otherwise.
+position, attitude and velocity is modelled as white noise plus a first-order Gauss-Markov process,
+whose correlation decays as exp(-t / T). Estimated are T and the share of the variance that this
+process has. They maximise the likelihood of the residuals in windows (1 s stretches of flights),
+after a polynomial is subtracted (restricted likelihood; Patterson & Thompson 1971). An error of the
+model, in contrast to noise, accumulates along a window (drift). So the likelihood also contains a
+drift by random force and torque; it would count as noise otherwise.
 """
 
 from __future__ import annotations
