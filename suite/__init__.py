@@ -132,7 +132,7 @@ def train_policy(
     out: Source,
     recipe: str = "race",
     *,
-    settings: Sequence[str] = (),
+    settings: str | Sequence[str] = (),
     iterations: int | None = None,
     seed: int = 0,
     progress: bool = True,
@@ -153,23 +153,23 @@ def train_policy(
     from suite.commands.train import Config, resolve
     from suite.train.run import train
 
-    options = Config(recipe=recipe, iterations=iterations, set=tuple(settings), seed=seed)
+    options = Config(recipe=recipe, iterations=iterations, set=_all(settings), seed=seed)
     outcome = train(resolve(options), Path(out), _console(progress))
     return Path(outcome.policy)
 
 
 def diagnose_flights(
-    flights: Sequence[Source],
+    flights: Source | Sequence[Source],
     vehicle: Source,
     out: Source,
     *,
-    reference: Sequence[Source] = (),
+    reference: Source | Sequence[Source] = (),
     progress: bool = True,
 ) -> dict[str, Any]:
     """Name the physical effect that a vehicle file lacks; return the contents of diagnosis.json.
 
     Args:
-        flights: flight logs, or folders of them.
+        flights: flight logs or folders of them: one, or a sequence.
         vehicle: a vehicle file or a shipped name.
         out: folder for diagnosis.json, vehicle.toml and report.html.
         reference: earlier flights; with them the diagnosis names what has changed since.
@@ -181,18 +181,18 @@ def diagnose_flights(
     from suite.diagnose.config import Config
     from suite.diagnose.run import diagnose_files
 
-    paths, before = (tuple(Path(f) for f in given) for given in (flights, reference))
+    paths, before = (tuple(map(Path, _all(given))) for given in (flights, reference))
     config = Config(flights=paths, vehicle=str(vehicle), reference=before, out=Path(out))
     return diagnose_files(config, _console(progress))
 
 
 def identify_vehicle(
-    flights: Sequence[Source], vehicle: Source, out: Source, *, progress: bool = True
+    flights: Source | Sequence[Source], vehicle: Source, out: Source, *, progress: bool = True
 ) -> dict[str, Any]:
     """Estimate the parameters of a vehicle file from flights, and return them with intervals.
 
     Args:
-        flights: flight logs, or folders of them.
+        flights: flight logs or folders of them: one, or a sequence.
         vehicle: the file or shipped name to start from.
         out: the vehicle file to write.
         progress: whether to print progress.
@@ -202,8 +202,13 @@ def identify_vehicle(
     """
     from suite.diagnose.identify.run import identify_files
 
-    paths = [Path(f) for f in flights]
+    paths = [*map(Path, _all(flights))]
     return identify_files(paths, str(vehicle), Path(out), (), _console(progress))
+
+
+def _all(given: Any) -> tuple[Any, ...]:
+    """Return one text or path, or a sequence of them, as a tuple."""
+    return (given,) if isinstance(given, str | Path) else tuple(given)
 
 
 def make_env(**settings: Any) -> gymnasium.Env[Any, Any]:
