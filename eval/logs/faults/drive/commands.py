@@ -58,6 +58,8 @@ be a physical effect or a wrong mass, and within the third it is m/s^2, whatever
 OFFSET, OFFSET_RMS = 3.0, 3.0
 """Least constant difference of command and gyro that no unit explains: in rad/s, and relative to
 the body rates (root mean square)."""
+LEAST_TOP = 0.02
+"""Smallest largest command of motors or throttle in a flight, as a share of the full range."""
 RATE_OFF = 0.1
 """Largest relative error of a controller's rate."""
 
@@ -71,10 +73,15 @@ def check_throttle(rows: Rows) -> list[Finding]:
             continue
         flying = value[np.isfinite(value).all(axis=1)].mean(axis=1)
         middle, top = float(np.median(flying)), float(np.max(flying))
-        if top <= 1.5:
+        if top <= 0.0 or LEAST_TOP <= top <= 1.5:
             continue
         fits = [r for r in RANGES if r[2][0] <= middle <= r[2][1]]
         figures = f"half of its values are below {middle:.4g} and all below {top:.4g}"
+        if top < LEAST_TOP:
+            text = f"{figures}, which lifts no vehicle: it was divided by too large a range"
+            fix = "correct the unit in the mapping of suite import"
+            findings.append(Finding("doubt", subject, text, "throttle_range", top, 0.95, fix))
+            continue
         if not fits:
             text = f"{figures}: no range from 0 to 1, percent, 1000 or 65535"
             findings.append(Finding("doubt", subject, text, "throttle_range", top, 0.95))

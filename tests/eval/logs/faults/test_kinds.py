@@ -156,6 +156,14 @@ def test_an_outlier_is_no_other_range(name):
     assert "1 rows of outliers" in found.evidence and not found.is_open and not readings
 
 
+@pytest.mark.parametrize("name", ["throttle", "pwm"])
+def test_commands_that_were_divided_by_too_large_a_range_are_doubted(name):
+    parts = good(end=10.0)
+    parts[name] = parts[name] / 65535.0
+    (found,) = (f for f in checked(parts)[0] if f.fault == "throttle_range")
+    assert "lifts no vehicle" in found.evidence and found.is_open
+
+
 @pytest.mark.parametrize("end", [8.0, 12.0, 16.0])
 @pytest.mark.parametrize("wrong", ["acc=-x,-y,-z", "acc=x,-y,-z"])
 def test_an_axis_without_force_does_not_show_its_sign(wrong, end):
