@@ -28,7 +28,7 @@ from suite.blind.build import simulator_for
 from suite.blind.cases import CONTINUOUS, Case
 from suite.blind.outside import Law, Outside
 from suite.common.startup import keep_compiled
-from suite.diagnose.data.colour import Noise, measured_noise
+from suite.diagnose.data.noise import Noise, measured_noise
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.evidence.rollouts import rollouts_along
 from suite.diagnose.report.diagnosis_json import diagnosis_json

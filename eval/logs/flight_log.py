@@ -114,8 +114,8 @@ class FlightLog:
     def whole(self) -> np.ndarray:
         """(T,) bool: rows with a complete state and a complete command."""
         parts = [self.pos_w, self.quat_wxyz, self.vel_w, self.rate_b]
-        if self.command is not None:
-            parts.append(self.command)
+        if (command := self.command) is not None:
+            parts.append(command)
         elif self.thrust_cmd is not None and self.torque_cmd_b is not None:
             parts += [self.thrust_cmd[:, None], self.torque_cmd_b]
         elif self.rotor_speed is not None:

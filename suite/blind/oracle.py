@@ -37,7 +37,7 @@ from eval.logs.flight_log import FlightLog
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.common.console import Console
-from suite.diagnose.data.colour import Noise
+from suite.diagnose.data.noise import Noise
 from suite.diagnose.data.windows import LENGTH_S
 from suite.diagnose.estimate.block import Block
 from suite.diagnose.evidence.rollouts import rollout_evidence, rollouts_along

@@ -22,8 +22,8 @@ from eval.logs.flight_log import FlightLog
 from eval.quadrotor.mixer import mix
 from eval.quadrotor.plant import make_plant, nominal_quadrotor
 from eval.vehicles.vehicle import Vehicle, motor_speed
-from suite.diagnose.data.colour import noise_like
 from suite.diagnose.data.inertial import InertialLog, is_inertial, posed
+from suite.diagnose.data.noise import noise_like
 from suite.diagnose.data.sampling import (
     HOLE_STEPS,
     interpolate,

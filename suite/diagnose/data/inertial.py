@@ -153,10 +153,7 @@ def _pieces(log: FlightLog) -> list[_Piece]:
     rate_b, acc_b = (interpolate(time_s, time_s, value) for value in (log.rate_b, log.acc_b))
     known = np.flatnonzero(np.isfinite(log.quat_wxyz).all(axis=1))
     # If the log has an attitude, its first value is within a few rows of the log's first row.
-    rot = log.rot_w[known[0]] if len(known) else np.eye(3)
-    up = acc_b[time_s <= time_s[0] + START_S].mean(axis=0)
-    if not len(known) and abs(float(np.linalg.norm(up)) - GRAVITY) <= LIKE_GRAVITY:
-        rot = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()
+    rot = log.rot_w[known[0]] if len(known) else _start(time_s, acc_b)
     count = max(1, round(float(time_s[-1] - time_s[0]) / PIECE_S))
     edges = np.linspace(0, len(time_s) - 1, count + 1).astype(int)
     parts = [slice(first, last + 1) for first, last in pairwise(edges)]
@@ -300,3 +297,11 @@ class _Piece:
         ]
         by_bias = -self._integral(rot_w)
         return np.concatenate([by_tilt, each, by_gyro, by_bias, *by_walk], axis=2)
+
+
+def _start(time_s: np.ndarray, acc_b: np.ndarray) -> np.ndarray:
+    """Return the attitude (3, 3) in which the first specific force points up."""
+    up = acc_b[time_s <= time_s[0] + START_S].mean(axis=0)
+    if abs(float(np.linalg.norm(up)) - GRAVITY) > LIKE_GRAVITY:
+        return np.eye(3)
+    return Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()

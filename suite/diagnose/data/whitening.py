@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import eval_legendre
 
-from suite.diagnose.data.colour import Linearisation, Noise, colour_filter, rotor_noise
+from suite.diagnose.data.noise import Linearisation, Noise, colour_filter, rotor_noise
 from suite.diagnose.data.windows import KNOTS, SLICES, STATE, FlightWindows
 from suite.diagnose.estimate.block import Block
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds

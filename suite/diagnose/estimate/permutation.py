@@ -69,9 +69,8 @@ def permutation_test(
 
     The columns of `hessian` (W, K, K) and `gradient` (W, K) are scaled to similar size. `groups`
     are those of the candidates `among`. They contain the columns `always`, and gains are relative
-    to a fit of these alone. `fold` (W,) is the
-    cross-validation fold of each window, and `room` the lowest and highest change (K,) of each
-    column.
+    to a fit of these alone. `fold` (W,) is the cross-validation fold of each window, and `room` the
+    lowest and highest change (K,) of each column.
     """
     if not groups:
         return []

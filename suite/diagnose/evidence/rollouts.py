@@ -20,7 +20,7 @@ from eval.effects.log_faults import pose_delay
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import assemble
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.colour import Linearisation, Noise, measured_noise, residual_as_noise
+from suite.diagnose.data.noise import Linearisation, Noise, measured_noise, residual_as_noise
 from suite.diagnose.data.steps import LONGEST_S, step_s
 from suite.diagnose.data.whitening import Whitening, block_of, make_whitening, slow_energy
 from suite.diagnose.data.windows import KNOTS, LENGTH_S, SLICES, STATE, FlightWindows, cut, take

@@ -17,9 +17,9 @@ from scipy.ndimage import uniform_filter1d
 from eval.importers.rows import held
 from eval.importers.signals import Signal
 from eval.logs.flight_log import FlightLog
-from suite.diagnose.data.colour import noise_like
 from suite.diagnose.data.flights import leaning, turning_of
 from suite.diagnose.data.inertial import InertialLog, specific_force_w
+from suite.diagnose.data.noise import noise_like
 from suite.diagnose.data.sampling import HELD, MEASURED, attitude_at, in_hole, interpolate
 from suite.diagnose.data.view import FlightRows, WeakForm, weak_form
 from tracks.geometry.rotation import rot_to_quat

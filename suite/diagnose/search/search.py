@@ -74,9 +74,9 @@ def search(
         name, at = best
         new_names = _one_name_per_effect(name)
         known = current.evidence.estimate_noise(at)
-        # A single new name has just been tested.
-        count = len(named) + len(new_names) - (len(new_names) == 1)
-        named, at = _tested_again(task, known.evidence, at, [*named, *new_names], count)
+        named, at = _drop_unneeded(
+            task, known.evidence, at, [*named, *new_names], len(new_names) == 1
+        )
         current = with_inactive(known if at is best[1] else known.evidence.relinearise(at), among)
     named, at = _settle(task, current.evidence, current.at, named)
     last = judged = _final_fit(current.evidence, at, named)
@@ -208,27 +208,21 @@ def _replace_or_drop(
     return [*named[:place], *_one_name_per_effect(best[0]), *named[place + 1 :]], best[1]
 
 
-def _tested_again(
-    task: SearchTask,
-    evidence: Evidence,
-    at: Estimate,
-    named: list[NamedEffect],
-    count: int,
-    among: Sequence[Candidate] = (),
+def _drop_unneeded(
+    task: SearchTask, evidence: Evidence, at: Estimate, named: list[NamedEffect], last_tested: bool
 ) -> tuple[list[NamedEffect], Estimate]:
-    """Test the first `count` names one after another; return the names and the fit with them.
+    """Return the names that are significant in addition to all others, and the fit with them.
 
-    Candidates of `among` may take the place of a name. Without them, a name is dropped or kept with
-    its fit.
+    With `last_tested` the last name has just been tested, and is not tested again.
     """
-    untested, place = len(named) - count, 0
-    while place < len(named) - untested:
+    place = 0
+    while place < len(named) - last_tested:
         itself = [named[place].candidate]
-        tried = _replace_or_drop(task, evidence, at, named, place, among or itself)
-        is_dropped = len(tried[0]) < len(named)
-        if among or is_dropped:
-            named, at = tried
-        place += not is_dropped  # if the name was dropped, the next one is here now
+        remaining, refitted = _replace_or_drop(task, evidence, at, named, place, itself)
+        if len(remaining) < len(named):
+            named, at = remaining, refitted
+        else:
+            place += 1
     return named, at
 
 
@@ -241,7 +235,11 @@ def _settle(
         if not before:
             break
         at = evidence.fitted(at, fitted_by(named)).at
-        named, at = _tested_again(task, evidence, at, named, len(named), task.among)
+        place = 0
+        while place < len(named):
+            count = len(named)
+            named, at = _replace_or_drop(task, evidence, at, named, place, task.among)
+            place += len(named) >= count  # if the name was dropped, the next one is here now
         if [name.candidate for name in named] == before:
             break
     return named, at

@@ -13,8 +13,8 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.colour import Linearisation, measured_noise
 from suite.diagnose.data.hold_out import choose_held_out
+from suite.diagnose.data.noise import Linearisation, measured_noise
 from suite.diagnose.data.sampling import own_spacing_s
 from suite.diagnose.data.steps import has_firmware_loop, rows_show_torque
 from suite.diagnose.data.whitening import block_of, make_whitening

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.data.colour import Linearisation, Noise
+from suite.diagnose.data.noise import Linearisation, Noise
 from suite.diagnose.data.whitening import block_of, make_whitening, rotor_spread, slow_energy
 from suite.diagnose.data.windows import (
     LENGTH_S,

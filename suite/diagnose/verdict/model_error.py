@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from suite.diagnose.data.colour import Linearisation, Noise, at_least, measured_noise
+from suite.diagnose.data.noise import Linearisation, Noise, at_least, measured_noise
 from suite.diagnose.data.whitening import Whitening, block_of, make_whitening, slow_energy
 from suite.diagnose.data.windows import SLICES
 from suite.diagnose.thresholds import Thresholds

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from suite.common.errors import WorkFailed
-from suite.diagnose.data.colour import noise_of
+from suite.diagnose.data.noise import noise_of
 from suite.diagnose.estimate.block import NormalEquations
 from suite.diagnose.estimate.gauss_newton import intervals95
 from suite.diagnose.evidence.rollouts import RolloutModel, rollout_evidence, start_estimate

@@ -14,7 +14,7 @@ from policies.formats.c.compiler import find_compiler
 from policies.formats.torch_twin import torch_twin
 from suite import cli
 from suite.common.errors import WorkFailed
-from suite.diagnose.data.colour import noise_of
+from suite.diagnose.data.noise import noise_of
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.experiments import gpu
 from suite.experiments.bench import diagnose, judge, policy, sysid_baseline, train

@@ -259,22 +259,22 @@ def answers(policy):
     return policy.act(policy.start(64), state, image, np.ones(64, bool))[0]
 
 
-def test_a_policy_that_came_as_content_keeps_its_name_and_is_the_same_without_its_files(tmp_path):
-    folder = tmp_path / "mine" / "policy"  # as a training writes it
-    folder.mkdir(parents=True)
-    for name in ("config.json", "weights.safetensors", "card.md"):
-        (folder / name).write_bytes((shipped.locate("race-paper") / name).read_bytes())
+@pytest.mark.parametrize(("at", "name"), [("my.policy", "my.policy"), ("mine/policy", "mine")])
+def test_a_policy_as_content_keeps_its_name_and_is_the_same_without_its_files(at, name, tmp_path):
+    (folder := tmp_path / at).mkdir(parents=True)
+    for file in ("config.json", "weights.safetensors", "card.md"):
+        (folder / file).write_bytes((shipped.locate("race-paper") / file).read_bytes())
     content = PolicyContent.of(folder)
     assert [name for name, _ in content.files] == ["config.json", "weights.safetensors"]
     packed, expected = pack(content), answers(load_policy(folder))
     shutil.rmtree(folder)
     found = unpack(packed)()
-    assert found.name == "mine" and unpack(packed)() is found, "loaded once"
+    assert found.name == name and unpack(packed)() is found, "loaded once"
     assert np.array_equal(answers(found), expected)
     (tmp_path / "policy.h").write_text("a header")
     (tmp_path / "policy.c").write_text("a program")
     content = PolicyContent.of(tmp_path / "policy.c")
-    assert (Path(content.name).name, content.file) == (tmp_path.name, "policy.c")
+    assert content.name == f"{tmp_path.parent.name}/{tmp_path.name}" and content.file == "policy.c"
     assert [name for name, _ in content.files] == ["policy.h", "policy.c"]
     with pytest.raises(PolicyError, match="trust"):
         content()
@@ -304,7 +304,7 @@ def test_an_onnx_file_behind_a_link_comes_with_its_weights(tmp_path):
     (tmp_path / "mine.onnx").symlink_to(path)
     whole = {name: (folder / name).read_bytes() for name in ("it.onnx", "w.bin")}
     content = PolicyContent.of(tmp_path / "there" / "it.onnx")
-    assert (Path(content.name).name, content.file) == ("real", "it.onnx")
+    assert (content.name, content.file) == (f"{tmp_path.name}/real", "it.onnx")
     assert dict(content.files) == whole
     content = PolicyContent.of(tmp_path / "mine.onnx")
     assert content.file == "mine.onnx"

@@ -59,7 +59,7 @@ OFFSET, OFFSET_RMS = 3.0, 3.0
 """Least constant difference of command and gyro that no unit explains: in rad/s, and relative to
 the body rates (root mean square)."""
 LEAST_TOP = 0.02
-"""Smallest largest command of motors or throttle in a flight, as a share of the full range."""
+"""Throttle or mean motor command that every flight exceeds at least once, from 0 to 1."""
 RATE_OFF = 0.1
 """Largest relative error of a controller's rate."""
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data import hold_out, sampling, steps
-from suite.diagnose.data.colour import noise_of, rotor_noise
+from suite.diagnose.data.noise import noise_of, rotor_noise
 from suite.diagnose.data.windows import BURN_IN_S, LENGTH_S, SLICES, STEPS, cut, take
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tests.support.broken_logs import changed, on_the_ground, rows

@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 
 from eval.flights.simulate import SENSORS, fly, log_of
-from suite.diagnose.data import colour
-from suite.diagnose.data.colour import Linearisation
+from suite.diagnose.data.noise import (
+    ESTIMATED,
+    Linearisation,
+    Noise,
+    colour_filter,
+    measured_noise,
+    residual_as_noise,
+)
 from suite.diagnose.data.whitening import block_of, make_whitening, orthonormal, slow_energy
 from suite.diagnose.data.windows import KNOTS, SLICES, STATE, cut
 from suite.diagnose.estimate.parameters import candidates, make_space
@@ -100,7 +106,7 @@ def test_slopes_are_those_of_small_changes_and_a_disturbance_pushes_the_windows(
 def test_what_the_start_explains_is_projected_out(linearised):
     model, windows, linear = linearised
     sigma = np.where(windows.valid.any(axis=(0, 1)), 0.01, np.nan)
-    whitening = make_whitening(linear, colour.Noise(sigma, {}))
+    whitening = make_whitening(linear, Noise(sigma, {}))
     moved = np.random.default_rng(0).standard_normal((len(windows.flight), STATE))
     by_start = np.einsum("wnck,wk->wnc", linear.slope[..., model.starts[:STATE]], moved)
     start_only = linear._replace(residual=by_start, offset=0.0 * linear.offset)
@@ -154,7 +160,7 @@ def linear_of(residual, windows):
 
 def measured(residual, windows):
     """Return the noise of residuals that do not depend on the start."""
-    return colour.measured_noise(linear_of(residual, windows))
+    return measured_noise(linear_of(residual, windows))
 
 
 def noise_like(windows, share, lasts_s, rng, group=GROUP):
@@ -202,7 +208,7 @@ def test_groups_of_one_estimator_have_one_correlation_time(windows):
     pose = SLICES["position"]
     weak[..., pose] = noise_like(windows, 0.9, 0.05, rng, "position")[..., pose]
     coloured = measured(weak, windows).coloured
-    assert set(coloured) == set(colour.ESTIMATED)
+    assert set(coloured) == set(ESTIMATED)
     assert coloured["velocity"][1] == coloured["position"][1] == pytest.approx(0.05, rel=0.4)
     assert coloured["velocity"][0] < 0.1
 
@@ -215,8 +221,8 @@ def test_white_noise_and_a_slow_error_of_the_model_have_no_colour(windows):
 
 
 def test_the_filter_makes_rows_independent(windows):
-    noise = colour.Noise(np.ones(19), {GROUP: (0.85, 0.05)})
-    one = colour.colour_filter(noise, GROUP, windows)
+    noise = Noise(np.ones(19), {GROUP: (0.85, 0.05)})
+    one = colour_filter(noise, GROUP, windows)
     values = noise_like(windows, 0.85, 0.05, np.random.default_rng(2))[..., SLICES[GROUP]]
     white = one @ values
     neighbours = (white[:, 1:] * white[:, :-1]).mean() / (white**2).mean()
@@ -229,7 +235,7 @@ def test_where_the_model_lacks_something_the_whole_residual_counts_as_noise(wind
     residual = noise_like(windows, 0.0, 1.0, rng)
     swing = np.sin(6.0 * windows.row_s[..., None] + rng.uniform(0.0, 6.0, (len(residual), 1, 3)))
     residual[..., SLICES["velocity"]] += 8.0 * swing
-    noise = colour.residual_as_noise(linear_of(residual, windows))
+    noise = residual_as_noise(linear_of(residual, windows))
     np.testing.assert_allclose(noise.sigma[SLICES["velocity"]], 8.0 / np.sqrt(2.0), rtol=0.3)
     share, lasts_s = noise.coloured["velocity"]
     assert share > 0.95 and lasts_s > 0.1

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from suite.diagnose.data.colour import Linearisation, Noise
+from suite.diagnose.data.noise import Linearisation, Noise
 from suite.diagnose.data.windows import CHANNELS, SLICES, STATE
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import Candidate

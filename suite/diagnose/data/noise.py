@@ -191,14 +191,21 @@ def _stretches(
             continue
         time = (time_s - time_s.mean()) / (time_s[-1] - time_s[0])
         powers = time[:, None] ** np.arange(limits.colour_degree + 1)
-        # The drift is white noise that is integrated once or twice.
-        since_s = time_s - time_s[0]
-        early, late = np.minimum.outer(since_s, since_s), np.maximum.outer(since_s, since_s)
-        once_twice = {1: early, 2: 0.5 * early**2 * (3.0 * late - early)}
-        drift = once_twice.get(INTEGRATED.get(name, 0), np.zeros_like(early))
+        drift = _drift_covariance(time_s - time_s[0], INTEGRATED.get(name, 0))
         residuals = np.moveaxis(stacked, 1, 0).reshape(rows, -1)
         groups[name] = _Stretches(time_s, residuals, powers, drift)
     return groups
+
+
+def _drift_covariance(time_s: np.ndarray, integrations: int) -> np.ndarray:
+    """Return the covariance (N, N) of white noise that is integrated once or twice; else zeros.
+
+    The variance after a second is 1.
+    """
+    early, late = np.minimum.outer(time_s, time_s), np.maximum.outer(time_s, time_s)
+    if integrations == 2:
+        return 0.5 * early**2 * (3.0 * late - early)
+    return early if integrations == 1 else np.zeros_like(early)
 
 
 def _without_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.ndarray, int, float]:
