@@ -113,6 +113,21 @@ def checked_act(
     return output
 
 
+class Wrapper:
+    """A `Policy` that flies as another `policy` does; a subclass adds something to `act`."""
+
+    def __init__(self, policy: Policy) -> None:
+        """Take name, spec and memory from `policy`."""
+        self.policy, self.name, self.spec = policy, policy.name, policy.spec
+        self.start = policy.start
+
+    def act(
+        self, hidden: Hidden, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
+    ) -> tuple[np.ndarray, Hidden]:
+        """Return what `checked_act` returns for the policy."""
+        return checked_act(self.policy, hidden, state, image, fresh)
+
+
 def load_policy(name_or_path: str | Path, trust: bool = False) -> Policy:
     """Return a policy to fly.
 

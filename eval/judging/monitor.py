@@ -9,13 +9,13 @@ action is flown. The judge and real-time flights (`suite fly`) use the same moni
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from policies.policy import Hidden, Policy, checked_act
+from policies.policy import Hidden, Policy, Wrapper
 from policies.spec import PolicyError, PolicySpec
 from tracks.geometry.camera import pixel_rays_b
 from tracks.input.ranges import Range
@@ -66,45 +66,30 @@ class Seen(NamedTuple):
     """(N, P) bool, whether the pixel shows an object within the camera's range."""
 
 
-@dataclass
-class Monitored:
+class Monitored(Wrapper):
     """A `Policy` that runs another policy and monitors its actions."""
 
-    policy: Policy
-    """The monitored policy."""
-    limits: MonitorLimits = MonitorLimits()
+    limits = MonitorLimits()
     """Limits of the monitor."""
-    interventions: int = field(default=0, compare=False)
-    """Number of evasive manoeuvres so far, over all rows."""
 
-    def __post_init__(self) -> None:
+    def __init__(self, policy: Policy) -> None:
         """Refuse kinds of action and image that the monitor does not support."""
-        action, depth = self.policy.spec.action, self.policy.spec.depth
+        super().__init__(policy)
+        action, depth = policy.spec.action, policy.spec.depth
         if action.kind != "acceleration" or not action.is_plain or depth.uint8:
             raise PolicyError(
-                f"{self.policy.name}: the monitor supports only accelerations in m/s^2 and float "
+                f"{policy.name}: the monitor supports only accelerations in m/s^2 and float "
                 "images; fly it without --monitor"
             )
-
-    @property
-    def name(self) -> str:
-        """Name of the monitored policy in tables."""
-        return f"{self.policy.name}+monitor"
-
-    @property
-    def spec(self) -> PolicySpec:
-        """The specification of the monitored policy."""
-        return self.policy.spec
-
-    def start(self, n: int) -> Hidden:
-        """Return the policy's hidden state at the start of n trials."""
-        return self.policy.start(n)
+        self.name = f"{policy.name}+monitor"
+        self.interventions = 0
+        """Number of evasive manoeuvres so far, over all rows."""
 
     def act(
         self, hidden: Hidden, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
     ) -> tuple[np.ndarray, Hidden]:
         """Return the policy's actions (n, 3), limited or replaced where necessary."""
-        action, hidden = checked_act(self.policy, hidden, state, image, fresh)
+        action, hidden = super().act(hidden, state, image, fresh)
         seen = seen_of(self.spec, state, image)
         action_b = limited(self.limits, np.asarray(action, float), seen)
         action_b, replaced = last_moment(self.limits, action_b, seen, 1.0 / self.spec.rate_hz)

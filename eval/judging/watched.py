@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from policies.policy import Hidden, Policy
+from policies.policy import Hidden, Policy, Wrapper
 from policies.spec import Note
 
 EXTREME, LEAST_DECISIONS = 0.999, 20
@@ -13,12 +13,11 @@ OFTEN = 0.5
 """Share of extreme outputs above which the policy probably saturates."""
 
 
-class Watched:
+class Watched(Wrapper):
     """Flies as `policy` does, and keeps its outputs and whether its memory changes."""
 
     def __init__(self, policy: Policy) -> None:
-        self.name, self.spec, self.start = policy.name, policy.spec, policy.start
-        self._policy = policy
+        super().__init__(policy)
         self._outputs: list[np.ndarray] = []
         self._has_memory = self._remembers = False
 
@@ -26,7 +25,7 @@ class Watched:
         self, hidden: Hidden, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
     ) -> tuple[np.ndarray, Hidden]:
         """Return what the policy's `act` returns."""
-        output, new_hidden = self._policy.act(hidden, state, image, fresh)
+        output, new_hidden = super().act(hidden, state, image, fresh)
         self._outputs.append(np.array(output, float))
         if isinstance(hidden, np.ndarray) and hidden[~fresh].size:
             self._has_memory = True

@@ -20,7 +20,7 @@ from policies.formats.c.compiler import find_compiler
 from policies.formats.c.forward import Observed
 from policies.formats.c.project import actions_of, native_actions, random_observations
 from policies.formats.policy_file import PolicyCheckpoint
-from policies.policy import Hidden, Policy
+from policies.policy import Hidden, Policy, Wrapper
 from policies.spec import PolicyError
 from suite.judging.deploy.latency import Timing, c_step, time_in_turn
 
@@ -86,13 +86,12 @@ SEED = 900_000
 """Seed of the first of these flights; no results table uses it."""
 
 
-class Recorder:
+class Recorder(Wrapper):
     """A policy that records its inputs in all flights, which the judge flies at once as a batch."""
 
     def __init__(self, policy: Policy) -> None:
         """Record the inputs of `policy`."""
-        self.name, self.spec, self.start = policy.name, policy.spec, policy.start
-        self._policy = policy
+        super().__init__(policy)
         self._inputs: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
     def act(
@@ -100,7 +99,7 @@ class Recorder:
     ) -> tuple[np.ndarray, Hidden]:
         """Return the policy's actions and memory."""
         self._inputs.append((state.copy(), image.copy(), fresh.copy()))
-        return self._policy.act(hidden, state, image, fresh)
+        return super().act(hidden, state, image, fresh)
 
     def observed(self) -> Observed:
         """Return the recorded inputs, one flight after the other.
