@@ -90,11 +90,10 @@ def evaluate_policy(
     Raises:
         ValueError: for an argument that cannot be used, before the first flight.
     """
-    from eval.judging.judge import JudgeOptions, fly
     from eval.judging.outputs import action_report, check_rows, notes_of, object_faults
     from eval.logs.faults.vehicle import vehicle_doubts
     from policies.policy import check_is_policy, load_policy
-    from suite.judging.flying import policy_for_workers
+    from suite.judging.flying import fly_trials, policy_for_workers
     from suite.judging.requests import Evaluation
     from suite.judging.trials import read_trial_set
 
@@ -115,10 +114,7 @@ def evaluate_policy(
     flown, processes = loaded, 1 if workers is None else workers
     if is_source:
         flown = policy_for_workers(loaded, str(policy), False, processes)
-    options = JudgeOptions(workers=processes, sensors=trial_set.sensors)
-    results = fly(
-        flown, trial_set.trials, trial_set.vehicle, simulator, options, tracks=trial_set.tracks
-    )
+    results = fly_trials(flown, evaluation, trial_set, processes)
     # An object is probed after its flights, so that the probe cannot change them.
     doubts = object_faults(loaded) if is_object and not tests else ()
     known = {doubt.fault for doubt in doubts}

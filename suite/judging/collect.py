@@ -16,6 +16,7 @@ from suite.common.stages import announce
 from suite.judging.flying import (
     Manner,
     default_policy,
+    fly_trials,
     flying_estimate,
     load_in_manner,
     policy_for_workers,
@@ -149,8 +150,7 @@ def _fly_missing(
 
     When a flight ends, write its log, its line in the journal and its row.
     """
-    from eval.judging.judge import JudgeOptions, Record, fly
-    from eval.worlds.trial import Rules
+    from eval.judging.judge import Record
 
     missing = [trial for trial in trial_set.trials if trial not in rows]
     workers = workers_for(len(missing), workers, collection.simulator)
@@ -158,8 +158,6 @@ def _fly_missing(
     announce(console, title, flying_estimate(len(missing), workers, collection.simulator))
     show_notes(console, collection.simulator, trial_set)
     source, manner = collection.policy or default_policy(), Manner(speed=collection.speed)
-    rules = Rules(time_limit_s=collection.time_limit_s)
-    options = JudgeOptions(workers=workers, rules=rules, sensors=trial_set.sensors)
     with console.progress("flights", len(trial_set.trials), begun=len(rows)) as update:
 
         def keep(result: TrialResult, flight: Flight | None) -> None:
@@ -171,16 +169,8 @@ def _fly_missing(
             update(len(rows), result.ended_by)
 
         if missing:
-            fly(
-                policy_for_workers(policy, source, collection.trust, workers, manner),
-                missing,
-                trial_set.vehicle,
-                collection.simulator,
-                options,
-                keep,
-                Record(depth=False),
-                trial_set.tracks,
-            )
+            flown = policy_for_workers(policy, source, collection.trust, workers, manner)
+            fly_trials(flown, collection, trial_set, workers, missing, keep, Record())
 
 
 def _row(out: Path, result: TrialResult) -> Row | None:

@@ -17,6 +17,7 @@ from suite.common.stages import announce
 from suite.judging.flying import (
     Manner,
     default_policy,
+    fly_trials,
     flying_estimate,
     load_in_manner,
     manners,
@@ -256,18 +257,7 @@ def _fly_entry(
     console: Console,
 ) -> list[TrialResult]:
     """Fly the trials of an entry that its journal lacks; return all results, in order."""
-    from eval.judging.guard import ActionLimits
-    from eval.judging.judge import JudgeOptions, fly
-    from eval.worlds.trial import Rules
-
-    label = entry.label
-    options = JudgeOptions(
-        workers=workers,
-        rules=Rules(time_limit_s=evaluation.time_limit_s),
-        limits=ActionLimits(deadline_s=evaluation.deadline_s),
-        sensors=trial_set.sensors,
-    )
-    trials = trial_set.trials
+    label, trials = entry.label, trial_set.trials
     with journal:
         missing = journal.missing(trials)
         before = len(trials) - len(missing)
@@ -288,16 +278,9 @@ def _fly_entry(
                 flown, won = flown + 1, won + result.success
                 update(flown, f"{won / flown:.0%} success")
 
-            fly(
-                policy_for_workers(
-                    entry.policy, entry.source, evaluation.trust, workers, entry.manner
-                ),
-                missing,
-                trial_set.vehicle,
-                evaluation.simulator,
-                options,
-                keep,
-                tracks=trial_set.tracks,
+            policy = policy_for_workers(
+                entry.policy, entry.source, evaluation.trust, workers, entry.manner
             )
+            fly_trials(policy, evaluation, trial_set, workers, missing, keep)
         # An earlier command may have had other policies, and another label for this one.
         return [journal.done[trial]._replace(policy=label) for trial in trials]

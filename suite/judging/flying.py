@@ -19,7 +19,11 @@ from tracks.common.files import plain
 from tracks.common.work import Workers, usable_cores, worker_count
 
 if TYPE_CHECKING:
+    from eval.judging.judge import OnResult, Record
+    from eval.worlds.trial import TrialResult, TrialSpec
     from policies.policy import Policy
+    from suite.judging.requests import SimulatedFlights
+    from suite.judging.trials import TrialSet
 
 TRIALS_A_PROCESS = 128
 """Smallest number of trials for another process: the start of a process takes seconds."""
@@ -195,6 +199,37 @@ def load_in_manner(name_or_path: str, trust: bool, manner: Manner = PLAIN) -> Po
     from policies.policy import load_policy
 
     return manner(load_policy(name_or_path, trust))
+
+
+def fly_trials(
+    policy: Policy | Callable[[], Policy],
+    request: SimulatedFlights,
+    trial_set: TrialSet,
+    workers: Workers = 1,
+    trials: Sequence[TrialSpec] | None = None,
+    on_result: OnResult | None = None,
+    record: Record | None = None,
+) -> list[TrialResult]:
+    """Fly a command's trials in the judge, with the settings of its `request`.
+
+    They are all of `trial_set`, or else `trials`; the other arguments are those of
+    `eval.judging.judge.fly`.
+    """
+    from eval.judging.guard import ActionLimits
+    from eval.judging.judge import JudgeOptions, fly
+    from eval.worlds.trial import Rules
+
+    options = JudgeOptions(
+        workers=workers,
+        rules=Rules(time_limit_s=request.time_limit_s),
+        limits=ActionLimits(deadline_s=getattr(request, "deadline_s", None)),
+        sensors=trial_set.sensors,
+    )
+    trials = trial_set.trials if trials is None else trials
+    return fly(
+        policy, trials, trial_set.vehicle, request.simulator, options, on_result, record,
+        trial_set.tracks,
+    )  # fmt: skip
 
 
 def policy_record(name_or_path: str, policy: Policy) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from suite.common.console import Console
 from suite.judging.content import policy_digest
 from suite.judging.evaluate import file_digests
-from suite.judging.flying import default_policy, load_in_manner, manners
+from suite.judging.flying import default_policy, fly_trials, load_in_manner, manners
 from suite.judging.requests import Evaluation
 from suite.judging.trials import parse_levels, parse_tracks, read_trial_set, trial_list
 from tracks.common.toml_table import Table
@@ -101,19 +101,13 @@ def fly_again(
     Raises:
         ValueError: if the policy, vehicle, sensors or a track has changed.
     """
-    from eval.judging.guard import ActionLimits
-    from eval.judging.judge import JudgeOptions, Record, fly
+    from eval.judging.judge import Record
     from eval.view.recording import Drone
-    from eval.worlds.trial import Rules, track_of
+    from eval.worlds.trial import track_of
 
     # Read the inputs as the evaluation did.
-    _, tracks, vehicle, sensors, *_ = read_trial_set(evaluation)
-    options = JudgeOptions(
-        workers=1,
-        rules=Rules(time_limit_s=evaluation.time_limit_s),
-        limits=ActionLimits(deadline_s=evaluation.deadline_s),
-        sensors=sensors,
-    )
+    trial_set = read_trial_set(evaluation)
+    _, tracks, vehicle, sensors, *_ = trial_set
     name = policy or (evaluation.policies or (default_policy(),))[0]
     manner = manners(evaluation.speed, monitor=False)[0]
     loaded = load_in_manner(name, evaluation.trust, manner)
@@ -128,9 +122,8 @@ def fly_again(
         if flight is not None:
             flights[result.trial] = flight
 
-    results = fly(
-        loaded, trials, vehicle, evaluation.simulator, options, keep, Record(depth=True), tracks
-    )
+    record = Record(depth=True)
+    results = fly_trials(loaded, evaluation, trial_set, 1, trials, keep, record)
     rollouts = [
         (track_of(tracks, trial), flights[trial], result)
         for trial, result in zip(trials, results, strict=True)

@@ -19,7 +19,13 @@ from policies.policy import Policy
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.provenance import refuse_other_run, write_run_record
-from suite.judging.flying import default_policy, load_in_manner, manners, policy_record
+from suite.judging.flying import (
+    default_policy,
+    fly_trials,
+    load_in_manner,
+    manners,
+    policy_record,
+)
 from suite.judging.link.companion import FINISHED, Companion
 from suite.judging.link.flights import (
     Flight,
@@ -99,7 +105,9 @@ def fly_over_link(
         )
     rules = Rules(time_limit_s=evaluation.time_limit_s)
     # The judge's trials come before the flights, since the judge may refuse the policy.
-    judged = [] if link else _judged_successes(loaded, trial_set, rules)
+    judged = (
+        [] if link else [result.success for result in fly_trials(loaded, evaluation, trial_set)]
+    )
     out.mkdir(parents=True, exist_ok=True)
     interrupt = None
     if link:
@@ -123,16 +131,6 @@ def fly_over_link(
     if interrupt is not None:
         raise interrupt
     return {**answer, "out": str(out)}
-
-
-def _judged_successes(policy: Policy, trial_set: TrialSet, rules: Rules) -> list[bool]:
-    """Fly the trials in the judge, without a link; return whether each one succeeds."""
-    from eval.judging.judge import JudgeOptions, fly
-
-    trials, tracks = trial_set.trials, trial_set.tracks
-    options = JudgeOptions(slots=min(16, len(trials)), workers=1, rules=rules)
-    results = fly(policy, trials, trial_set.vehicle, options=options, tracks=tracks)
-    return [result.success for result in results]
 
 
 def _fly_real_vehicle(

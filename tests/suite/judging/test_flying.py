@@ -175,7 +175,7 @@ def test_a_start_in_contact_is_refused_wherever_a_track_file_is_flown(tmp_path, 
 def test_from_python_a_track_file_is_flown_and_a_named_policy_in_several_processes(monkeypatch):
     flown = []
 
-    def fly(policy, trials, vehicle, world, options, tracks):
+    def fly(policy, trials, vehicle, world, options, on_result, record, tracks):
         assert options.workers == 1 or pack(policy)
         return flown.append((options.workers, trials, list(tracks))) or []
 
