@@ -90,7 +90,7 @@ def evaluate_policy(
     Raises:
         ValueError: for an argument that cannot be used, before the first flight.
     """
-    from eval.judging.outputs import action_report, check_rows, notes_of, object_faults
+    from eval.judging.outputs import action_report, notes_of, object_faults
     from eval.logs.faults.vehicle import vehicle_doubts
     from policies.policy import check_is_policy, load_policy
     from suite.judging.flying import fly_trials, policy_for_workers
@@ -106,9 +106,8 @@ def evaluate_policy(
     evaluation = Evaluation(trials=trials, seed=seed, simulator=simulator, **request)
     is_source = isinstance(policy, str | Path)
     trial_set = read_trial_set(evaluation, repeated=not is_source, **objects)
-    is_object = not (is_source or hasattr(loaded, "notes"))
-    tests = check_rows(loaded) if is_object else []
-    notes = dict.fromkeys([*notes_of(loaded), *trial_set.notes, *tests])
+    before = notes_of(loaded)
+    notes = dict.fromkeys([*before, *trial_set.notes])
     for note in (*vehicle_doubts(trial_set.vehicle), *trial_set.differences, *notes):
         warnings.warn(str(note), stacklevel=2)
     flown, processes = loaded, 1 if workers is None else workers
@@ -116,10 +115,10 @@ def evaluate_policy(
         flown = policy_for_workers(loaded, str(policy), False, processes)
     results = fly_trials(flown, evaluation, trial_set, processes)
     # An object is probed after its flights, so that the probe cannot change them.
-    doubts = object_faults(loaded) if is_object and not tests else ()
+    doubts = () if before or hasattr(loaded, "notes") else object_faults(loaded)
     known = {doubt.fault for doubt in doubts}
-    in_flight = action_report(results, loaded.spec.action)["warnings"]
-    for doubt in (*doubts, *(each for each in in_flight if each.fault not in known)):
+    in_flight = action_report(results, loaded.spec.action, known)["warnings"]
+    for doubt in (*doubts, *in_flight):
         warnings.warn(f"policy {loaded.name!r}: {doubt}", stacklevel=2)
     return results
 

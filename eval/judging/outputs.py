@@ -9,7 +9,7 @@ accelerates.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from typing import Any
 
 import numpy as np
@@ -86,19 +86,17 @@ class Outputs:
         return {"decisions": count, "output_max": float(self._largest[slot]), "action_up": up}
 
 
-def action_report(results: Sequence[TrialResult], action: ActionSpec) -> dict[str, Any]:
-    """Return the shares of limited and invalid actions of one policy, and warnings."""
+def action_report(
+    results: Sequence[TrialResult], action: ActionSpec, known: Container[str] = ()
+) -> dict[str, Any]:
+    """Return the shares of limited and bad actions, and warnings except of `known` faults."""
     decisions = sum(row.decisions for row in results)
     if not decisions:
         return {"decisions": 0, "limited": None, "bad": None, "warnings": []}
     limited = sum(row.limited_actions for row in results) / decisions
     bad = sum(row.bad_actions for row in results) / decisions
-    return {
-        "decisions": decisions,
-        "limited": limited,
-        "bad": bad,
-        "warnings": _warnings(results, action, limited, bad),
-    }
+    warnings = [n for n in _warnings(results, action, limited, bad) if n.fault not in known]
+    return {"decisions": decisions, "limited": limited, "bad": bad, "warnings": warnings}
 
 
 def _scale_advice(action: ActionSpec) -> str:
@@ -129,12 +127,13 @@ def _warnings(
 
 
 def notes_of(policy: Policy) -> tuple[Note, ...]:
-    """Return the assumptions about a policy's file, and the probable faults of its outputs.
+    """Return the notes about a policy before it flies.
 
-    A policy object that is from no file has no `notes`.
+    They are the assumptions about its file, and the probable faults of its outputs. An object that
+    is from no file has no `notes`: only its rows are tested, by `check_rows`.
     """
     notes = getattr(policy, "notes", None)
-    return () if notes is None else (*notes, *probable_faults(policy))
+    return check_rows(policy) if notes is None else (*notes, *probable_faults(policy))
 
 
 def object_faults(policy: Policy) -> tuple[Note, ...]:
@@ -261,7 +260,7 @@ def _level_states(spec: PolicySpec, offset: np.ndarray) -> np.ndarray:
     return state
 
 
-def check_rows(policy: Policy) -> list[str]:
+def check_rows(policy: Policy) -> tuple[Note, ...]:
     """Refuse a policy object whose answer for a row depends on the other rows.
 
     A row is the observation of one trial. A copy of the object is tested, if it can be copied, so
@@ -269,7 +268,7 @@ def check_rows(policy: Policy) -> list[str]:
     rows, is not tested.
 
     Returns:
-        A warning if the same inputs give two answers: the policy is random or keeps memory.
+        A note if the same inputs give two answers: the policy is random or keeps memory.
 
     Raises:
         ValueError: naming the largest change of an answer.
@@ -279,21 +278,22 @@ def check_rows(policy: Policy) -> list[str]:
         first, again, other = (_two_answers(tested, ROWS, seed) for seed in (0, 0, 1))
         alone = _two_answers(tested, 1, 0)
     except Exception:  # any error of an object's own code; the judge reports it
-        return []
+        return ()
     if first.shape[1:] != (ROWS, policy.spec.action.size) or first.dtype.kind not in "fiu":
-        return []  # the judge refuses these actions
+        return ()  # the judge refuses these actions
     if first.tobytes() != again.tobytes():
-        return [
+        text = (
             f"policy {policy.name!r}: the same inputs gave two answers. It is random, or its "
-            "memory is in the object, so that results depend on earlier trials: keep it in hidden"
-        ]
+            "memory is in the object, so that results depend on earlier trials"
+        )
+        return (Note("memory_outside", text, "keep it in hidden"),)
     change = max(np.abs(answers[:, 0] - first[:, 0]).max() for answers in (other, alone))
     if change > ROUNDING * max(1.0, np.abs(first).max()):
         raise ValueError(
             f"policy {policy.name!r}: a row's action changes by {change:.2g} with the other rows "
             "of its batch; rows are separate trials (docs/policies.md)"
         )
-    return []
+    return ()
 
 
 def _two_answers(policy: Policy, count: int, seed: int) -> np.ndarray:

@@ -17,6 +17,9 @@ from policies.contract import contract_of, summary
 from policies.policy import Policy, load_policy
 from policies.spec import Note
 from suite.common.console import Console
+from suite.judging.flying import fly_trials
+from suite.judging.requests import SimulatedFlights
+from suite.judging.trials import read_trial_set
 from tracks.common.files import check_no_input
 
 TIME_LIMIT_S = 5.0
@@ -137,36 +140,36 @@ def policy_findings(policy: Policy, trials: int, console: Console) -> list[dict[
 
     The policy shows its actions in short flights, `trials` of them, perhaps none.
     """
-    from eval.judging.outputs import probable_faults
+    from eval.judging.outputs import notes_of
 
     console.say(f"{policy.name}: {summary(contract_of(policy.spec))}")
-    findings = [_record("contract", *note) for note in getattr(policy, "notes", ())]
-    findings += [_record(doubt.fault.split("_")[0], *doubt) for doubt in probable_faults(policy)]
-    # Warnings in flight, without the faults that were found before.
+    of_file = getattr(policy, "notes", ())
+    findings = [
+        _record("contract" if note in of_file else note.fault.split("_")[0], *note)
+        for note in notes_of(policy)
+    ]
     known = {record["fault"] for record in findings}
-    warnings, hints = _warnings_in_flight(policy, trials, console, bool(known))
-    findings += [_record("action", *warning) for warning in warnings if warning.fault not in known]
+    warnings, hints = _warnings_in_flight(policy, trials, console, known)
+    findings += [_record("action", *warning) for warning in warnings]
     return findings + [_record("memory", *hint) | {"status": "note"} for hint in hints]
 
 
 def _warnings_in_flight(
-    policy: Policy, trials: int, console: Console, explained: bool
+    policy: Policy, trials: int, console: Console, known: set[str]
 ) -> tuple[list[Note], list[Note]]:
     """Return probable faults of the actions in a few short flights, and hints.
 
-    Flights without a gate are a fault of their own, unless another fault has `explained` them.
+    The faults `known` are left out. Flights without a gate are a fault if there is no other one.
     """
-    from eval.judging.judge import JudgeOptions, fly
     from eval.judging.outputs import action_report
     from eval.judging.watched import Watched
-    from eval.quadrotor.vehicle_file import load_vehicle
-    from eval.worlds.trial import Rules, TrialSpec
 
-    trial_specs = [TrialSpec("random", 0, 500_000 + seed) for seed in range(trials)]
-    options = JudgeOptions(workers=1, rules=Rules(time_limit_s=TIME_LIMIT_S))
+    if not trials:
+        return [], []
+    request = SimulatedFlights("random", "0", trials, 500_000, "racer5", TIME_LIMIT_S)
     watched = Watched(policy)
-    results = fly(watched, trial_specs, load_vehicle("racer5"), options=options)
-    actions = action_report(results, policy.spec.action)
+    results = fly_trials(watched, request, read_trial_set(request))
+    actions = action_report(results, policy.spec.action, known)
     if not actions["decisions"]:
         return [], []
     share, count = actions["limited"], actions["decisions"]
@@ -177,7 +180,7 @@ def _warnings_in_flight(
     endings = ", ".join(f"{number} {ending}" for ending, number in ended.items())
     text = f"in {trials} flights of {TIME_LIMIT_S:g} s at level 0 it passed {gates} gates"
     console.say(f"{text}; at the end: {endings}")
-    if not gates and trials >= LEAST_FLIGHTS and not (warnings or explained):
+    if not gates and trials >= LEAST_FLIGHTS and not (warnings or known):
         fix = (
             "compare units, axes, signs and order of its state, image and action with the "
             "contract above; after a very short training this is no fault"
