@@ -5,21 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 from suite.common.console import Console
+from suite.common.options import options
 
-OPTIONS = ("vehicle", "hidden_vehicle")
-"""Options that name a vehicle file."""
 OWN_CHECK = ("check", "delta", "diagnose", "identify")
 """Commands that list these doubts among the findings about their flights."""
 
 
 def warn_of_vehicles(command: str, config: Any, console: Console) -> None:
-    """Print the doubts about the vehicle files that the options `config` of a command name.
+    """Print the doubts about vehicle files in the options `config`, whose names end in "vehicle".
 
     A file that cannot be read is left to the command, which refuses it.
     """
-    groups = [config, getattr(config, "flown", None)]
-    values = [getattr(group, option, None) for group in groups for option in OPTIONS]
-    names = dict.fromkeys(str(value) for value in values if value)
+    given = (o.default for o in options(type(config), config) if o.field.endswith("vehicle"))
+    names = dict.fromkeys(name for name in given if name)
     if command in OWN_CHECK or not names:
         return
     from eval.logs.faults.vehicle import vehicle_doubts

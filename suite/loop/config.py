@@ -11,8 +11,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
+from eval.judging.judge import check_records
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.sensors.sensors_file import SensorSet, load_sensors, sensors_table
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds import world_class
 from policies import shipped
+from policies.formats.policy_file import load_policy_checkpoint
 from suite.delta.fit import FitConfig
+from suite.diagnose.estimate.parameters import refuse_own_motion
+from suite.judging.content import policy_digest
+from suite.judging.flying import checkpoint_folder, default_policy
 from suite.judging.trials import is_track_file, parse_levels, parse_tracks
 from suite.train.config import TrainConfig, check
 from suite.train.overrides import at_rate, check_owned, check_phases, phase_configs, with_changes
@@ -105,9 +114,9 @@ class LoopConfig:
         Raises:
             ValueError: naming what has changed.
         """
-        for name, digest in _digests_of_files(
-            self.vehicle, self.sensors, self.hidden_vehicle
-        ).items():
+        true = load_vehicle(self.hidden_vehicle) if self.hidden_vehicle else None
+        digests = _digests(load_vehicle(self.vehicle), load_sensors(self.sensors), true)
+        for name, digest in digests.items():
             if digest != self.digests[name]:
                 raise ValueError(
                     f"the file of --{name.replace('_', '-')} has changed since the loop began, so "
@@ -172,14 +181,6 @@ def resolve(
     Raises:
         ValueError: for an invalid option, with what is allowed.
     """
-    from eval.judging.judge import check_records
-    from eval.quadrotor.vehicle_file import load_vehicle
-    from eval.worlds import world_class
-    from policies.formats.policy_file import load_policy_checkpoint
-    from suite.diagnose.estimate.parameters import refuse_own_motion
-    from suite.judging.content import policy_digest
-    from suite.judging.flying import checkpoint_folder, default_policy
-
     # The kind of loop, its recipe and its size.
     hidden = hidden_vehicle is not None or simulator != EXACT_SIMULATORS[0]
     if hidden and policy is None:
@@ -207,7 +208,7 @@ def resolve(
         training = with_changes(training, changes)
         check_phases(training)
     # The true vehicle, which must differ from the simulation's.
-    true_vehicle = vehicle if hidden_vehicle is None else hidden_vehicle
+    true, true_vehicle = None, vehicle if hidden_vehicle is None else hidden_vehicle
     if hidden:
         refuse_own_motion(simulated)
         world_class(simulator)
@@ -219,7 +220,7 @@ def resolve(
                 "is hidden; give a vehicle file with one more effect, such as "
                 "examples/hidden.toml, or another simulator, such as --simulator rotorpy"
             )
-    digests = _digests_of_files(vehicle, sensors, true_vehicle if hidden else None)
+    digests = _digests(simulated, load_sensors(sensors), true)
     # The settings of the fine-tuning.
     if policy is not None:
         spec = load_policy_checkpoint(checkpoint_folder(policy)).spec
@@ -258,18 +259,10 @@ def resolve(
     return config
 
 
-def _digests_of_files(vehicle: str, sensors: str, hidden_vehicle: str | None) -> dict[str, str]:
-    """Return the SHA-256 of the contents of the files, by option."""
-    from eval.quadrotor.vehicle_file import load_vehicle
-    from eval.sensors.sensors_file import load_sensors, sensors_table
-
-    digests = {
-        "vehicle": digest_of(load_vehicle(vehicle)),
-        "sensors": digest_of(sensors_table(load_sensors(sensors))),
-    }
-    if hidden_vehicle is not None:
-        digests["hidden_vehicle"] = digest_of(load_vehicle(hidden_vehicle))
-    return digests
+def _digests(vehicle: Vehicle, sensors: SensorSet, true: Vehicle | None) -> dict[str, str]:
+    """Return the SHA-256 of the contents of the files, by option; `true` is a hidden vehicle."""
+    digests = {"vehicle": digest_of(vehicle), "sensors": digest_of(sensors_table(sensors))}
+    return digests | ({} if true is None else {"hidden_vehicle": digest_of(true)})
 
 
 def _check_changes(

@@ -49,6 +49,8 @@ def test_doubts_about_a_vehicle_file_are_printed_once_and_stop_nothing(tmp_path,
     train = "train --model quad --list-settings --vehicle"
     assert run(train, tmp_path / "mm.toml") == 0
     assert capfd.readouterr().err.count("divide by 1000") == 1
+    page = "reproduce robustness --policy no.onnx --out"
+    assert "divide by 1000" in refused(capfd, page, tmp_path, "--vehicle", tmp_path / "mm.toml")
 
 
 def test_effects_command_lists_and_describes(capfd):
