@@ -10,9 +10,24 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from eval.judging.outputs import action_report, notes_of
+from eval.judging.watched import Watched
+from eval.logs.columns import FlightLogError
+from eval.logs.faults.check import (
+    CheckContext,
+    check_files,
+    check_log,
+    not_identifiable,
+    with_fixes,
+)
+from eval.logs.faults.finding import Finding, finding_lines
+from eval.logs.faults.vehicle import check_same_vehicle
+from eval.logs.flight_log import flight_files, read_flights, write_flight
+from eval.quadrotor.vehicle_file import load_vehicle
 from policies.contract import contract_of, summary
 from policies.policy import Policy, load_policy
 from policies.spec import Note
@@ -57,21 +72,6 @@ def check_flight_files(
     Raises:
         ValueError: for invalid files.
     """
-    from dataclasses import replace
-
-    from eval.logs.columns import FlightLogError
-    from eval.logs.faults.check import (
-        CheckContext,
-        check_files,
-        check_log,
-        not_identifiable,
-        with_fixes,
-    )
-    from eval.logs.faults.finding import Finding, finding_lines
-    from eval.logs.faults.vehicle import check_same_vehicle
-    from eval.logs.flight_log import flight_files, read_flights, write_flight
-    from eval.quadrotor.vehicle_file import load_vehicle
-
     # Check the files, then each flight; write the corrected flights.
     spec = None if policy is None else policy.spec
     context = CheckContext(
@@ -140,8 +140,6 @@ def policy_findings(policy: Policy, trials: int, console: Console) -> list[dict[
 
     The policy shows its actions in short flights, `trials` of them, perhaps none.
     """
-    from eval.judging.outputs import notes_of
-
     console.say(f"{policy.name}: {summary(contract_of(policy.spec))}")
     of_file = getattr(policy, "notes", ())
     findings = [
@@ -161,9 +159,6 @@ def _warnings_in_flight(
 
     The faults `known` are left out. Flights without a gate are a fault if there is no other one.
     """
-    from eval.judging.outputs import action_report
-    from eval.judging.watched import Watched
-
     if not trials:
         return [], []
     request = SimulatedFlights("random", "0", trials, 500_000, "racer5", TIME_LIMIT_S)

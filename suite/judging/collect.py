@@ -7,9 +7,19 @@ earlier call, and from a journal, a file with a line for each finished flight.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from eval.logs.columns import DURATION_MIN
+from eval.effects.log_faults import apply_log_faults
+from eval.judging.judge import Record, check_records
+from eval.judging.results import Journal
+from eval.logs.columns import DURATION_MIN, FlightLogError
+from eval.logs.flight import Flight
+from eval.logs.flight_log import log_from_flight, logs_in, write_flight
+from eval.quadrotor.vehicle_file import save_vehicle, vehicle_table
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds import nearest
+from eval.worlds.trial import TrialResult, TrialSpec
+from policies.policy import Policy
 from suite.common.console import Console
 from suite.common.provenance import engines, refuse_other_run, write_run_record
 from suite.common.stages import announce
@@ -30,13 +40,6 @@ from tracks.common.files import write_json
 from tracks.common.provenance import git_commit, stamp
 from tracks.common.work import Workers
 from tracks.input.reading import read_json
-
-if TYPE_CHECKING:
-    from eval.judging.results import Journal
-    from eval.logs.flight import Flight
-    from eval.vehicles.vehicle import Vehicle
-    from eval.worlds.trial import TrialResult, TrialSpec
-    from policies.policy import Policy
 
 LIST = "flights.json"
 """Name of the list of flights in the output folder."""
@@ -61,9 +64,6 @@ def collect(
     Raises:
         ValueError: if a setting of `collection` cannot be used, or `out` holds other flights.
     """
-    from eval.judging.judge import check_records
-    from eval.judging.results import Journal
-
     trial_set, manner = read_trial_set(collection), Manner(speed=collection.speed)
     check_records(collection.simulator)
     refuse_equal_names({trial.track for trial in trial_set.trials})
@@ -118,9 +118,6 @@ def _write_vehicle(
 
     It is not written, with a warning, if a value is beyond the bounds of vehicle files.
     """
-    from eval.quadrotor.vehicle_file import save_vehicle, vehicle_table
-    from eval.worlds import nearest
-
     described = nearest(collection.simulator, vehicle)
     if vehicle_table(described) == vehicle_table(vehicle):
         return None
@@ -150,8 +147,6 @@ def _fly_missing(
 
     When a flight ends, write its log, its line in the journal and its row.
     """
-    from eval.judging.judge import Record
-
     missing = [trial for trial in trial_set.trials if trial not in rows]
     workers = workers_for(len(missing), workers, collection.simulator)
     title = f"{len(missing)} flights in {collection.simulator}"
@@ -190,10 +185,6 @@ def _write_log(
 
     It is None, with a warning, if the log is refused.
     """
-    from eval.effects.log_faults import apply_log_faults
-    from eval.logs.columns import FlightLogError
-    from eval.logs.flight_log import log_from_flight, write_flight
-
     name = log_name(result.track, result.difficulty, result.seed)
     logged = flight._replace(**apply_log_faults(vehicle.effects, flight._asdict()))
     try:
@@ -206,8 +197,6 @@ def _write_log(
 
 def _refuse_other_logs(out: Path, trial_set: TrialSet) -> None:
     """Refuse a folder with logs of other commands: a diagnosis would mix them with these."""
-    from eval.logs.flight_log import logs_in
-
     names = {log_name(t.track, t.difficulty, t.seed) for t in trial_set.trials}
     if others := [log.name for log in logs_in(out) if log.name not in names]:
         raise ValueError(
@@ -224,8 +213,6 @@ def _existing_rows(out: Path, identity: dict[str, Any]) -> dict[TrialSpec, Row]:
     Raises:
         ValueError: if the list cannot be read, or is that of another collection.
     """
-    from eval.worlds.trial import TrialSpec
-
     path = out / LIST
     if not path.is_file():
         return {}

@@ -9,11 +9,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from eval.judging.outputs import action_report, notes_of
+from eval.judging.plans import VEHICLE, OverPlan, over_plan
+from eval.judging.results import Journal, write_results
+from eval.judging.tables import grids, markdown_table, summarise, with_interval
+from eval.quadrotor.vehicle_file import load_vehicle, vehicle_table
+from eval.sensors.sensors_file import SensorSet, sensors_table
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds.trial import TrialResult
+from policies.policy import Policy
 from suite.common.console import Console
 from suite.common.provenance import engines, refuse_other_run, write_run_record
 from suite.common.stages import announce
+from suite.judging.comparing import paired_sentence
 from suite.judging.flying import (
     Manner,
     default_policy,
@@ -33,15 +45,7 @@ from tracks.common.files import digest_of
 from tracks.common.grid import rich_table
 from tracks.common.provenance import stamp
 from tracks.common.work import Workers
-
-if TYPE_CHECKING:
-    from eval.judging.plans import OverPlan
-    from eval.judging.results import Journal
-    from eval.sensors.sensors_file import SensorSet
-    from eval.vehicles.vehicle import Vehicle
-    from eval.worlds.trial import TrialResult
-    from policies.policy import Policy
-    from tracks.track import Track
+from tracks.track import Track
 
 
 class Entry(NamedTuple):
@@ -73,10 +77,6 @@ def evaluate(
     Raises:
         ValueError: for invalid values in `evaluation`, before the first flight.
     """
-    from eval.judging.outputs import notes_of
-    from eval.judging.results import write_results
-    from eval.judging.tables import grids, markdown_table, summarise, with_interval
-
     # Read the options: trials, and entries.
     trial_set, out = read_trial_set(evaluation), Path(out)
     refuse_other_run(out, evaluation)
@@ -149,9 +149,6 @@ def _laps_over_plan(results: Sequence[TrialResult], trial_set: TrialSet) -> list
 
     The planned laps are shipped, for one vehicle and for families of tracks only.
     """
-    from eval.judging.plans import VEHICLE, over_plan
-    from eval.quadrotor.vehicle_file import load_vehicle, vehicle_table
-
     if vehicle_table(trial_set.vehicle) != vehicle_table(load_vehicle(VEHICLE)):
         return []
     return over_plan([row for row in results if row.track not in trial_set.tracks])
@@ -159,10 +156,6 @@ def _laps_over_plan(results: Sequence[TrialResult], trial_set: TrialSet) -> list
 
 def _sentences(results: Sequence[TrialResult]) -> list[str]:
     """Return a sentence for each policy but the first one, on its difference to the first one."""
-    import numpy as np
-
-    from suite.judging.comparing import paired_sentence
-
     successes: dict[str, dict[Any, bool]] = {}
     for row in results:
         successes.setdefault(row.policy, {})[row.trial] = row.success
@@ -176,8 +169,6 @@ def _sentences(results: Sequence[TrialResult]) -> list[str]:
 
 def _actions(entry: Entry, results: Sequence[TrialResult], console: Console) -> dict[str, Any]:
     """Print and return how many actions of an entry exceeded the limits, with warnings."""
-    from eval.judging.outputs import action_report
-
     rows = [result for result in results if result.policy == entry.label]
     actions = action_report(rows, entry.policy.spec.action)
     if actions["decisions"]:
@@ -197,9 +188,6 @@ def file_digests(
 
     It is computed from the values in a file, so comments do not change it.
     """
-    from eval.quadrotor.vehicle_file import vehicle_table
-    from eval.sensors.sensors_file import sensors_table
-
     contents: dict[str, object] = {"vehicle": vehicle_table(vehicle)}
     if sensors.models:
         contents["sensors"] = sensors_table(sensors)
@@ -225,8 +213,6 @@ def _open_journals(
     Raises:
         ValueError: if an existing journal has other settings; then no new journal is made.
     """
-    from eval.judging.results import Journal
-
     paths = [out / f"journal-{number}.jsonl" for number in range(len(entries))]
     journals = {}
     pairs = zip(paths, entries, strict=True)

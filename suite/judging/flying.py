@@ -12,18 +12,20 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from policies import shipped
+from policies.formats.checkpoint import CONFIG
+from policies.policy import Policy
 from policies.spec import PolicyError
 from suite.common.stages import Estimate
 from suite.judging.content import PolicyContent, policy_digest
+from suite.judging.requests import SimulatedFlights
+from suite.judging.trials import TrialSet
 from tracks.common.files import plain
 from tracks.common.work import Workers, usable_cores, worker_count
 
 if TYPE_CHECKING:
     from eval.judging.judge import OnResult, Record
     from eval.worlds.trial import TrialResult, TrialSpec
-    from policies.policy import Policy
-    from suite.judging.requests import SimulatedFlights
-    from suite.judging.trials import TrialSet
 
 TRIALS_A_PROCESS = 128
 """Smallest number of trials for another process: the start of a process takes seconds."""
@@ -92,8 +94,6 @@ def default_policy() -> str:
     Raises:
         ValueError: if no policy is shipped.
     """
-    from policies import shipped
-
     names = shipped.names()
     if not names:
         raise ValueError("no policy is shipped with this version; give one with --policy")
@@ -106,9 +106,6 @@ def checkpoint_folder(policy: str, option: str = "--policy") -> Path:
     Raises:
         ValueError: if the policy is not a checkpoint of the suite; the message names `option`.
     """
-    from policies import shipped
-    from policies.formats.checkpoint import CONFIG
-
     folder = shipped.locate(policy)
     if not (folder / CONFIG).is_file():
         names = ", ".join(shipped.names()) or "none"

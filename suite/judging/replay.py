@@ -12,6 +12,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from eval.judging.judge import Record
+from eval.logs.flight import Flight
+from eval.worlds.trial import TrialResult, TrialSpec, track_of
 from suite.common.console import Console
 from suite.judging.content import policy_digest
 from suite.judging.evaluate import file_digests
@@ -23,9 +26,7 @@ from tracks.input.ranges import check_ranges
 from tracks.input.reading import read_json
 
 if TYPE_CHECKING:
-    from eval.logs.flight import Flight
     from eval.view.recording import Drone, Rollout
-    from eval.worlds.trial import TrialResult, TrialSpec
 
 
 class Replay(NamedTuple):
@@ -101,9 +102,7 @@ def fly_again(
     Raises:
         ValueError: if the policy, vehicle, sensors or a track has changed.
     """
-    from eval.judging.judge import Record
     from eval.view.recording import Drone
-    from eval.worlds.trial import track_of
 
     # Read the inputs as the evaluation did.
     trial_set = read_trial_set(evaluation)

@@ -14,7 +14,9 @@ from typing import Any
 from policies import shipped
 from policies.formats.c.arrays import multiply_adds
 from policies.formats.c.source import memory_bytes
+from policies.formats.export import check_formats, export_policy, exported_checkpoint, file_names
 from policies.formats.policy_file import PolicyCheckpoint
+from policies.native import native_policy
 from suite.common.console import Console
 from suite.judging.content import policy_digest
 from suite.judging.deploy.parity import Parity, observed_flights, parity
@@ -41,14 +43,6 @@ def export(
         ValueError: if the policy is not the suite's, a format or type is unknown, or an export of
             another policy would be overwritten.
     """
-    from policies.formats.export import (
-        check_formats,
-        export_policy,
-        exported_checkpoint,
-        file_names,
-    )
-    from policies.native import native_policy
-
     check_formats(formats, dtype)
     if "c" in formats:
         check_no_input(out / CARD, [shipped.locate(policy) / CARD])

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from eval.judging.monitor import Monitored
-from eval.worlds.trial import Rules
+from eval.worlds.trial import Rules, track_of
 from policies.block_policy import BlockPolicy, for_one_row
 from policies.policy import Policy
 from suite.common.console import Console
@@ -143,8 +143,6 @@ def _fly_real_vehicle(
     key: bytes | None,
 ) -> dict[str, Any]:
     """Fly one flight with the vehicle at `address`, and return its results for fly.json."""
-    from eval.worlds.trial import track_of
-
     if len(trial_set.trials) != 1:
         raise ValueError(
             f"--link flies one flight, and these options give {len(trial_set.trials)}; give one "

@@ -100,7 +100,7 @@ def test_a_simulator_that_differs_from_the_vehicle_file_writes_the_file_that_des
     for name, values in described.effects.items():
         np.testing.assert_array_equal(np.hstack(values), np.hstack(flown.effects[name]), name)
     beyond = with_effects(flown, rotor_drag=(1.0,))
-    monkeypatch.setattr("eval.worlds.nearest", lambda *_: beyond)
+    monkeypatch.setattr("suite.judging.collect.nearest", lambda *_: beyond)
     assert run(*line, "--policy", pilots["diver"], "--out", tmp_path / "beyond") == 0
     assert "no vehicle file describes these flights: effects.rotor_drag" in capfd.readouterr().err
 
@@ -149,7 +149,7 @@ def test_a_flight_whose_log_is_refused_does_not_stop_the_others(
             log.rate_b[4, 0] = 300.0
         return log
 
-    monkeypatch.setattr(eval.logs.flight_log, "log_from_flight", broken)
+    monkeypatch.setattr("suite.judging.collect.log_from_flight", broken)
     assert run(TWO, "--policy", pilots["pursuit"], "--out", tmp_path) == 0
     flights = json.loads((tmp_path / "flights.json").read_text())["flights"]
     assert [row["file"] for row in flights] == [None, "zigzag-0-8.parquet"]
