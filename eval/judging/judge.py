@@ -237,7 +237,6 @@ class _Slots:
         self._decision = np.zeros(slots)
         self._action_b = np.tile(self._first, (slots, 1))
         self._outputs = Outputs(slots, action)
-        self._faults = np.zeros((slots, 3), int)
         self._late = np.zeros(slots, bool)
         self._fresh = np.ones(slots, bool)
         self._hidden = policy.start(slots)
@@ -285,7 +284,7 @@ class _Slots:
                 break
             self._index[slot], trial = waiting.pop()
             self._trial[slot] = trial
-            self._decision[slot], self._action_b[slot], self._faults[slot] = 0, self._first, 0
+            self._decision[slot], self._action_b[slot] = 0, self._first
             self._outputs.start(slot)
             self._fresh[slot], self._late[slot] = True, False
             if self._recorder:
@@ -320,7 +319,6 @@ class _Slots:
         )  # fmt: skip
         self._action_b = guarded.action_b
         self._outputs.add(guarded, state)
-        self._faults += np.stack([guarded.bad, guarded.limited, guarded.late], axis=-1)
         self._late = guarded.late
         flying = flying & ~guarded.late
         self._fresh[:] = False
@@ -365,7 +363,6 @@ class _Slots:
         assert trial is not None
         columns = result_columns(self._world.progress, slot, self._world.dt)
         is_collision = columns["ended_by"] == "collision"
-        bad, limited, late = map(int, self._faults[slot])
         return TrialResult(
             *trial,
             **columns,
@@ -373,8 +370,5 @@ class _Slots:
             vehicle=task.vehicle.name,
             world=self._world.name,
             collided_with=self._world.collided_with(slot) if is_collision else None,
-            bad_actions=bad,
-            limited_actions=limited,
-            late_actions=late,
             **self._outputs.columns(slot),
         )

@@ -66,15 +66,18 @@ class Outputs:
         self._is_acceleration = action.kind == "acceleration"
         self._count = np.zeros(slots, int)
         self._largest, self._up = np.zeros(slots), np.zeros(slots)
+        self._faults = np.zeros((slots, 3), int)
 
     def start(self, slot: int) -> None:
         """Reset the statistics of `slot`, a place in the simulator, for a new trial."""
         self._count[slot], self._largest[slot], self._up[slot] = 0, 0.0, 0.0
+        self._faults[slot] = 0
 
     def add(self, guarded: Guarded, state: np.ndarray) -> None:
         """Add one output of every slot, with its state observation (N, spec.state_size)."""
         self._count += ~guarded.late
         self._largest = np.fmax(self._largest, guarded.largest)
+        self._faults += np.stack([guarded.bad, guarded.limited, guarded.late], axis=-1)
         if self._is_acceleration:
             climbs = (state[:, UP_B] * state[:, VEL_B]).sum(-1) > 0.0
             self._up += climbs * (state[:, UP_B] * guarded.action_b).sum(-1)
@@ -83,7 +86,10 @@ class Outputs:
         """Return the fields of `TrialResult` for the outputs in `slot`."""
         count = int(self._count[slot])
         up = float(self._up[slot]) / count if count and self._is_acceleration else 0.0
-        return {"decisions": count, "output_max": float(self._largest[slot]), "action_up": up}
+        bad, limited, late = map(int, self._faults[slot])
+        faults = {"bad_actions": bad, "limited_actions": limited, "late_actions": late}
+        largest = float(self._largest[slot])
+        return {"decisions": count, "output_max": largest, "action_up": up, **faults}
 
 
 def action_report(

@@ -71,7 +71,7 @@ def fly_trial(
         sensors.start(0, trial)
     limits = limits_of(limits, spec.action, vehicle)
     action_b = first_action(spec.action, vehicle)[None]
-    outputs, bad_count, limited_count, late_count, decisions = Outputs(1, spec.action), 0, 0, 0, 0
+    outputs, decisions = Outputs(1, spec.action), 0
     passed = passed_8s = passed_035 = 0
     speeds: list[float] = []
     before_w = data.qpos[:3].copy()
@@ -126,11 +126,9 @@ def fly_trial(
             )
             action_b = guarded.action_b[:1]
             outputs.add(Guarded(*(part[:1] for part in guarded)), state.astype(np.float32))
-            bad_count += int(guarded.bad[0])
-            limited_count += int(guarded.limited[0])
             decisions += 1
             if guarded.late[0]:
-                ended_by, late_count = "timeout", 1
+                ended_by = "timeout"
                 break
 
         # Fly one step.
@@ -166,9 +164,6 @@ def fly_trial(
         v_mean=sum(speeds) / max(len(speeds), 1),
         gates_8s=passed_8s,
         gates_035=passed_035,
-        bad_actions=bad_count,
-        limited_actions=limited_count,
-        late_actions=late_count,
         **outputs.columns(0),
     )
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
 from suite.commands.tracks import family_text
 from suite.common.console import Console
-from suite.common.options import Command
+from suite.common.options import Command, settings
 from suite.common.usage import first_paragraph
 from tracks.common.names import unknown_name
 
@@ -40,10 +40,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         ValueError: for an unknown kind or recipe.
     """
     if config.kind == "settings":
-        recipe = _module("suite.train.recipes").named_recipe(config.recipe)
-        return {"settings": list_settings(recipe, console)}
+        from suite.train.recipes import named_recipe
+
+        return {"settings": list_settings(named_recipe(config.recipe), console)}
     if not config.kind:
-        all_names = {name: sorted(kind.names()) for name, kind in KINDS.items()}
+        all_names = {kind: sorted(_entries(kind)) for kind in KINDS}
         width = max(map(len, all_names))
         for kind_name, names in all_names.items():
             console.say(f"{kind_name:<{width}}  {', '.join(names)}")
@@ -51,8 +52,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         return all_names
     if config.kind not in KINDS:
         raise unknown_name("kind", config.kind, [*KINDS, "settings"])
-    kind = KINDS[config.kind]
-    descriptions = {name: kind.describe(name) for name in kind.names()}
+    descriptions = {name: _line(config.kind, name) for name in _entries(config.kind)}
     width = max(map(len, descriptions))
     for name, text in descriptions.items():
         console.say(f"{name:<{width}}  {text}")
@@ -64,8 +64,6 @@ def list_settings(config: TrainConfig, console: Console) -> list[dict[str, Any]]
 
     The values are those before the phases.
     """
-    from suite.common.options import settings
-
     all_settings = [setting for setting in settings(config) if setting.path != "phases"]
     for setting in all_settings:
         allowed = f", allowed {setting.allowed}" if setting.allowed else ""
@@ -73,66 +71,58 @@ def list_settings(config: TrainConfig, console: Console) -> list[dict[str, Any]]
     return [setting._asdict() for setting in all_settings]
 
 
-class Kind(NamedTuple):
-    """A kind of names. Packages that only the descriptions need are not loaded for the names."""
-
-    names: Callable[[], Iterable[str]]
-    """Function that returns all names."""
-    describe: Callable[[str], str]
-    """Function that returns a line about a name."""
+def _entries(kind: str) -> Any:
+    """Return the table of the entries of a kind, or the list of their names."""
+    module, attribute, _ = KINDS[kind]
+    found = getattr(importlib.import_module(module), attribute)
+    return found() if callable(found) else found
 
 
-def _module(name: str) -> Any:
-    """Return a module, imported at the first list that needs it."""
-    return importlib.import_module(name)
+def _line(kind: str, name: str) -> str:
+    """Return a line about an entry of a kind."""
+    if describe := KINDS[kind][2]:
+        return describe(name)
+    entry = _entries(kind)[name]
+    if isinstance(entry, str):
+        return entry
+    return getattr(entry, "summary", "") or first_paragraph(entry.__doc__)
 
 
 def _vehicle(name: str) -> str:
     """Return a line about a shipped vehicle."""
-    vehicle = _module("eval.quadrotor.vehicle_file").load_vehicle(name)
+    from eval.quadrotor.vehicle_file import load_vehicle
+
+    vehicle = load_vehicle(name)
     effects = ", ".join(vehicle.effects) or "no effects"
     return f"{vehicle.mass:g} kg, controller {vehicle.controller.kind}; {effects}"
 
 
 def _policy(name: str) -> str:
     """Return a line about a shipped policy."""
-    spec = _module("policies.policy").load_policy(name).spec
+    from policies.policy import load_policy
+
+    spec = load_policy(name).spec
     return f"{spec.action.kind}, {spec.rate_hz:g} Hz, {spec.state_size} state inputs and depth"
-
-
-def _recipe(name: str) -> str:
-    """Return a line about a recipe of `suite train`."""
-    return first_paragraph(_module("suite.train.recipes").RECIPES[name].__doc__)
 
 
 def _sensors(name: str) -> str:
     """Return the sensor models of a shipped sensors file."""
-    return ", ".join(_module("eval.sensors.sensors_file").load_sensors(name).models) or "no errors"
+    from eval.sensors.sensors_file import load_sensors
+
+    return ", ".join(load_sensors(name).models) or "no errors"
 
 
-def _simulator(name: str) -> str:
-    """Return a line about a simulator."""
-    return first_paragraph(_module("eval.worlds").WORLDS.find(name).__doc__)
-
-
-KINDS: dict[str, Kind] = {
-    "tracks": Kind(lambda: _module("tracks.families").FAMILIES, family_text),
-    "vehicles": Kind(lambda: _module("eval.quadrotor.vehicle_file").shipped_vehicles(), _vehicle),
-    "policies": Kind(lambda: _module("policies.shipped").names(), _policy),
-    "recipes": Kind(lambda: _module("suite.train.recipes").RECIPES, _recipe),
-    "effects": Kind(
-        lambda: _module("eval.effects").EFFECTS,
-        lambda name: _module("eval.effects").EFFECTS[name].summary,
-    ),
-    "sensors": Kind(lambda: _module("eval.sensors.sensors_file").shipped_sensors(), _sensors),
-    "sensor-models": Kind(
-        lambda: _module("eval.sensors").SENSORS,
-        lambda name: _module("eval.sensors").SENSORS[name].summary,
-    ),
-    "simulators": Kind(lambda: _module("eval.worlds").WORLDS, _simulator),
-    "benchmarks": Kind(
-        lambda: _module("suite.experiments.bench").BENCHES,
-        lambda name: _module("suite.experiments.bench").BENCHES[name],
-    ),
+KINDS: dict[str, tuple[str, str, Callable[[str], str] | None]] = {
+    "tracks": ("tracks.families", "FAMILIES", family_text),
+    "vehicles": ("eval.quadrotor.vehicle_file", "shipped_vehicles", _vehicle),
+    "policies": ("policies.shipped", "names", _policy),
+    "recipes": ("suite.train.recipes", "RECIPES", None),
+    "effects": ("eval.effects", "EFFECTS", None),
+    "sensors": ("eval.sensors.sensors_file", "shipped_sensors", _sensors),
+    "sensor-models": ("eval.sensors", "SENSORS", None),
+    "simulators": ("eval.worlds", "WORLDS", None),
+    "benchmarks": ("suite.experiments.bench", "BENCHES", None),
 }
-"""Name of each kind -> its names and their descriptions."""
+"""Kind -> module, its table (or function) of the names, and a function (name) -> a line about it.
+Without this function the line is the entry's summary. A module is imported when its names are
+listed."""

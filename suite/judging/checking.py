@@ -56,9 +56,10 @@ def check_policy(
     policy = load_policy(name, trust)
     findings = policy_findings(policy, trials, console)
     for finding in findings:
-        console.say(f"{finding['status']}: {finding['evidence']}; {finding['fix']}")
+        console.say(f"{finding.status}: {finding.evidence}; {finding.fix}")
     contract = contract_of(policy.spec).to_json()
-    return policy, {"policy": policy.name, "contract": contract, "findings": findings}
+    records = [finding._asdict() for finding in findings]
+    return policy, {"policy": policy.name, "contract": contract, "findings": records}
 
 
 def check_flight_files(
@@ -135,21 +136,21 @@ def _check_outputs(files: Sequence[Path], out: Path) -> None:
         names[file.name] = file
 
 
-def policy_findings(policy: Policy, trials: int, console: Console) -> list[dict[str, Any]]:
-    """Return the findings about a policy's interface, as records of `suite check`.
+def policy_findings(policy: Policy, trials: int, console: Console) -> list[Finding]:
+    """Return the findings about a policy's interface.
 
     The policy shows its actions in short flights, `trials` of them, perhaps none.
     """
     console.say(f"{policy.name}: {summary(contract_of(policy.spec))}")
     of_file = getattr(policy, "notes", ())
     findings = [
-        _record("contract" if note in of_file else note.fault.split("_")[0], *note)
+        _finding("contract" if note in of_file else note.fault.split("_")[0], note)
         for note in notes_of(policy)
     ]
-    known = {record["fault"] for record in findings}
+    known = {finding.fault for finding in findings}
     warnings, hints = _warnings_in_flight(policy, trials, console, known)
-    findings += [_record("action", *warning) for warning in warnings]
-    return findings + [_record("memory", *hint) | {"status": "note"} for hint in hints]
+    findings += [_finding("action", warning) for warning in warnings]
+    return findings + [_finding("memory", hint, "note") for hint in hints]
 
 
 def _warnings_in_flight(
@@ -184,7 +185,6 @@ def _warnings_in_flight(
     return warnings, watched.hints()
 
 
-def _record(signal: str, fault: str, evidence: str, fix: str) -> dict[str, Any]:
-    """Return a finding about a policy, with the keys of a finding about a flight."""
-    return {"fault": fault, "signal": signal, "size": None, "evidence": evidence,
-            "confidence": None, "status": "doubt", "fix": fix}  # fmt: skip
+def _finding(signal: str, note: Note, status: str = "doubt") -> Finding:
+    """Return a note about a policy as a finding."""
+    return Finding(status, signal, note.evidence, note.fault, fix=note.fix)

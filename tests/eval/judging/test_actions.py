@@ -226,8 +226,8 @@ def test_short_flights_show_negated_axes_saturation_and_a_constant_memory(capsys
         "action_saturated": lambda a: 15 * np.sign(a),
     }
     for fault, change in changes.items():
-        records = policy_findings(Changed(change), 3, Console())
-        found = [(record["fault"], record["status"]) for record in records]
+        findings = policy_findings(Changed(change), 3, Console())
+        found = [(finding.fault, finding.status) for finding in findings]
         assert found == [(fault, "doubt")] * bool(fault) + [("memory_constant", "note")], fault
         assert "3 flights of 5 s at level 0 it passed" in capsys.readouterr().out
     assert not Watched(Steady()).hints()  # it has made no decision
