@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -21,8 +20,8 @@ from suite.diagnose.identify.numbers import DELAY, Number
 
 Formula = Callable[[Mapping[str, float]], ArrayLike]
 """Function from fitted numbers by name to the value of an entry, or to its values (V,)."""
-INERTIAS = ("inertia_x", "inertia_y", "inertia_z")
-"""Names of the fitted numbers of the inertia."""
+INERTIAS, DRAGS, GAINS = ([f"{name}_{a}" for a in "xyz"] for name in ("inertia", "drag", "gain"))
+"""Names of fitted numbers by axis."""
 EFFECTS_TABLE = "effects."
 """Prefix of the key of an effect's parameter."""
 
@@ -32,86 +31,54 @@ def entries_of(driven: DrivenVehicle, fitted: Fitted, log_thrust: float = 0.0) -
 
     `log_thrust` is the logarithm of the scale of the thrust, from the force fit.
     """
+    # Flights show the ratio of torque to inertia about z. The uncertainty of the inertia counts if
+    # the inertia is identified; otherwise the inertia is held fixed.
+    identified = [name for name in INERTIAS if fitted.identifies(name)]
+    gain = np.asarray(driven.start.controller.rate_gain)
+
+    def twist(n: Mapping[str, float]) -> float:
+        numbers = {name: n[name] for name in (*identified, "yaw")}
+        return driven.vehicle({**numbers, "thrust": log_thrust}).rotors.torque_coefficient
+
+    # Key, unit, the fitted number that must be identified for each value, and the formula if it is
+    # not that of the driven vehicle.
+    thrust = {
+        "pwm": [
+            ("motors.thrust", "N", ("thrust", "thrust")),
+            ("motors.voltage_exponent", "1", ("battery",)),
+        ],
+        "rotors": [("rotors.thrust_coefficient", "N/(rad/s)^2", ("thrust",))],
+    }.get(driven.drive, [("effects.thrust_scale.scale", "1", ("thrust",))])
+    rows = {
+        "thrust": thrust,
+        "drag_z": [("effects.linear_drag.coefficient", "1/s", DRAGS)],
+        "inertia_x": [
+            ("inertia", "kg m^2", INERTIAS, lambda n: possible_inertia(driven.vehicle(n).inertia))
+        ],
+        "yaw": [("rotors.torque_coefficient", "N m/(rad/s)^2", ("yaw",), twist)],
+        "late": [
+            ("rotors.time_constant", "s", ("lag",), lambda n: n["lag"]),
+            # `late` is the sum of lag and delay. The delay in the file keeps the sum.
+            (DELAY, "s", ("late",), lambda n: n["late"] - n["lag"]),
+        ],
+        "gain_x": [
+            ("controller.rate_gain", "1/s", GAINS, lambda n: gain * np.exp([n[g] for g in GAINS]))
+        ],
+    }
     names = [name for name in fitted.names if name not in fitted.known]
-    entries, entry = list[Number](), partial(_entry, fitted)
-    # Thrust and drag.
-    if "thrust" in names and driven.drive == "pwm":
-        entries = [
-            entry("motors.thrust", "N", lambda n: driven.motor_map(n).thrust, 2 * ["thrust"]),
-            entry(
-                "motors.voltage_exponent",
-                "1",
-                lambda n: driven.motor_map(n).voltage_exponent,
-                ["battery"],
-            ),
-        ]
-    elif "thrust" in names and driven.drive == "rotors":
-        one = entry(
-            "rotors.thrust_coefficient",
-            "N/(rad/s)^2",
-            lambda n: driven.vehicle(n).rotors.thrust_coefficient,
-            ["thrust"],
-        )
-        entries.append(one)
-    elif "thrust" in names:
-        scale = entry("effects.thrust_scale.scale", "1", lambda n: np.exp(n["thrust"]), ["thrust"])
-        entries.append(scale)
-    if "drag_z" in names:
-        drag = entry(
-            "effects.linear_drag.coefficient",
-            "1/s",
-            lambda n: driven.vehicle(n).effects["linear_drag"].coefficient,
-            [f"drag_{axis}" for axis in "xyz"],
-        )
-        entries.append(drag)
-    # Inertia and yaw torque.
-    if "inertia_x" in names:
-        inertia = entry(
-            "inertia", "kg m^2", lambda n: possible_inertia(driven.vehicle(n).inertia), INERTIAS
-        )
-        entries.append(inertia)
-    if "yaw" in names:
-        # Flights show the ratio of torque to inertia about z. The uncertainty of the inertia counts
-        # if the inertia is identified; otherwise the inertia is held fixed.
-        identified = [name for name in INERTIAS if fitted.identifies(name)]
-
-        def twist(n: Mapping[str, float]) -> float:
-            numbers = {name: n[name] for name in (*identified, "yaw")}
-            return driven.vehicle({**numbers, "thrust": log_thrust}).rotors.torque_coefficient
-
-        entries.append(entry("rotors.torque_coefficient", "N m/(rad/s)^2", twist, ["yaw"]))
-    # Lag, delay and gains of the rate loop.
-    if "late" in names:
-        entries.append(entry("rotors.time_constant", "s", lambda n: n["lag"], ["lag"]))
-        # `late` is the sum of lag and delay. The delay is at least as uncertain as the lag, however
-        # exact the sum is. The delay in the file keeps the sum.
-        widest = fitted.unknowns[fitted.index("late")].max_half_width
-        entries.append(entry(DELAY, "s", lambda n: n["late"] - n["lag"], ["late"], widest))
-    if "gain_x" in names:
-        start, needs = np.asarray(driven.start.controller.rate_gain), [f"gain_{a}" for a in "xyz"]
-        gains = entry(
-            "controller.rate_gain",
-            "1/s",
-            lambda n: start * np.exp([n[name] for name in needs]),
-            needs,
-        )
-        entries.append(gains)
-    return entries
+    return [_entry(driven, fitted, *row) for name in rows if name in names for row in rows[name]]
 
 
 def _entry(
+    driven: DrivenVehicle,
     fitted: Fitted,
     key: str,
     unit: str,
-    formula: Formula,
     needs: Sequence[str],
-    widest: float = np.inf,
+    formula: Formula | None = None,
 ) -> Number:
-    """Return an entry whose intervals follow from the fit's covariance.
-
-    `needs` names for each value the fitted number that must be identified. An identified value
-    whose 95 % interval has a half-width above `widest` `follows` (see `Number`).
-    """
+    """Return an entry whose intervals follow from the fit's covariance."""
+    formula = formula or (lambda n: _value(driven.vehicle(n), key))
     values = np.atleast_1d(formula(fitted.values()))
     # Finite differences of the formula turn the covariance of the fit into that of the values.
     slopes = np.zeros((len(values), len(fitted.unknowns)))
@@ -123,6 +90,8 @@ def _entry(
         slopes[:, k] = change / (2.0 * unknown.step)
     variance = np.einsum("vi,ij,vj->v", slopes, fitted.covariance, slopes)
     half = Z95 * np.sqrt(np.maximum(variance, 0.0))
+    # The delay is at least as uncertain as the lag, however exact their sum is.
+    widest = fitted.unknowns[fitted.index("late")].max_half_width if key == DELAY else np.inf
     known = [fitted.identifies(name) for name in needs]
     spans = [
         (float(v - h), float(v + h)) if is_known and h <= widest else None
@@ -130,6 +99,14 @@ def _entry(
     ]
     follows = any(one and span is None for one, span in zip(known, spans, strict=True))
     return Number(key, unit, values.tolist(), spans, follows)
+
+
+def _value(vehicle: Vehicle, key: str) -> Any:
+    """Return the value of an entry of a vehicle file."""
+    table, _, name = key.removeprefix(EFFECTS_TABLE).rpartition(".")
+    if key.startswith(EFFECTS_TABLE):
+        return getattr(vehicle.effects[table], name)
+    return getattr(getattr(vehicle, table), name)
 
 
 def with_entries(
