@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,12 +18,22 @@ from suite.diagnose.identify.drive import DrivenVehicle, possible_inertia
 from suite.diagnose.identify.fit import Z95, Fitted
 from suite.diagnose.identify.numbers import DELAY, Number
 
-Formula = Callable[[Mapping[str, float]], ArrayLike]
-"""Function from fitted numbers by name to the value of an entry, or to its values (V,)."""
 INERTIAS, DRAGS, GAINS = ([f"{name}_{a}" for a in "xyz"] for name in ("inertia", "drag", "gain"))
 """Names of fitted numbers by axis."""
 EFFECTS_TABLE = "effects."
 """Prefix of the key of an effect's parameter."""
+
+
+class Row(NamedTuple):
+    """How an entry of a vehicle file follows from fitted numbers."""
+
+    key: str
+    unit: str
+    needs: Sequence[str]
+    """The fitted number that must be identified, for each value of the entry."""
+    formula: Callable[[Mapping[str, float]], ArrayLike] | None = None
+    """Function from fitted numbers by name to the value, or the values (V,); None: that of the
+    driven vehicle."""
 
 
 def entries_of(driven: DrivenVehicle, fitted: Fitted, log_thrust: float = 0.0) -> list[Number]:
@@ -40,45 +50,43 @@ def entries_of(driven: DrivenVehicle, fitted: Fitted, log_thrust: float = 0.0) -
         numbers = {name: n[name] for name in (*identified, "yaw")}
         return driven.vehicle({**numbers, "thrust": log_thrust}).rotors.torque_coefficient
 
-    # Key, unit, the fitted number that must be identified for each value, and the formula if it is
-    # not that of the driven vehicle.
     thrust = {
         "pwm": [
-            ("motors.thrust", "N", ("thrust", "thrust")),
-            ("motors.voltage_exponent", "1", ("battery",)),
+            Row("motors.thrust", "N", ("thrust", "thrust")),
+            Row("motors.voltage_exponent", "1", ("battery",)),
         ],
-        "rotors": [("rotors.thrust_coefficient", "N/(rad/s)^2", ("thrust",))],
-    }.get(driven.drive, [("effects.thrust_scale.scale", "1", ("thrust",))])
+        "rotors": [Row("rotors.thrust_coefficient", "N/(rad/s)^2", ("thrust",))],
+    }.get(driven.drive, [Row("effects.thrust_scale.scale", "1", ("thrust",))])
     rows = {
         "thrust": thrust,
-        "drag_z": [("effects.linear_drag.coefficient", "1/s", DRAGS)],
+        "drag_z": [Row("effects.linear_drag.coefficient", "1/s", DRAGS)],
         "inertia_x": [
-            ("inertia", "kg m^2", INERTIAS, lambda n: possible_inertia(driven.vehicle(n).inertia))
+            Row(
+                "inertia", "kg m^2", INERTIAS, lambda n: possible_inertia(driven.vehicle(n).inertia)
+            )
         ],
-        "yaw": [("rotors.torque_coefficient", "N m/(rad/s)^2", ("yaw",), twist)],
+        "yaw": [Row("rotors.torque_coefficient", "N m/(rad/s)^2", ("yaw",), twist)],
         "late": [
-            ("rotors.time_constant", "s", ("lag",), lambda n: n["lag"]),
+            Row("rotors.time_constant", "s", ("lag",), lambda n: n["lag"]),
             # `late` is the sum of lag and delay. The delay in the file keeps the sum.
-            (DELAY, "s", ("late",), lambda n: n["late"] - n["lag"]),
+            Row(DELAY, "s", ("late",), lambda n: n["late"] - n["lag"]),
         ],
         "gain_x": [
-            ("controller.rate_gain", "1/s", GAINS, lambda n: gain * np.exp([n[g] for g in GAINS]))
+            Row(
+                "controller.rate_gain",
+                "1/s",
+                GAINS,
+                lambda n: gain * np.exp([n[g] for g in GAINS]),
+            )
         ],
     }
     names = [name for name in fitted.names if name not in fitted.known]
-    return [_entry(driven, fitted, *row) for name in rows if name in names for row in rows[name]]
+    return [_entry(driven, fitted, row) for name in rows if name in names for row in rows[name]]
 
 
-def _entry(
-    driven: DrivenVehicle,
-    fitted: Fitted,
-    key: str,
-    unit: str,
-    needs: Sequence[str],
-    formula: Formula | None = None,
-) -> Number:
+def _entry(driven: DrivenVehicle, fitted: Fitted, row: Row) -> Number:
     """Return an entry whose intervals follow from the fit's covariance."""
-    formula = formula or (lambda n: _value(driven.vehicle(n), key))
+    formula = row.formula or (lambda n: _value(driven.vehicle(n), row.key))
     values = np.atleast_1d(formula(fitted.values()))
     # Finite differences of the formula turn the covariance of the fit into that of the values.
     slopes = np.zeros((len(values), len(fitted.unknowns)))
@@ -91,14 +99,14 @@ def _entry(
     variance = np.einsum("vi,ij,vj->v", slopes, fitted.covariance, slopes)
     half = Z95 * np.sqrt(np.maximum(variance, 0.0))
     # The delay is at least as uncertain as the lag, however exact their sum is.
-    widest = fitted.unknowns[fitted.index("late")].max_half_width if key == DELAY else np.inf
-    known = [fitted.identifies(name) for name in needs]
+    widest = fitted.unknowns[fitted.index("late")].max_half_width if row.key == DELAY else np.inf
+    known = [fitted.identifies(name) for name in row.needs]
     spans = [
         (float(v - h), float(v + h)) if is_known and h <= widest else None
         for v, h, is_known in zip(values, half, known, strict=True)
     ]
     follows = any(one and span is None for one, span in zip(known, spans, strict=True))
-    return Number(key, unit, values.tolist(), spans, follows)
+    return Number(row.key, row.unit, values.tolist(), spans, follows)
 
 
 def _value(vehicle: Vehicle, key: str) -> Any:
