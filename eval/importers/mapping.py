@@ -7,6 +7,7 @@ readers of tables and of Crazyflie logs use it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from eval.importers.options import ImportOptions
 from eval.importers.rows import continuous, measured, turn_axes
 from eval.importers.signals import Recording, Signal, collect, make_signal
 from eval.logs.columns import ESTIMATE, GROUPS, FlightLogError
+from eval.logs.faults.drive.commands import is_share
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.pose import BAD, CALM_RATE, TIMES_BETTER, WIDTH_S, turns_of
 from eval.logs.faults.relation import match, rms, smooth
@@ -77,6 +79,10 @@ def recording_of(
             text = f"{signal} is of the {column.source}; there is none of the {options.source}"
             findings.append(Finding("note", "file", text))
         used_columns[signal], parts[signal] = column, _in_log_unit(part, column, name)
+        if signal in ("throttle", "pwm") and not is_share(parts[signal][1], 0.9):
+            # The mapping's unit is wrong: `check_throttle` finds it by the values of the file.
+            column = replace(column, factor=tuple(float(np.sign(f)) for f in column.factor))
+            parts[signal] = _in_log_unit(part, column, name)
     parts.pop("time", None)
     # Angles become quaternions, unless the file has quaternions too.
     euler: dict[str, Part] = {}

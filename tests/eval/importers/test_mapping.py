@@ -277,6 +277,22 @@ def test_a_mapped_table_equals_the_flight(tmp_path, kind):
     np.testing.assert_allclose(np.abs(np.sum(log.quat_wxyz * truth.quat, 1)), 1.0, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("unit", "span", "words"),
+    [("%", 65535.0, "0 to 65535"), ("%", 1000.0, "0 to 1000"), ("65535", 100.0, "percent")],
+)
+def test_a_throttle_in_another_unit_than_the_mapping_says_is_corrected(tmp_path, unit, span, words):
+    truth, columns = _table()
+    columns["thr"] = truth.thrust / 30.0 * span
+    path, mapping = tmp_path / "log.csv", tmp_path / "map.toml"
+    pa_csv.write_csv(pa.table(columns), path)
+    mapping.write_text(EVERYTHING.replace('"thr", unit = "%"', f'"thr", unit = "{unit}"'))
+    log, findings = import_log(path, None, ImportOptions(map=mapping, full_thrust=30.0))
+    (found,) = (f for f in findings if f.fault == "throttle_range")
+    assert found.status == "corrected" and f"goes from {words}," in found.evidence
+    np.testing.assert_allclose(log.thrust_cmd, truth.thrust, rtol=1e-6)
+
+
 def test_euler_angles_and_a_world_with_y_up(tmp_path):
     truth = _table()[0]
     rot = Rotation.from_euler("x", -90, degrees=True).as_matrix()  # z-up to y-up

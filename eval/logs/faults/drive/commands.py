@@ -64,17 +64,22 @@ RATE_OFF = 0.1
 """Largest relative error of a controller's rate."""
 
 
+def is_share(value: np.ndarray, quantile: float = 1.0) -> bool:
+    """Return whether a throttle or motor commands (T, C) may go from 0 to 1, by this quantile."""
+    known = value[np.isfinite(value).all(axis=1)].mean(axis=1)
+    top = float(np.quantile(known, quantile)) if len(known) else 0.0
+    return top <= 0.0 or LEAST_TOP <= top <= 1.5
+
+
 def check_throttle(rows: Rows) -> list[Finding]:
     """Return a finding for throttle and for motor commands whose range is not 0 to 1."""
     findings = []
     for name, subject in (("throttle", "throttle"), ("pwm", "motor commands")):
         value = rows.get(name)
-        if value is None or not np.isfinite(value).any():
+        if value is None or is_share(value):
             continue
         flying = value[np.isfinite(value).all(axis=1)].mean(axis=1)
         middle, top = float(np.median(flying)), float(np.max(flying))
-        if top <= 0.0 or LEAST_TOP <= top <= 1.5:
-            continue
         fits = [r for r in RANGES if r[2][0] <= middle <= r[2][1]]
         figures = f"half of its values are below {middle:.4g} and all below {top:.4g}"
         if top < LEAST_TOP:
