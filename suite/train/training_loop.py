@@ -137,6 +137,11 @@ def train_in_folder(
         if done < total:
             write_run_record(folder, run.config, run.config.seed, resumed=done > 0)
         state = _iterate(phases, run, state, console, watch)
+    else:
+        console.note(
+            f"{folder} holds this training, finished: nothing is trained; to train its policy "
+            f"further, give another --out with --init-from {folder / 'policy'}"
+        )
     # The outcome, from the last tenth of the curve.
     rows = curve.read(folder)
     if not rows:

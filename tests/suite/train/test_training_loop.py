@@ -61,7 +61,7 @@ def measured(folder):
     return [row["iteration"] for row in curve.read(folder, curve.WATCHED)]
 
 
-def test_the_outcome_is_of_the_last_tenth_and_the_policy_is_measured_on_the_way(tmp_path):
+def test_the_outcome_is_of_the_last_tenth_and_the_policy_is_measured_on_the_way(tmp_path, capfd):
     seen = []
     outcome = train(tmp_path, counting(20), seen=seen)
     assert outcome.iterations == 20 and outcome.policy == tmp_path / "policy"
@@ -70,8 +70,10 @@ def test_the_outcome_is_of_the_last_tenth_and_the_policy_is_measured_on_the_way(
     rows = curve.read(tmp_path)
     assert [row["loss"] for row in rows] == [100.0 - i for i in range(20)]
     assert [row["cold"] for row in rows] == [True] + [False] * 19
+    assert "nothing is trained" not in capfd.readouterr().err
     train(tmp_path, counting(20), seen=seen)
     assert len(seen) == 6, "a finished run is neither trained nor measured again"
+    assert "finished: nothing is trained" in capfd.readouterr().err
     (tmp_path / "metrics.jsonl").unlink()
     with pytest.raises(ValueError, match=r"without its curve, metrics\.jsonl: put that back, use"):
         train(tmp_path, counting(20))
