@@ -52,13 +52,24 @@ def differences(stored: Any, new: Any, name: str = "") -> list[str]:
     `stored` is of an earlier run ("there"), `new` of this one ("here"). The names of nested values
     are appended to `name`.
     """
-    if isinstance(stored, Mapping) and isinstance(new, Mapping):
+    there, here = _by_name(stored), _by_name(new)
+    if isinstance(there, Mapping) and isinstance(here, Mapping):
         changes = []
-        for key in dict.fromkeys([*new, *stored]):
+        for key in dict.fromkeys([*here, *there]):
             path = f"{name}.{key}" if name else str(key)
-            changes += differences(stored.get(key), new.get(key), path)
-        return changes
+            changes += differences(there.get(key), here.get(key), path)
+        if changes or isinstance(stored, Mapping):
+            return changes
     return [] if stored == new else [f"{name} is {shown(stored)} there, {shown(new)} here"]
+
+
+def _by_name(value: Any) -> Any:
+    """Return a list of records by their numbers, and one of changes "name=value" by their names."""
+    if isinstance(value, list) and all(isinstance(one, Mapping) for one in value):
+        return {number: one for number, one in enumerate(value, 1)}
+    if isinstance(value, list) and all(isinstance(one, str) and "=" in one for one in value):
+        return dict(one.split("=", 1) for one in value)
+    return value
 
 
 def first_changes(changes: Sequence[str]) -> str:

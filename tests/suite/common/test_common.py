@@ -26,7 +26,15 @@ from suite.common.errors import FAILED, UNUSABLE, WorkFailed, explain
 from suite.common.provenance import refuse_other_run, run_record, write_run_record
 from suite.common.report import Details, Links, Picture, Report, Section, html
 from suite.common.running.remote import Job
-from suite.common.stages import MARK, Estimate, Stage, announce, claim, run_stages
+from suite.common.stages import (
+    MARK,
+    Estimate,
+    Stage,
+    announce,
+    claim,
+    differences,
+    run_stages,
+)
 from suite.common.work import do_jobs, read_workers_option
 from suite.experiments.study.training import training_commit
 from suite.judging.requests import Collection, Evaluation
@@ -219,6 +227,13 @@ def test_a_folder_of_another_configuration_is_refused(tmp_path):
     (tmp_path / "run.json").write_text("{}")
     with pytest.raises(ValueError, match="not the record of a run"):
         claim(tmp_path, Settings(), 0)
+
+
+def test_differences_in_lists_are_named_by_number_and_setting():
+    there = {"phases": [{"share": 0.5, "set": []}, {"share": 0.5, "set": ["loss.jerk=1", "a=2"]}]}
+    here = {"phases": [there["phases"][0], {"share": 0.5, "set": ["loss.jerk=3", "a=2"]}]}
+    assert differences(there, here) == ["phases.2.set.loss.jerk is '1' there, '3' here"]
+    assert differences({"set": ["a=1", "a=2"]}, {"set": ["a=2"]}) and not differences(here, here)
 
 
 def test_an_estimate_is_said_in_figures_for_people_and_missing_memory_is_warned_of(capsys):
