@@ -22,7 +22,7 @@ from eval.worlds.trial import TrialResult, TrialSpec
 from policies.policy import Policy
 from suite.common.console import Console
 from suite.common.provenance import engines, refuse_other_run, write_run_record
-from suite.common.stages import announce
+from suite.common.stages import announce, differences, first_changes
 from suite.judging.flying import (
     Manner,
     default_policy,
@@ -218,17 +218,17 @@ def _existing_rows(out: Path, identity: dict[str, Any]) -> dict[TrialSpec, Row]:
         return {}
     try:
         listing = read_json(path)
-        is_same = without_paths({key: listing.get(key) for key in identity}) == identity
+        stored = without_paths({key: listing.get(key) for key in identity})
         rows = {
             TrialSpec(row["track"], row["difficulty"], row["seed"]): row
             for row in listing["flights"]
         }
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not a list of flights ({error}); move it away") from error
-    if not is_same:
+    if stored != identity:
         raise ValueError(
-            f"{path}: was written by another collection, another version of the code or of a "
-            "package, or on another processor; give another --out or move it away"
+            f"{path}: is of other flights ({first_changes(differences(stored, identity))}); give "
+            "another --out or move it away"
         )
     return {
         trial: row

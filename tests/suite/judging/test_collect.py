@@ -1,6 +1,7 @@
 """suite collect: logs that read back, and flights that are none."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -54,13 +55,14 @@ def test_flights_of_another_course_or_code_are_not_taken_for_its_own(
         assert run(*args) == 0
     with monkeypatch.context() as patch:
         patch.setattr(suite.judging.collect, "git_commit", lambda: "another")
-        assert "another version of the code" in refused(capfd, *args)
+        assert re.search("git_commit is '.*' there, 'another' here", refused(capfd, *args))
     with monkeypatch.context() as patch:
         patch.setattr(suite.judging.collect, "engines", lambda: {"numpy": "another"}, False)
-        assert "or of a package" in refused(capfd, *args)
-    for file, text in ((track, COURSE), (sensors, SENSORS)):
+        assert "engines.numpy is" in refused(capfd, *args)
+    assert "collection.seed is 100000 there, 5 here" in refused(capfd, *args, "--seed", 5)
+    for file, text, words in ((track, COURSE, "tracks."), (sensors, SENSORS, "sensors.")):
         file.write_text(text.replace("1.0", "1.1"))
-        assert "another collection" in refused(capfd, *args)
+        assert f"is of other flights ({words}" in refused(capfd, *args)
         file.write_text(text)
 
 
