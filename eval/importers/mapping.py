@@ -99,6 +99,8 @@ def recording_of(
     parts |= _estimates(mapping, used_columns, find, name)
     for column in mapping.keep:
         part = find((column,))
+        if part is None and not mapping.optional:
+            raise FlightLogError(name, column, None, missing(column))
         if part is not None:
             time_s, value = part
             width = value.shape[1]  # a column of lists becomes one column per number

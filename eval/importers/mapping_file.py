@@ -113,9 +113,9 @@ class LogMap:
     motor_side: tuple[tuple[float, float], ...] | None = None
     """Positions of the file's motors 1 to 4 (x forward, y left), in any unit; None: unknown."""
     optional: bool = False
-    """Whether missing signals are left out; otherwise they are an error."""
+    """Whether missing signals and columns are left out; otherwise they are an error."""
     keep: tuple[str, ...] = ()
-    """Columns that are kept unchanged, if present."""
+    """Columns that are kept unchanged."""
     text_file: str = ""
     """Name of a text file in the log's folder with lines `key: value`. In the name, {stem} stands
     for the log's name without its ending, and {number} for the digits in {stem}."""

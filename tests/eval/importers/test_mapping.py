@@ -323,11 +323,15 @@ def test_columns_that_are_not_there_are_refused_by_name(tmp_path):
     pa_csv.write_csv(pa.table(_table()[1]), path)
     for old, new, reason in (
         ('"p", "q", "r"', '"p", "q", "rr"', "log.csv.*column rr: missing; did you mean 'r'"),
+        ("\nframes", '\nkeep = ["thrr"]\nframes', "column thrr: missing; did you mean 'thr'"),
         ('time = {column = "stamp", unit = "ns"}', "", r"name it in the mapping's \[time\]"),
     ):
         mapping.write_text(EVERYTHING.replace(old, new))
         with pytest.raises(ValueError, match=reason):
             import_log(path, None, ImportOptions(map=mapping))
+    mapping.write_text('optional = "yes"\nkeep = ["thrr"]' + EVERYTHING)
+    log, _ = import_log(path, None, ImportOptions(map=mapping, full_thrust=30.0))
+    assert set(log.extra) == {"throttle"}
 
 
 def test_text_among_numbers_is_refused_with_its_row(tmp_path):
