@@ -78,7 +78,7 @@ POSE: tuple[Check, ...] = (
 )
 """Position, attitude, rates, velocity and acceleration; each check relies on those before it."""
 DRIVE: tuple[Check, ...] = (
-    lambda rows, _: check_voltage(rows),
+    lambda rows, against: check_voltage(rows, against.vehicle),
     lambda rows, against: check_gyro_signs(rows, against.vehicle),
     lambda rows, against: check_gyro_scale(rows, against.vehicle),
     lambda rows, against: check_motors(rows, against.vehicle),

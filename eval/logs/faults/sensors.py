@@ -11,9 +11,13 @@ from eval.logs.faults.pose import CALM_RATE, Rows, turns_of
 from eval.logs.faults.reading import option
 from eval.logs.faults.relation import forward_mean, rms, smooth
 from eval.logs.velocity import velocity_from_position
+from eval.vehicles.vehicle import Vehicle
 
 LEAST_V, MOST_V = 2.5, 70.0
 """Possible battery voltages, from one empty cell to sixteen full cells [V]."""
+NOMINAL = 1.5
+"""A battery's median voltage is within this factor of its nominal one: full and loaded empty cells
+are within 1.2 and 1.3."""
 SUNK_M = 0.5
 """Least fall of the height as the motors start [m]."""
 SPAN_S = 0.6
@@ -39,14 +43,23 @@ def check_voltage_fails(value: np.ndarray) -> bool:
     return not len(known) or not LEAST_V <= float(np.median(known)) <= MOST_V
 
 
-def check_voltage(rows: Rows) -> list[Finding]:
-    """Return a finding on whether the battery's voltage is possible, and on its unit."""
+def check_voltage(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding]:
+    """Return a finding on whether the battery's voltage is possible, and on its unit.
+
+    The voltage must be near the nominal one of `vehicle`, if its motors depend on the voltage.
+    """
     value = rows.get("voltage")
     if value is None or not np.isfinite(value).any():
         return []
     middle = float(np.nanmedian(value))
     if LEAST_V <= middle <= MOST_V:
-        return [Finding("ok", "voltage", f"{middle:.3g} V")]
+        motors = None if vehicle is None else vehicle.motors
+        ratio = middle / motors.voltage if motors and motors.voltage_exponent else 1.0
+        if 1.0 / NOMINAL < ratio < NOMINAL:
+            return [Finding("ok", "voltage", f"{middle:.3g} V")]
+        text = f"{middle:.3g} V is {ratio:.3g} times motors.voltage of the vehicle file"
+        fix = "the number of cells or the unit in the log, or motors.voltage"
+        return [Finding("doubt", "voltage", text, "voltage", middle, 0.95, fix)]
     for unit, scale in (("mV", 1e-3), ("hundredths of a volt", 1e-2), ("tenths of a volt", 0.1)):
         if middle > MOST_V and LEAST_V <= middle * scale <= MOST_V:
             text = f"{middle:.4g} V in the file: it is in {unit}"

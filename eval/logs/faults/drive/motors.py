@@ -62,8 +62,10 @@ POLES = {
     if 0.5 <= mine / true <= 2.0 and mine != true
 }
 """Wrong number of poles -> factor by which speeds from electrical rpm (eRPM) are then too large."""
-COEFFICIENT = "or rotors.thrust_coefficient of the vehicle file is wrong, such as for rpm"
-"""Other cause of a wrong lift, which a log alone does not exclude."""
+COEFFICIENT = (
+    "or --vehicle is another vehicle's file, or its rotors.thrust_coefficient is wrong, as for rpm"
+)
+"""Other causes of a wrong lift, which a log alone does not exclude."""
 SHIPPED_ORDER = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
 """Motor positions (x forward, y left) in the order of the shipped vehicles: front right, rear
 right, rear left, front left."""
@@ -296,14 +298,15 @@ def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Fin
     links = [n for n in range(2, 9) if abs(np.log(factor**-2 / n)) < np.log(1.1)]
     if links:
         text = f"{figures}: {vehicle.mass:g} kg may be the mass of {links[0]} links, entered each"
+        text += f"; {COEFFICIENT}"
         fix = f"mass = {vehicle.mass / links[0]:.3g} in the vehicle file"
         return Finding("doubt", "mass", text, "vehicle_mass", factor**-2, 0.9, fix)
     if poles:
-        text = f"{figures}: {poles[0]}, or the mass or the thrust coefficient is wrong"
-        fix = f"--motor-poles {poles[0].split(' ')[-1]}"
+        text = f"{figures}: if they are from eRPM, {poles[0]}; or the mass is wrong, {COEFFICIENT}"
+        fix = f"the --vehicle of this log, or --motor-poles {poles[0].split(' ')[-1]} for eRPM"
         return Finding("doubt", "rotor speeds", text, "motor_poles", factor, 0.9, fix)
-    text = f"{figures}: the speeds' unit, the mass or the thrust coefficient is wrong"
-    fix = "mass or rotors.thrust_coefficient of the vehicle file"
+    text = f"{figures}: the speeds' unit or the mass is wrong, {COEFFICIENT}"
+    fix = "the --vehicle of this log, or mass or rotors.thrust_coefficient of the vehicle file"
     return Finding("doubt", "rotor speeds", text, "motor_unit", factor, 0.9, fix)
 
 

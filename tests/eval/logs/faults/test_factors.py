@@ -11,6 +11,7 @@ from eval.logs.faults.drive.commands import check_thrust_command
 from eval.logs.faults.drive.motor_map import check_motor_map
 from eval.logs.faults.drive.motors import check_lift, check_motors
 from eval.logs.faults.relation import match
+from eval.logs.faults.sensors import check_voltage
 from eval.logs.faults.vectors import check_gyro, check_velocity
 from eval.logs.faults.vehicle import check_vehicle_numbers, vehicle_doubts
 from eval.quadrotor.loops import KINDS
@@ -43,7 +44,7 @@ def test_a_factor_with_a_name_is_put_right():
         finding = lift(factor)
         assert finding.status == "corrected" and words in finding.evidence
         assert finding.fix == f"--read motor={1 / scale:.10g}"
-        assert "or rotors.thrust_coefficient of the vehicle file is wrong" in finding.evidence
+        assert "or --vehicle is another vehicle's file, or its rotors.thr" in finding.evidence
 
 
 @pytest.mark.parametrize("factor", [6.5, 11.0, 11.5, 10.2])
@@ -54,9 +55,10 @@ def test_a_factor_between_two_names_is_left_to_its_owner(factor):
 
 
 def test_a_factor_without_a_name_is_a_doubt():
-    assert lift(2.5).is_open
+    assert lift(2.5).is_open and "the --vehicle of this log" in lift(2.5).fix
     assert lift(1.0, None).status == "note"
     assert lift(14 / 12).fault == "motor_poles" and "14" in lift(14 / 12).fix
+    assert "the --vehicle of this log" in lift(14 / 12).fix
     assert lift(5**-0.5).fault == "vehicle_mass"
 
 
@@ -253,6 +255,19 @@ def test_the_fault_is_named_and_the_fix_is_the_map_that_was_flown(by, changes, f
         assert not found(rows, replace(PLAIN, motors=fixed)), "the fix is right"
         gives = [first * u + second * u**2 for u in (u0 * 15.0 / voltage for u0 in (0.4, 0.55))]
         assert gives == pytest.approx([1.5 * u + 4.0 * u**2 for u in (0.4, 0.55)], rel=0.06)
+
+
+@pytest.mark.parametrize("factor", [0.25, 0.5, 2.0, 4.0])
+def test_a_voltage_far_from_the_nominal_one_of_the_motors_is_in_doubt(factor):
+    rows, vehicle = flown(), with_motors()
+    for scale, where, status in (
+        (1.0, vehicle, "ok"),
+        (factor, vehicle, "doubt"),
+        (factor, PLAIN, "ok"),
+        (factor, with_motors(voltage_exponent=0.0), "ok"),
+    ):
+        (finding,) = check_voltage({"voltage": scale * rows["voltage"]}, where)
+        assert finding.status == status
 
 
 def test_what_a_flight_does_not_show_is_reported_as_not_identifiable():
