@@ -15,7 +15,6 @@ import numpy as np
 from tracks.families.layout import GATE_COUNT, MAX_YAW_NOISE, Layout, furnish, ramp
 from tracks.geometry.gates import square_gates
 from tracks.geometry.obstacles import PerStretch, segment_distance, straight_sites
-from tracks.geometry.scene import Gates
 
 MIN_SPACING_M, MAX_SPACING_M = 2.5, 7.0
 """Least and largest horizontal distance between successive gates [m]."""
@@ -108,14 +107,14 @@ def _walk(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return gate centres (G, 2), yaws (G,) and the start (2,) of the first free walk.
 
-    A walk is free if it passes far enough from other gates, see `_is_free`.
+    A walk is free if it passes far enough from other gates, see `is_free`.
     """
     # A mix without hairpins draws no number here, so that each seed keeps its track.
     hairpins = mix.hairpin_share > 0 and rng.random() < mix.hairpin_share
     for _ in range(_DRAWS):
         turn = _drift_turns(d, rng, mix.sharp_share)
         walks = _candidates(d, rng, _with_hairpins(turn, rng) if hairpins else turn)
-        free = np.flatnonzero(_is_free(walks, MAX_HAIRPIN_APPROACH if hairpins else MAX_APPROACH))
+        free = np.flatnonzero(is_free(walks, MAX_HAIRPIN_APPROACH if hairpins else MAX_APPROACH))
         if len(free):
             return walks.center[free[0]], walks.yaw[free[0]], walks.start[free[0]]
     straight = _candidates(0.0, rng, np.zeros(GATE_COUNT))
@@ -159,7 +158,7 @@ def _candidates(d: float, rng: np.random.Generator, turn: np.ndarray) -> Walks:
     return Walks(point - point[:, :1], yaw, -point[:, 0])
 
 
-def _is_free(walks: Walks, max_approach: float = MAX_APPROACH) -> np.ndarray:
+def is_free(walks: Walks, max_approach: float = MAX_APPROACH) -> np.ndarray:
     """Return which walks are free, (W,) bool.
 
     On a free walk, every stretch keeps its distance from the gates that are not its ends, and
@@ -178,10 +177,3 @@ def _is_free(walks: Walks, max_approach: float = MAX_APPROACH) -> np.ndarray:
     joined = (gate == stretch) | (gate == stretch - 1)
     avoids_others = np.all((distance > PASSING_M) | joined, axis=(1, 2))
     return approaches & leaves & avoids_others
-
-
-def is_free(gates: Gates, start_pos_w: np.ndarray) -> bool:
-    """Return whether straight flight from gate to gate avoids the other gates' frames."""
-    normal = gates.rot_w[:, :2, 0]
-    yaw = np.arctan2(normal[:, 1], normal[:, 0])
-    return bool(_is_free(Walks(gates.center_w[None, :, :2], yaw[None], start_pos_w[None, :2]))[0])

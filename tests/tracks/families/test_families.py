@@ -8,7 +8,7 @@ import pytest
 from scipy import ndimage
 
 from tracks.families import FAMILIES, JUDGED, LEVELS, MAX_COUNTS, make_track, random, random_track
-from tracks.families.random import Mix, is_free
+from tracks.families.random import Mix, Walks, is_free
 from tracks.formats.meshes import solid_meshes
 from tracks.geometry.obstacles import segment_distance
 from tracks.geometry.scene import counts
@@ -290,16 +290,17 @@ def test_no_stretch_runs_through_another_gates_frame(tracks):
             others = np.delete(point[1:], [max(k - 1, 0), k], axis=0)
             way = begin + share * (end - begin)
             assert np.linalg.norm(way[:, None] - others, axis=-1).min() > 1.5
-        assert is_free(gates, track.start_pos_w)
 
 
 def test_a_track_through_its_own_gate_is_not_free():
     track = make_track("circular", 0, 3)
     gates = track.scene.gates
-    center = gates.center_w.copy()
-    center[3] = (center[6] + center[7]) / 2
-    assert is_free(gates, track.start_pos_w)
-    assert not is_free(gates._replace(center_w=center), track.start_pos_w)
+    center, normal = gates.center_w[:, :2], gates.rot_w[:, :2, 0]
+    crossed = center.copy()
+    crossed[3] = (center[6] + center[7]) / 2
+    yaw, start = np.arctan2(normal[:, 1], normal[:, 0]), track.start_pos_w[:2]
+    walks = Walks(np.stack([center, crossed]), np.stack([yaw, yaw]), np.stack([start, start]))
+    assert is_free(walks).tolist() == [True, False]
 
 
 def test_sizes_and_spacings_stay_in_their_ranges(tracks):
