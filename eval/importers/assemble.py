@@ -19,7 +19,7 @@ from eval.importers.rows import GAP_S, GAP_STEPS, row_times, rows_at, sampled_ro
 from eval.importers.signals import NEEDED, Recording, median_step, with_readings
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
 from eval.logs.faults.check import DRIVE, POSE, CheckContext, run_checks
-from eval.logs.faults.clock import check_time
+from eval.logs.faults.clock import CUT, PAUSE_S, check_time
 from eval.logs.faults.finding import Finding, finding_lines
 from eval.logs.faults.position import check_jumps
 from eval.logs.faults.reading import BY_ATTITUDE, MOTORS, read_rows
@@ -28,8 +28,6 @@ from eval.logs.flight_log import FlightLog, log_from_columns
 
 SLOW_HZ = 40.0
 """A signal below this rate gets a note [Hz]."""
-PAUSE_S = 5.0
-"""After a longer gap there may be another flight [s]."""
 END_S = 0.5
 """A signal that begins or ends this much later or earlier than the others gets a note [s]."""
 SIGNAL_TEXTS = {
@@ -227,7 +225,7 @@ def _notes_on_rates(recording: Recording, time_s: np.ndarray) -> list[Finding]:
             longest = float(np.max(np.diff(times)))
             text = f"{gaps} gaps, the longest {longest:.2g} s: left empty"
             if longest > PAUSE_S:
-                text += "; if another flight follows, cut it off with --end"
+                text += f"; {CUT}"
             findings.append(Finding("note", subject, text))
     return findings
 

@@ -10,7 +10,7 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.logs.columns import GROUPS
 from eval.logs.faults.catalogue import FAULTS
-from eval.logs.faults.clock import check_clock, check_time
+from eval.logs.faults.clock import check_clock, check_pause, check_time
 from eval.logs.faults.drive.commands import (
     check_controller_rate,
     check_gyro_scale,
@@ -183,7 +183,9 @@ def check_log(
     measured = {"time": log.time_s, **action, **signals_of(columns_from_log(log))}
     findings += check_controller_rate(measured, against.policy_hz)
     findings += [] if log.pos_w is None else check_jumps(log.time_s, log.pos_w)
-    step_s = float(np.median(np.diff(read_rows({"time": log.time_s}, readings)["time"])))
+    time_s = read_rows({"time": log.time_s}, readings)["time"]
+    findings += check_pause(time_s)
+    step_s = float(np.median(np.diff(time_s)))
     if len(log.time_s) < LEAST_ROWS or step_s > SLOWEST_S:
         text = f"{len(log.time_s)} rows, {step_s:.2g} s apart: at least {LEAST_ROWS} rows, "
         text += f"{SLOWEST_S:g} s apart or less, are needed"

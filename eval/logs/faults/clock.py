@@ -20,6 +20,10 @@ from eval.logs.faults.pose import SPAN_S, Rows
 from eval.logs.faults.reading import TIMES, option
 from eval.logs.faults.relation import jackknife_error
 
+PAUSE_S = 5.0
+"""After a longer pause there may be another flight [s]."""
+CUT = "if another flight follows, cut it off with --end of suite import"
+"""What to do about a pause."""
 STEPS_S = (5e-5, 0.25)
 """Possible time between rows of a log [s]."""
 REACH_S, STEP_S = 0.1, 0.002
@@ -116,6 +120,16 @@ def check_time(rows: Rows, fastest: float | None = None) -> list[Finding]:
     text = f"{figures}: time is in {possible_units[0]}"
     return [Finding("corrected", "time", text, "time_unit", 1.0 / TIMES[possible_units[0]], 0.99,
                     option(("time", possible_units[0])))]  # fmt: skip
+
+
+def check_pause(time_s: np.ndarray) -> list[Finding]:
+    """Return a note on the longest pause between the rows of a log at `time_s` (T,) [s]."""
+    steps = np.diff(time_s)
+    if np.max(steps, initial=0.0) <= PAUSE_S:
+        return []
+    k = int(np.argmax(steps))
+    text = f"none for {steps[k]:.3g} s after t = {time_s[k]:.2f} s: {CUT}"
+    return [Finding("note", "rows", text)]
 
 
 def check_clock(rows: Rows) -> list[Finding]:

@@ -21,6 +21,9 @@ from eval.vehicles.vehicle import Vehicle
 
 LATE_S = 0.06
 """Allowed delay in addition to the delay of rate loop, rotors and a usual radio link [s]."""
+EARLY = (0.03, 0.4, 0.5)
+"""Commands that follow the gyro by more than the first [s] are logged too late, if their relative
+residual is below the second and below the third times that of commands before the gyro."""
 USUAL_S = 0.08
 """Delay of rate loop, rotors and radio link that is assumed without a vehicle file [s]."""
 GAIN = (0.8, 1.25)
@@ -175,8 +178,17 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
     if rms(rate) < CALM_RATE:
         text = f"turns of {rms(rate):.2g} rad/s are too small to check it by"
         return [Finding("not identifiable", subject, text, "rate_curve")]
-    # Signs and order of the axes.
     matched = match(command, rate)
+    # No command follows the gyro. One that fits far better so is logged too late.
+    smoothed = smooth(time_s, rows["cmd_rate"], WIDTH_S)
+    early, gyro = delayed(time_s, rows["rate"], smoothed)
+    reverse = match(smoothed, gyro)
+    misfit, usual = (m.misfit(m.as_given) for m in (reverse, matched))
+    if early > EARLY[0] and misfit < min(EARLY[1], EARLY[2] * usual):
+        text = f"it follows the gyro after {1e3 * early:.0f} ms: it is logged too late"
+        fix = "the link's or the logger's clock"
+        return [Finding("doubt", subject, text, "command_delay", -early, 0.93, fix)]
+    # Signs and order of the axes.
     correlations = ", ".join(f"{v:+.2f}" for v in matched.as_given)
     figures = f"the gyro follows it after {1e3 * delay:.0f} ms with correlations {correlations}"
     if not matched.seen.any():

@@ -46,6 +46,15 @@ def test_a_stored_finding_on_another_vehicle_file_is_not_repeated_and_one_on_the
     assert faults(CheckContext(PLAIN)) == ["voltage"]
 
 
+def test_a_long_pause_of_the_rows_has_a_note():
+    log = fly(PLAIN, 0, duration_s=3.0)
+    for pause_s, notes in ((4.0, 0), (60.0, 1)):
+        paused = replace(log, time_s=log.time_s + pause_s * (log.time_s > 1.5))
+        found = [f for f in check_log(paused)[0] if f.signal == "rows"]
+        assert len(found) == notes
+        assert all(f.status == "note" and "none for 60 s after" in f.evidence for f in found)
+
+
 def test_a_copy_of_a_flight_is_refused(tmp_path):
     """One copy could be held out to test the fit to the other."""
     log = fly(PLAIN, 0, duration_s=3.0)

@@ -131,6 +131,15 @@ def test_stick_pulses_are_no_degrees_per_second():
     assert "stick pulses" in found.evidence and "--read" not in found.fix
 
 
+@pytest.mark.parametrize(("late_s", "ahead_s"), [(0.0, 0.0), (0.05, 0.0), (0.15, 0.1), (0.3, 0.25)])
+def test_commands_that_follow_the_gyro_are_logged_too_late(late_s, ahead_s):
+    parts = good(end=10.0)
+    parts["cmd_rate"] = np.roll(parts["cmd_rate"], round(late_s * HZ), axis=0)
+    found = [f for f in checked(parts)[0] if f.signal == "rate command" and f.is_open]
+    assert [f.fault for f in found] == ["command_delay"] * bool(ahead_s)
+    assert not found or found[0].size == pytest.approx(-ahead_s, abs=0.04)
+
+
 def test_commands_of_swapped_axes_are_not_late():
     """By its own axis the command may fit best after another time."""
     time_s = good(end=10.0)["time"]
