@@ -64,7 +64,7 @@ def list_settings(config: TrainConfig, console: Console) -> list[dict[str, Any]]
 
     The values are those before the phases.
     """
-    all_settings = [setting for setting in settings(config) if setting.path != "phases"]
+    all_settings = [one for one in settings(config) if one.path not in ("phases", "seed")]
     for setting in all_settings:
         allowed = f", allowed {setting.allowed}" if setting.allowed else ""
         console.say(f"{setting.path} = {setting.default!r}{allowed}\n    {setting.about}")

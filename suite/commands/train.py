@@ -96,12 +96,12 @@ def resolve(config: Config) -> TrainConfig:
         ("episode.batch", "--num-envs", config.num_envs),
         ("optimizer.rate", "--lr", config.lr),
         ("optimizer.iterations", "--iterations", config.iterations),
-        ("seed", "--seed", config.seed or None),
     )
     given = [option for option in options if option[2] is not None]
     check_owned(
         [change for change in config.set if not change.strip().startswith(PREFIX)],
-        {path: f"leave out {name} or this change" for path, name, _ in given},
+        {"seed": "give --seed"}
+        | {path: f"leave out {name} or this change" for path, name, _ in given},
     )
     run = replace(named_recipe(config.recipe), seed=config.seed)
     run = with_model(run, config.model, config.vehicle)

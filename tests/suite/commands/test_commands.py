@@ -92,6 +92,7 @@ def test_train_lists_the_settings_of_its_recipe_and_trains_nothing(tmp_path, cap
     ]
     paths = [setting["path"] for setting in found]
     assert {"optimizer.rate", "loss.progress", "spec.camera.width"} <= set(paths)
+    assert "seed" not in paths, "--seed sets it"
     assert all(setting["about"] for setting in found) and not list(tmp_path.iterdir())
 
 

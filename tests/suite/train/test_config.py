@@ -107,13 +107,15 @@ def test_a_setting_that_is_given_twice_is_refused():
         with pytest.raises(ValueError, match=f"'{again}': loss.* is given twice; give it once"):
             with_changes(RUN, [f"{path}=1", again])
     options = {"optimizer.rate": "lr", "episode.batch": "num_envs"}
-    options |= {"optimizer.iterations": "iterations", "seed": "seed"}
+    options |= {"optimizer.iterations": "iterations"}
     for path, option in options.items():
         change, name = f"{path}=8", option.replace("_", "-")
         resolve(Config(recipe="quick", set=(change,)))
         with pytest.raises(ValueError, match=f"this command sets {path}; leave out --{name} or"):
             resolve(Config(recipe="quick", set=(change,), **{option: 8}))
     resolve(Config(lr=1e-3, set=("phases.2.optimizer.rate=1e-4",)))
+    with pytest.raises(ValueError, match="this command sets seed; give --seed"):
+        resolve(Config(recipe="quick", seed=0, set=("seed=5",)))
 
 
 def test_spreads_go_with_the_size_of_the_vehicle_that_is_asked_for():
