@@ -14,7 +14,7 @@ from eval.effects.interface import GRAVITY
 from eval.importers.frames import conjugate, rotate
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows, turns_of
-from eval.logs.faults.reading import option, read_as
+from eval.logs.faults.reading import axes_matrix, option, read_as
 from eval.logs.faults.relation import LEAST, SEEN, Match, match, pooled_scale, rms, smooth, within
 from eval.logs.velocity import velocity_from_position
 
@@ -139,6 +139,8 @@ def _turned(found: Match, signal: str, subject: str) -> Finding:
     )
     frame = {"x,-y,-z": "body_frame"}.get(found.axes, f"{subject}_axes")
     text = f"correlations with what it should be are {alike}; its axes are {found.axes}"
+    if frame == "gyro_axes" and np.linalg.det(axes_matrix(found.axes)) > 0.0:
+        text += ", or the attitude's body is rotated by as much against the vehicle"
     sure = float(np.clip(np.min(found.alike[found.seen]), 0.0, 0.99))
     fix = option((signal, found.axes))
     status = "corrected" if found.is_turned else "doubt"

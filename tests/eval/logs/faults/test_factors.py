@@ -10,6 +10,7 @@ import pytest
 from eval.logs.faults.drive.commands import check_thrust_command
 from eval.logs.faults.drive.motor_map import check_motor_map
 from eval.logs.faults.drive.motors import check_lift, check_motors
+from eval.logs.faults.reading import parse_readings, read_rows
 from eval.logs.faults.relation import match
 from eval.logs.faults.sensors import check_voltage
 from eval.logs.faults.vectors import check_gyro, check_velocity
@@ -17,6 +18,7 @@ from eval.logs.faults.vehicle import check_vehicle_numbers, vehicle_doubts
 from eval.quadrotor.loops import KINDS
 from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
 from eval.vehicles.vehicle import CollisionBox, Controller, MotorMap, command_of_thrust
+from tests.support import known_flight
 from tests.support.vehicles import PLAIN
 
 SCALED = Controller(
@@ -60,6 +62,15 @@ def test_a_factor_without_a_name_is_a_doubt():
     assert lift(14 / 12).fault == "motor_poles" and "14" in lift(14 / 12).fix
     assert "the --vehicle of this log" in lift(14 / 12).fix
     assert lift(5**-0.5).fault == "vehicle_mass"
+
+
+@pytest.mark.parametrize(("axes", "both"), [("y,-x,z", True), ("y,x,z", False), ("x,-y,z", False)])
+def test_axes_of_a_gyro_that_are_a_rotation_may_be_those_of_the_attitude(axes, both):
+    parts = known_flight.fly(np.arange(0.0, 10.0, 0.01))
+    rows = {"time": parts.time, "quat": parts.quat, "rate": parts.rate}
+    found = check_gyro(read_rows(rows, parse_readings([f"rate={axes}"])))
+    (turned,) = (f for f in found if f.fault == "gyro_axes" and f.status == "corrected")
+    assert ("or the attitude's body is rotated" in turned.evidence) == both
 
 
 def test_without_a_gyro_order_and_spin_are_not_identifiable():
