@@ -1,16 +1,17 @@
 """Measure whether the diagnosis finds nothing on clean flights, and effects that just matter.
 
-    python tools/relevance.py [SETS [SEED [FIRST]]]
+    python tools/relevance.py [SETS [SEED [FIRST [TIMES]]]]
 
 A set has four flights of `suite collect` with their own simulator, vehicle, track family, level,
 row rate and noise, and commands or measured rotor speeds alone. It is diagnosed twice against the
 vehicle that flew. First nothing is hidden: the verdict must be `no_gap`. Then one effect is hidden,
-as large as the threshold of practical relevance (`Thresholds.relevance`): it must be named.
+TIMES (1) the threshold of practical relevance (`Thresholds.relevance`): it must be named.
 RotorPy's aerodynamics differ from the vehicle file. So its flights are diagnosed against the file
 that describes them best, and nothing is hidden in them.
 
-The tool prints a line for each set. Then it prints both shares, with their 95 % intervals (Clopper
-and Pearson). 60 sets take about 30 minutes on one core.
+The tool prints a line for each set. Then it prints the shares, with their 95 % intervals (Clopper
+and Pearson): that of the named effects for each kind of log. 60 sets take about 30 minutes on one
+core.
 """
 
 from __future__ import annotations
@@ -66,6 +67,13 @@ class Setting(NamedTuple):
     commands: bool
     """Whether the log has the commands."""
 
+    @property
+    def kind(self) -> str:
+        """The input of the model that the log allows."""
+        if not self.commands:
+            return "with rotor speeds alone"
+        return "with all commands" if self.every == 1 else "with every second command"
+
 
 def draw(number: int, rng: np.random.Generator, seed: int) -> Setting:
     """Return the setting of set `number`."""
@@ -118,11 +126,13 @@ def as_logged(log: FlightLog, setting: Setting, rng: np.random.Generator) -> Fli
     )
 
 
-def at_threshold(name: str, values: Any, vehicle: Vehicle, logs: Sequence[FlightLog]) -> Any:
-    """Return the effect's `values`, scaled to the threshold of relevance on these flights.
+def at_threshold(
+    name: str, values: Any, vehicle: Vehicle, logs: Sequence[FlightLog], times: float
+) -> Any:
+    """Return the effect's `values`, scaled to `times` the threshold of relevance on these flights.
 
     The size follows from the model's slopes along the flights. Force, torque and drift are divided
-    by their thresholds, and the largest ratio becomes one.
+    by their thresholds, and the largest ratio becomes `times`.
     """
     by_rotors = logs[0].thrust_cmd is None
     model, windows, start = rollouts_along(logs, vehicle, rotor_input=by_rotors)
@@ -135,7 +145,7 @@ def at_threshold(name: str, values: Any, vehicle: Vehicle, logs: Sequence[Flight
     size = rollout_size(slope @ change, windows)
     shares = [(s or 0.0) / limit for s, limit in zip(size, THRESHOLDS.relevance, strict=True)]
     theta = start.theta.copy()
-    theta[indices] += change / max(shares)
+    theta[indices] += times * change / max(shares)
     return space.effects(theta)[name]
 
 
@@ -143,10 +153,11 @@ def main(
     sets: tyro.conf.Positional[int] = 60,
     seed: tyro.conf.Positional[int] = 6_100_000,
     first: tyro.conf.Positional[int] = 0,
+    times: tyro.conf.Positional[float] = 1.0,
 ) -> None:
     """Run the sets, and print a line for each and the shares."""
     keep_compiled()
-    clean, hidden_sets, named = 0, 0, 0
+    clean, named = 0, dict[str, list[bool]]()
     for number in range(first, first + sets):
         rng = np.random.default_rng([seed, number])
         setting = draw(number, rng, seed)
@@ -159,15 +170,17 @@ def main(
         clean += null["verdict"] == "no_gap"
         line = f"{number:3d} {_words(setting)}: {_found(null)}"
         if vehicle is flown:
-            hidden = at_threshold(effect, values, vehicle, logs)
+            hidden = at_threshold(effect, values, vehicle, logs, times)
             logs = fly_logs(setting, with_effects(flown, {effect: hidden}), rng)
             found = diagnosis_json(diagnose(logs, vehicle, seed=number))
             outcome = outcome_of(effect, found["effects"])
-            hidden_sets, named = hidden_sets + 1, named + outcome.startswith("named")
+            named.setdefault(setting.kind, []).append(outcome.startswith("named"))
             line += f" | {effect}: {outcome}, {_found(found)}"
         print(line, flush=True)
     print(share_line("clean sets with the verdict no_gap", clean, sets))
-    print(share_line("effects at the threshold that are named", named, hidden_sets))
+    for kind, outcomes in named.items():
+        what = f"effects of {times:g} times the threshold that are named, {kind}"
+        print(share_line(what, sum(outcomes), len(outcomes)))
 
 
 def _found(found: Any) -> str:

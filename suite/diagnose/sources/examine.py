@@ -16,7 +16,7 @@ from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.estimate.parameters import Candidate, effects_in, indices_of
 from suite.diagnose.search.evaluation import NamedEffect, SearchResult
-from suite.diagnose.sources.source import TOO_SMALL, Finding, Source
+from suite.diagnose.sources.source import TOGETHER, TOO_SMALL, Finding, Source
 from suite.diagnose.verdict.gap import EffectSize, Gap
 
 CONTRADICTION = 1.5
@@ -74,7 +74,9 @@ def examine(
         without = _without_each(source, found)
     for name, size in too_small:
         is_relevant = size.relevant(source.limits)
-        reason = "no larger than the model's own error" if is_relevant else "too small to matter"
+        reason = "too small to matter"
+        if is_relevant:
+            reason = "no larger than the model's own error, or the other effects cancel it"
         warnings.append(f"{name}: left out, {reason}: {size.words()}")
     if not source.small_explains:
         explained = found, (before, after)
@@ -171,23 +173,26 @@ def relevant_part(
 ) -> tuple[SearchResult, Gap, dict[str, EffectSize], list[tuple[str, EffectSize]]]:
     """Leave out the effects below the threshold of relevance.
 
-    If the gap is below that threshold from the start, only faults of the log may be named. `gaps`
-    are the gap without any named effect and the gap with all of them.
+    If all named effects together are below it, only faults of the log may be named. `gaps` are the
+    gap without any named effect and the gap with all of them.
 
     Returns:
         The result with the relevant effects, the gap with them, the sizes of these effects by name,
         and the names and sizes of the effects that were left out.
     """
     (before, after), left_out = gaps, list[tuple[str, EffectSize]]()
-    gap_is_small = bool(found.named) and not source.is_relevant(before)
+    all_are_small: bool | None = None
     while found.named:
         ranges = source.sizes(found)
+        together = ranges.pop(TOGETHER, None)
+        if all_are_small is None:  # of what the search has found; the rest may be smaller
+            all_are_small = together is not None and not together[1].relevant(source.limits)
         sizes = {name: size for name, (size, _) in ranges.items()}
         too_small = [
             name
             for name, (_, upper) in ranges.items()
             if not source.names_small
-            and ((gap_is_small and not EFFECTS[name].of_log) or not upper.relevant(source.limits))
+            and ((all_are_small and not EFFECTS[name].of_log) or not upper.relevant(source.limits))
         ]
         if not too_small:
             return found, after, sizes, left_out

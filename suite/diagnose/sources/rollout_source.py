@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -186,7 +187,7 @@ class RolloutSource(Source):
             equations = rollout_evidence(model, linear, *options)[1].equations
             change, _ = gauss_newton_step(equations, estimate.theta, model.space)
             model_error = self.coarser_share * np.abs(change)
-        return sizes_by_effect(found, slope, lambda c: rollout_size(c, windows), model_error)
+        return sizes_by_effect(found, slope, partial(rollout_size, windows=windows), model_error)
 
     def remaining(self, found: SearchResult, gaps: tuple[Gap, Gap], seed: int) -> Remaining:
         """Return the structure in the error that remains after `found`, see `Source`.

@@ -32,6 +32,8 @@ from suite.diagnose.verdict.model_error import beyond_error
 
 LEAST_GAP = 1e-9
 """Lower limit of a gap minus its noise floor in a division, in the gap's unit."""
+TOGETHER = "together"
+"""Key of the size that all named effects have together, see `Source.sizes`."""
 TOO_SMALL = "that is too small to matter"
 """Reason of an error below the thresholds of relevance, see `Remaining.reason`."""
 
@@ -171,8 +173,9 @@ class Source(ABC):
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
         """Return the sizes of the named effects on these flights, by the effect's name.
 
-        Each entry is the size and the upper end of its 95 % interval, which is zero if the model's
-        own error may be the whole effect. The result is empty if the size has no physical unit;
+        The entry `TOGETHER` is for all of them at once: their changes may cancel. Each entry is the
+        size and the upper end of its 95 % interval, which is zero if the model's own error may be
+        the whole effect. The result is empty if the size has no physical unit;
         then no effect counts as too small.
         """
         return {}
@@ -189,21 +192,23 @@ class Source(ABC):
 def sizes_by_effect(
     found: SearchResult,
     slope: np.ndarray,
-    size_of: Callable[[np.ndarray], EffectSize],
+    size_of: Callable[..., EffectSize],
     model_error: float | np.ndarray = 0.0,
 ) -> dict[str, tuple[EffectSize, EffectSize]]:
     """Return the size of each named effect and the upper end of its 95 % interval, by name.
 
-    The upper end is zero if the model's own error may be the whole effect (see `beyond_error`).
-    `slope` (..., K) are derivatives of the flights' errors by the K named parameters, and `size_of`
-    takes a change of these errors to its size. The model's own numerical error may change the
+    The entry `TOGETHER` is for all of them at once. The upper end is zero if the model's own error
+    may be the whole effect (see `beyond_error`). `slope` (..., K) are derivatives of the flights'
+    errors by the K named parameters. `size_of` takes a change of these errors to its size, or with
+    a number of standard errors to its upper limit. The model's own numerical error may change the
     parameters by `model_error` (K,); this is subtracted before the upper end is computed.
     """
     entries, width, change = found.last.evidence.space.entries, found.half_widths(), found.moved
     certain = np.sign(change) * np.maximum(np.abs(change) - model_error, 0.0)
     error, sizes = np.broadcast_to(model_error, change.shape), {}
-    for name in dict.fromkeys(named.candidate.name for named in found.named):
-        columns = [k for k, index in enumerate(found.indices) if entries[index].effect == name]
+    effects = np.array([entries[index].effect for index in found.indices])
+    columns_of = {named.candidate.name: effects == named.candidate.name for named in found.named}
+    for name, columns in (columns_of | {TOGETHER: np.ones(len(effects), bool)}).items():
         own_slope = slope[..., columns]
         upper = size_of(0.0 * own_slope[..., 0])
         if beyond_error(change[columns], error[columns], width[columns]):

@@ -8,6 +8,7 @@ model could explain, and whether structure remains beyond the named effects.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -80,7 +81,7 @@ class ViewSource(Source):
         block = found.last.block
         assert isinstance(block, ViewBlock)
         slope = block.data.slope[..., [block.along.index(index) for index in found.indices]]
-        return sizes_by_effect(found, slope, lambda c: view_size(c, self.view.in_world))
+        return sizes_by_effect(found, slope, partial(view_size, in_world=self.view.in_world))
 
     def remaining(self, found: SearchResult, gaps: tuple[Gap, Gap], seed: int) -> Remaining:
         """Return the error that a black box explains beyond the named effects, see `Source`.

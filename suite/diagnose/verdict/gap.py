@@ -33,6 +33,7 @@ from suite.diagnose.data.windows import (
     FlightWindows,
     take,
 )
+from suite.diagnose.estimate.gauss_newton import Z95
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
@@ -40,9 +41,14 @@ DRAWS = 1000
 """Number of draws of a bootstrap."""
 
 
-def rms_length(vectors: np.ndarray) -> float:
-    """Return the root mean square length of `vectors` (..., K), in their unit."""
-    return float(np.sqrt((vectors**2).sum(axis=-1).mean()))
+def rms_length(vectors: np.ndarray, z: float = 0.0) -> float:
+    """Return the root mean square length of `vectors` (..., K), in their unit.
+
+    With `z` it is an upper limit, by that many standard errors of the mean square: the same vehicle
+    on other stretches of flight gives another one.
+    """
+    squares = (vectors**2).sum(axis=-1)
+    return float(np.sqrt(squares.mean() + z * squares.std() / np.sqrt(squares.size)))
 
 
 class Channel(NamedTuple):
@@ -228,11 +234,12 @@ class EffectSize(NamedTuple):
         return " and ".join([*([", ".join(parts[:-1])] if parts[1:] else []), parts[-1]])
 
 
-def rollout_size(shift: np.ndarray, windows: FlightWindows) -> EffectSize:
+def rollout_size(shift: np.ndarray, windows: FlightWindows, z: float = 0.0) -> EffectSize:
     """Return the size of an effect that shifts the simulated values of `windows`.
 
     A fault of the log gets the size of the motion that would change the logged values as much.
-    `shift` (W, N, 19) is the change of the simulated values by the effect, by row and channel.
+    `shift` (W, N, 19) is the change of the simulated values by the effect, by row and channel. For
+    `z` see `rms_length`.
     """
     row_s, valid = np.asarray(windows.row_s), np.asarray(windows.valid)
 
@@ -245,22 +252,23 @@ def rollout_size(shift: np.ndarray, windows: FlightWindows) -> EffectSize:
         if not len(stretch):
             return 0.0
         row = (stretch, last_row[stretch])
-        return rms_length(shift[row][:, SLICES[group]] / row_s[row][:, None] ** power)
+        return rms_length(shift[row][:, SLICES[group]] / row_s[row][:, None] ** power, z)
 
     # The velocity grows with the acceleration times t, the position with half of it times t^2.
     force = growth("velocity", FORCE_S, 1) or 2.0 * growth("position", FORCE_S, 2)
     has_acc = valid[..., SLICES["accelerometer"]].all(axis=-1)
     if has_acc.any():
-        force = max(force, rms_length(shift[has_acc][:, SLICES["accelerometer"]]))
+        force = max(force, rms_length(shift[has_acc][:, SLICES["accelerometer"]], z))
     return EffectSize(force, growth("rates", TORQUE_S, 1), growth("position", 1.0, 2))
 
 
-def view_size(shift: np.ndarray, in_world: bool) -> EffectSize:
+def view_size(shift: np.ndarray, in_world: bool, z: float = 0.0) -> EffectSize:
     """Return the size of an effect that shifts a view's mean accelerations by `shift` (M, 3).
 
-    A view is a part of the dynamics: here the force (with `in_world` true) or the torque.
+    A view is a part of the dynamics: here the force (with `in_world` true) or the torque. For `z`
+    see `rms_length`.
     """
-    rms = rms_length(shift)
+    rms = rms_length(shift, z)
     return EffectSize(rms, 0.0, None) if in_world else EffectSize(0.0, rms, None)
 
 
@@ -268,7 +276,7 @@ def upper_size(
     slope: np.ndarray,
     change: np.ndarray,
     half_width: np.ndarray,
-    size_of: Callable[[np.ndarray], EffectSize],
+    size_of: Callable[..., EffectSize],
 ) -> EffectSize:
     """Return the upper end of the 95 % interval of an effect's size.
 
@@ -276,9 +284,10 @@ def upper_size(
         slope: (..., K) derivative of the simulated values along the effect's K parameters.
         change: (K,) fitted parameters minus those of the vehicle file.
         half_width: (K,) half-widths of the parameters' 95 % intervals.
-        size_of: function that takes a shift (...) of the simulated values to its size.
+        size_of: function that takes a shift (...) of the simulated values to its size, and with
+            `z` to the upper limit of its RMS, by that many standard errors.
     """
-    size = size_of(slope @ change)
+    size = size_of(slope @ change, z=Z95)
     widths = [size_of(slope[..., k] * width) for k, width in enumerate(half_width)]
     force, torque, drift = (
         float(np.sqrt(sum((one[i] or 0.0) ** 2 for one in widths))) for i in range(3)

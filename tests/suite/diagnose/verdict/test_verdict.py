@@ -14,7 +14,7 @@ from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.examine import confirmed, relevant_part
 from suite.diagnose.sources.rollout_source import of_rollouts, structure_where
-from suite.diagnose.sources.source import TOO_SMALL, Remaining, sizes_by_effect
+from suite.diagnose.sources.source import TOGETHER, TOO_SMALL, Remaining, sizes_by_effect
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict import gap as gaps
 from suite.diagnose.verdict import residual_structure as structure
@@ -220,8 +220,8 @@ def test_a_bias_of_the_accelerometer_counts_as_a_force_and_a_views_size_is_in_it
     assert gaps.view_size(moved, False) == gaps.EffectSize(0.0, pytest.approx(0.5), None)
 
 
-def size_of(moved):
-    return gaps.rollout_size(moved, windows())
+def size_of(moved, z=0.0):
+    return gaps.rollout_size(moved, windows(), z)
 
 
 def test_the_upper_end_of_a_size_holds_what_the_interval_allows():
@@ -230,6 +230,8 @@ def test_the_upper_end_of_a_size_holds_what_the_interval_allows():
     assert upper.force == pytest.approx(0.04) and not upper.relevant(THRESHOLDS)
     unsure = gaps.upper_size(slope, np.array([0.03]), np.array([0.03]), size_of)
     assert unsure.relevant(THRESHOLDS), "a small effect that may be large is no finding of none"
+    slope[0] *= 2.0
+    assert gaps.upper_size(slope, np.array([0.03]), np.array([0.01]), size_of).force > 0.06
 
 
 def test_an_effect_that_the_models_own_error_may_be_has_no_size_for_certain():
@@ -243,8 +245,9 @@ def test_an_effect_that_the_models_own_error_may_be_has_no_size_for_certain():
     )
 
     def upper(error):
-        ((size, upper),) = sizes_by_effect(found, slope, size_of, np.array([error])).values()
-        assert size.force == pytest.approx(0.05)
+        sizes = sizes_by_effect(found, slope, size_of, np.array([error]))
+        size, upper = sizes["clock_offset"]
+        assert size.force == pytest.approx(0.05) and sizes[TOGETHER] == (size, upper)
         return upper
 
     assert upper(0.0).force == pytest.approx(0.08)
@@ -284,17 +287,29 @@ def test_a_gap_matters_beyond_its_noise_by_more_than_the_thresholds(found_drag):
     assert matters(0.0, 0.0, limits=Thresholds(relevance=(0.0, 0.0, 0.0)))
 
 
-def test_where_rollouts_as_given_are_near_enough_no_name_matters(found_drag):
+def test_effects_that_cancel_each_other_are_no_names(found_drag):
+    before, after = found_drag.before, found_drag.after
+    large, small = gaps.EffectSize(1.0, 0.0, 0.0), gaps.EffectSize(0.01, 0.0, 0.0)
+
+    def relevant(together):
+        sizes = {"linear_drag": (large, large), TOGETHER: (together, together)}
+        source: Any = SimpleNamespace(
+            sizes=lambda _: dict(sizes), names_small=False, limits=THRESHOLDS
+        )
+        return relevant_part(source, found_drag.search, (before, after))
+
+    found, kept, _, out = relevant(small)
+    assert found.named == () and kept is before and out == [("linear_drag", large)]
+    found, kept, sizes, out = relevant(large)
+    assert found.named and kept is after and sizes == {"linear_drag": large} and out == []
+
+
+def test_an_error_that_is_small_enough_is_not_structure(found_drag):
     source, none = found_drag.source, gaps.Channel(1e-3, 0.0)
     channels = found_drag.before.channels.items()
     near = found_drag.before._replace(
         channels={horizon: dict.fromkeys(groups, none) for horizon, groups in channels}
     )
     held = source.held._replace(flight=np.zeros(400, int), start_s=0.25 * np.arange(400))
-    source = replace(source, held=held)
-    found, after, _, out = relevant_part(source, found_drag.search, (near, found_drag.after))
-    assert found.named == () and after is near
-    ((name, size),) = out
-    assert name == "linear_drag" and size.force > 0.05
-    rest = source.remaining(found, (near, near), 0)
+    rest = replace(source, held=held).remaining(found_drag.search.refitted(()), (near, near), 0)
     assert not rest.structured and rest.reason == TOO_SMALL
