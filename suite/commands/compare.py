@@ -39,6 +39,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from suite.judging.comparing import (
         compare_runs,
         compare_seeds,
+        policy_notes,
         read_runs,
         version_notes,
     )
@@ -56,7 +57,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         comparisons = [compare_seeds(runs, others)]
     else:
         comparisons = [compare_runs(runs[0], other) for other in (others or runs[1:])]
-    for note in version_notes([*runs, *others]):
+    for note in [*version_notes([*runs, *others]), *policy_notes(runs, others)]:
         console.note(note)
     for comparison in comparisons:
         console.say(comparison["sentence"])

@@ -181,3 +181,14 @@ def test_other_versions_are_noted(tmp_path, capsys):
         (folder / "run.json").write_text(json.dumps({"packages": {"mujoco": version}}))
     compare.run(compare.Config(tuple(folders)), Quiet())
     assert "(mujoco: 3.3.0, 3.4.0)" in " ".join(capsys.readouterr().err.split())
+
+
+def test_runs_of_one_policy_or_of_other_speeds_are_noted(tmp_path, capsys):
+    a, b, fast = (
+        run_of(tmp_path / name, [True, False], judged, policy, weights="w")
+        for name, judged, policy in (("a", None, "p"), ("b", None, "p"), ("c", SPEEDS, "p@1"))
+    )
+    for other, said in ((b, "have the same policy"), (fast, "different --speed or --monitor")):
+        for config in (compare.Config((a, other)), compare.Config((a,), against=(other,))):
+            compare.run(config, Quiet())
+            assert said in " ".join(capsys.readouterr().err.split())
