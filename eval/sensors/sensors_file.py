@@ -72,6 +72,18 @@ class SensorSet:
         return None
 
     @property
+    def without_effect(self) -> list[str]:
+        """Names of models that add no errors, since the sizes of all their errors are neutral."""
+        sensors = {name: SENSORS[name] for name in self.models}
+        return [
+            name
+            for name, sensor in sensors.items()
+            if sensor.estimate is None and sensor.grows
+            and all(getattr(self.models[name], parameter.name) == parameter.neutral
+                    for parameter in sensor.parameters if parameter.name in sensor.grows)
+        ]  # fmt: skip
+
+    @property
     def random(self) -> bool:
         """Whether what a policy observes depends on the trial's seed."""
         sensors = [SENSORS[name] for name in self.models]

@@ -173,6 +173,11 @@ def read_trial_set(
             "noise) all flights on a track from a file are equal"
             for name in once
         ]
+    notes += [
+        f"sensors {sensors.name!r}: {name} has no effect, because the sizes of all its errors are "
+        f"zero or left out; give one, such as {SENSORS[name].grows[0]!r}"
+        for name in sensors.without_effect
+    ]
     if sensors.estimator is None and any(SENSORS[name].measure for name in sensors.models):
         notes.append(
             f"sensors {sensors.name!r}: the IMU has no effect, because only an estimator "

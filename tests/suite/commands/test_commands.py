@@ -111,9 +111,10 @@ def test_listed_settings_are_those_of_the_other_options(capsys):
 
 def test_sensors_that_change_nothing_in_a_training_are_refused(tmp_path):
     file = tmp_path / "mine.toml"
-    file.write_text('schema = 1\nname = "mine"\n[[imu]]\nkind = "imu"\ngyro_bias = 0.01\n')
-    with pytest.raises(ValueError, match=r"imu does not change what a policy sees"):
-        resolve(Config(sensors=str(file)))
+    for model in ('[[imu]]\nkind = "imu"\ngyro_bias = 0.01\n', '[depth]\nkind = "tof"\n'):
+        file.write_text(f'schema = 1\nname = "mine"\n{model}')
+        with pytest.raises(ValueError, match=r"(imu|tof) does not change what a policy sees"):
+            resolve(Config(sensors=str(file)))
 
 
 def test_training_goes_on_from_a_policy_by_its_name_and_does_not_write_over_it(

@@ -150,6 +150,8 @@ def test_a_track_file_is_flown_once_a_seed_and_once_where_nothing_acts_by_chance
         ("depth", 'kind = "image_motion"\nexposure = 0.01', 1, "flown once"),
         ("gates", 'kind = "gate_map"\nshift = 0.05', 3, None),
         ("imu", 'kind = "imu"\ngyro_noise = 0.1', 1, "the IMU has no effect"),
+        ("depth", 'kind = "tof"', 3, "tof has no effect, because the sizes of all its errors"),
+        ("state", 'kind = "state_loss"\nlength = 1.0', 3, "give one, such as 'share'"),
     ],
 )
 def test_sensors_without_random_numbers_give_equal_flights(tmp_path, stage, text, flights, noted):
