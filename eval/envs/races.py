@@ -8,6 +8,7 @@ environment and N environments give the same results.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from numbers import Integral
@@ -25,7 +26,7 @@ from eval.envs.race import (
 from eval.judging.guard import ActionLimits, check_rate, first_action, guard_action, limits_of
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds.engine import refuse_start_contact
+from eval.worlds.engine import course_notes
 from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.slots import layout_of
 from eval.worlds.trial import ENDINGS, FLYING, Rules, TrialSpec, steps_to_next
@@ -201,7 +202,12 @@ class Races:
         check_spec(self.spec)
         check_rate("the spec", self.spec.rate_hz, vehicle.controller.frequency)
         if self._file_track:
-            refuse_start_contact(self._track, self._file_track, vehicle)
+            for note in course_notes(self._track, self._file_track, vehicle):
+                warnings.warn(note, stacklevel=2)
+            ignored = {"level": levels_of(config) != (0, 0), "track_seed": config.track_seed}
+            for setting in [setting for setting, given in ignored.items() if given]:
+                said = f"a track from a file has no levels and seeds: {setting} does not change it"
+                warnings.warn(f"{self._track}: {said}", stacklevel=2)
         self.contract: Contract = contract_of(self.spec)
         layout = layout_of([self._file_track] if self._file_track else [])
         self._world = MujocoWorld(

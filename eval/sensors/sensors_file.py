@@ -74,14 +74,13 @@ class SensorSet:
     @property
     def without_effect(self) -> list[str]:
         """Names of models that add no errors, since the sizes of all their errors are neutral."""
-        sensors = {name: SENSORS[name] for name in self.models}
-        return [
-            name
-            for name, sensor in sensors.items()
-            if sensor.estimate is None and sensor.grows
-            and all(getattr(self.models[name], parameter.name) == parameter.neutral
-                    for parameter in sensor.parameters if parameter.name in sensor.grows)
-        ]  # fmt: skip
+        found = []
+        for name, values in self.models.items():
+            sensor = SENSORS[name]
+            sizes = [entry for entry in sensor.parameters if entry.name in sensor.grows]
+            if sizes and sensor.estimate is None:
+                found += [name] * all(getattr(values, p.name) == p.neutral for p in sizes)
+        return found
 
     @property
     def random(self) -> bool:
