@@ -11,7 +11,8 @@ import os
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from numbers import Integral
+from numbers import Integral, Real
+from types import NoneType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,6 +39,7 @@ from policies.spec import ActionSpec, PolicySpec, check_spec
 from tracks.common.names import unknown_name
 from tracks.families import LEVELS, check_family, make_track
 from tracks.formats.custom import load_track
+from tracks.input.ranges import check_type
 from tracks.track import Track
 
 SEEDS = 2**31
@@ -106,6 +108,32 @@ class RaceConfig:
     rules: Rules = field(default_factory=Rules)
     """Rules for the end of an episode."""
 
+    @classmethod
+    def of(cls, **arguments: Any) -> RaceConfig:
+        """Return a configuration from arguments, of which `level` and `track_seed` are unchecked.
+
+        Raises:
+            TypeError: for an unknown argument, with the most similar one.
+            ValueError: for an argument of another type.
+        """
+        names = [entry.name for entry in fields(cls)]
+        for name in arguments.keys() - set(names):
+            likely = {"difficulty": "level", "seed": "track_seed"}.get(name, name)
+            raise TypeError(str(unknown_name("argument", likely, names)).replace(likely, name, 1))
+        config = cls(**arguments)
+        path = (str, os.PathLike)
+        check_type("track", config.track, path, "a track family or a track file (.toml)")
+        if not callable(config.vehicle):
+            said = "a name, a file, a Vehicle or a function that draws one"
+            check_type("vehicle", config.vehicle, (*path, Vehicle), said)
+        said = "a policy's name or folder, a spec or None"
+        check_type("spec", config.spec, (*path, PolicySpec, NoneType), said)
+        check_type("rewards", config.rewards, (Mapping,), "weights by name of the reward term")
+        for name, weight in config.rewards.items():
+            check_type(f"rewards[{name!r}]", weight, (Real,), "a number")
+        check_type("rules", config.rules, (Rules,), "an eval.worlds.trial.Rules")
+        return config
+
 
 def levels_of(config: RaceConfig) -> tuple[int, int]:
     """Return the lowest and the highest level.
@@ -117,7 +145,7 @@ def levels_of(config: RaceConfig) -> tuple[int, int]:
     levels = list(given) if isinstance(given, Iterable) else [given, given]
     whole = len(levels) == 2 and all(isinstance(level, Integral) for level in levels)
     if not whole or not LEVELS[0] <= levels[0] <= levels[1] <= LEVELS[-1]:
-        raise ValueError(f"level is {given}, allowed is 0 to 9, or (lowest, highest)")
+        raise ValueError(f"level is {given!r}, allowed is 0 to 9, or (lowest, highest)")
     return int(levels[0]), int(levels[1])
 
 

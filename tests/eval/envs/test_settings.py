@@ -50,6 +50,10 @@ REFUSED = {
     RaceVectorEnv: [
         ({"rewards": {"gates": 1.0}}, "unknown reward term 'gates'. Did you mean 'gate'"),
         ({"level": (3, 0)}, r"level is \(3, 0\), allowed is 0 to 9"),
+        ({"level": "3"}, "level is '3', allowed is 0 to 9"),
+        ({"vehicle": {}}, "vehicle is {}, allowed is a name"),
+        ({"track": ["zigzag"]}, r"track is \['zigzag'\], allowed is a track family or"),
+        ({"rewards": {"gate": "x"}}, r"rewards\['gate'\] is 'x', allowed is a number"),
         ({"level": 10}, "level is 10, allowed is 0 to 9"),
         ({"spec": "raec"}, "unknown policy .* 'raec'. Did you mean 'race'"),
         ({"num_envs": 0}, "num_envs is 0, allowed is 1 or more"),
@@ -79,6 +83,12 @@ REFUSED = {
 def test_settings_that_cannot_be_used_are_refused(make, settings, said):
     with pytest.raises(ValueError, match=said):
         make(**settings)
+
+
+def test_an_unknown_argument_is_refused_with_the_most_similar_one():
+    for name, known in (("difficulty", "level"), ("tracks", "track")):
+        with pytest.raises(TypeError, match=f"unknown argument '{name}'. Did you mean '{known}'"):
+            RaceEnv(**{name: 3})
 
 
 def test_flags_of_the_spec_and_of_the_environment_are_joined():

@@ -1,11 +1,13 @@
 """The small commands, and what the options of the train command become."""
 
+import re
 import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
+import suite
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from policies import shipped
 from policies.formats import policy_file
@@ -44,7 +46,7 @@ def test_doubts_about_a_vehicle_file_are_printed_once_and_stop_nothing(tmp_path,
     )
     command = "eval --track zigzag --difficulty 0 --trials 2 --time-limit-s 0.1 --workers 2"
     for name, count in ((tmp_path / "mm.toml", 1), ("reference", 0)):
-        assert run(f"{command} --out", tmp_path / "out", "--vehicle", name) == 0
+        assert run(f"{command} --out", tmp_path / f"out{count}", "--vehicle", name) == 0
         assert capfd.readouterr().err.count("divide by 1000") == count
     train = "train --model quad --list-settings --vehicle"
     assert run(train, tmp_path / "mm.toml") == 0
@@ -169,3 +171,20 @@ def test_the_command_line_asks_for_model_and_vehicle_together():
         resolve(Config(recipe="race-paper", vehicle="racer5"))
     with pytest.raises(ValueError, match="Did you mean 'racer5'"):
         resolve(Config(model="quad", vehicle="racer6"))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [
+        ("track", ["zigzag"], "a text, a path or a Track"),
+        ("vehicle", {}, "a name, a path or a Vehicle"),
+        ("trials", 1.5, "a whole number, 1 to"),
+        ("seed", "1", "a whole number, 0 to"),
+        ("workers", "2", "a whole number or None"),
+    ],
+)
+def test_from_python_an_argument_of_another_type_is_refused(name, value, allowed):
+    with pytest.raises(ValueError, match=re.escape(f"{name} is {value!r}, allowed is {allowed}")):
+        suite.evaluate_policy("race-paper", **{name: value})
+    with pytest.raises(ValueError, match="flights is 3, allowed is a text or a path"):
+        suite.diagnose_flights(3, "reference", "out")  # type: ignore[arg-type]
