@@ -188,3 +188,24 @@ def test_from_python_an_argument_of_another_type_is_refused(name, value, allowed
         suite.evaluate_policy("race-paper", **{name: value})
     with pytest.raises(ValueError, match="flights is 3, allowed is a text or a path"):
         suite.diagnose_flights(3, "reference", "out")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("tracks --difficulty 3", "--difficulty, --seed and --out are for a picture"),
+        ("tracks --out pictures", "such as suite tracks zigzag"),
+        ("tracks all", "TRACK is 'all', allowed is one of zigzag, circular, ellipse, random, or"),
+        ("view raec", "unknown RUN 'raec'. Did you mean 'race'?"),
+        (
+            "view nothere",
+            "The --out folder of a suite eval, a checkpoint's folder or a policy file",
+        ),
+    ],
+)
+def test_names_and_options_without_effect_are_refused_with_what_is_allowed(
+    line, words, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert words in refused(capsys, line)
+    assert not list(tmp_path.iterdir())

@@ -96,7 +96,10 @@ def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path, capsys):
     assert compare_runs(*read_runs(a), *read_runs(old))["trials"] == 40
     with pytest.raises(ValueError, match="10 trials are in only one of them"):
         compare_runs(*read_runs(a), *read_runs(run_of(tmp_path / "d", [True] * 30)))
-    for folder, said in ((tmp_path, "no trials.parquet"), (None, "less than twice")):
+    for folder, said in (
+        (tmp_path, "no trials.parquet"),
+        (None, r"of two policies .* \(given: 1\)"),
+    ):
         with pytest.raises(ValueError, match=said):
             compare.run(compare.Config((a, folder) if folder else (a,)), Quiet())
 
