@@ -127,15 +127,11 @@ def policy_notes(runs: Sequence[Run], others: Sequence[Run] = ()) -> list[str]:
     ]
     notes = []
     for run, other in pairs:
+        names = f"{run.name} and {other.name}"
         if run.manner != other.manner:
-            said = (
-                "flew with different --speed or --monitor, so the difference includes this effect"
-            )
+            notes.append(f"{names}: --speed or --monitor differ, which the difference includes")
         elif run.digest and run.digest == other.digest:
-            said = "have the same policy, so no difference is expected"
-        else:
-            continue
-        notes.append(f"{run.name} and {other.name}: {said}")
+            notes.append(f"{names}: have the same policy, so no difference is expected")
     return notes
 
 

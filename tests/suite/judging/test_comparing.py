@@ -191,7 +191,7 @@ def test_runs_of_one_policy_or_of_other_speeds_are_noted(tmp_path, capsys):
         run_of(tmp_path / name, [True, False], judged, policy, weights="w")
         for name, judged, policy in (("a", None, "p"), ("b", None, "p"), ("c", SPEEDS, "p@1"))
     )
-    for other, said in ((b, "have the same policy"), (fast, "different --speed or --monitor")):
+    for other, said in ((b, "have the same policy"), (fast, "--speed or --monitor differ")):
         for config in (compare.Config((a, other)), compare.Config((a,), against=(other,))):
             compare.run(config, Quiet())
             assert said in " ".join(capsys.readouterr().err.split())
