@@ -7,7 +7,7 @@ Other packages are imported at the first use of a name, so that `import suite` t
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -92,11 +92,19 @@ def evaluate_policy(
     """
     from eval.judging.outputs import action_report, notes_of, object_faults
     from eval.logs.faults.vehicle import vehicle_doubts
+    from eval.vehicles.vehicle import Vehicle
     from policies.policy import check_is_policy, load_policy
     from suite.judging.flying import fly_trials, policy_for_workers
     from suite.judging.requests import Evaluation
     from suite.judging.trials import read_trial_set
+    from tracks.input.ranges import check_type
+    from tracks.track import Track
 
+    path = (str, Path)
+    check_type("track", track, (*path, Track), "a text, a path or a Track; several in one text "
+               "with commas")  # fmt: skip
+    check_type("vehicle", vehicle, (*path, Vehicle), "a name, a path or a Vehicle")
+    check_type("workers", workers, (int, type(None)), "a whole number or None")
     loaded = load_policy(policy) if isinstance(policy, str | Path) else policy
     check_is_policy(loaded)
     given: dict[str, Any] = {"track": track, "vehicle": vehicle}
@@ -148,8 +156,10 @@ def train_policy(
     from suite.commands.train import Config, resolve
     from suite.train.run import train
 
-    options = Config(recipe=recipe, iterations=iterations, set=_all(settings), seed=seed)
-    outcome = train(resolve(options), Path(out), _console(progress))
+    options = Config(
+        recipe=recipe, iterations=iterations, set=_all("settings", settings), seed=seed
+    )
+    outcome = train(resolve(options), _path("out", out), _console(progress))
     return Path(outcome.policy)
 
 
@@ -176,8 +186,12 @@ def diagnose_flights(
     from suite.diagnose.config import Config
     from suite.diagnose.run import diagnose_files
 
-    paths, before = (tuple(map(Path, _all(given))) for given in (flights, reference))
-    config = Config(flights=paths, vehicle=str(vehicle), reference=before, out=Path(out))
+    paths, before = (
+        tuple(map(Path, _all(name, given)))
+        for name, given in (("flights", flights), ("reference", reference))
+    )
+    file = str(_path("vehicle", vehicle))
+    config = Config(flights=paths, vehicle=file, reference=before, out=_path("out", out))
     return diagnose_files(config, _console(progress))
 
 
@@ -197,13 +211,27 @@ def identify_vehicle(
     """
     from suite.diagnose.identify.run import identify_files
 
-    paths = [*map(Path, _all(flights))]
-    return identify_files(paths, str(vehicle), Path(out), (), _console(progress))
+    paths = [*map(Path, _all("flights", flights))]
+    start = str(_path("vehicle", vehicle))
+    return identify_files(paths, start, _path("out", out), (), _console(progress))
 
 
-def _all(given: Any) -> tuple[Any, ...]:
-    """Return one text or path, or a sequence of them, as a tuple."""
-    return (given,) if isinstance(given, str | Path) else tuple(given)
+def _all(name: str, given: Any) -> tuple[Any, ...]:
+    """Return the argument `name`, one text or path or a sequence of them, as a tuple."""
+    entries = (
+        tuple(given) if isinstance(given, Iterable) and not isinstance(given, str) else (given,)
+    )
+    for entry in entries:
+        _path(name, entry)
+    return entries
+
+
+def _path(name: str, given: Any) -> Path:
+    """Return the argument `name`, a text or a path, as a path."""
+    from tracks.input.ranges import check_type
+
+    check_type(name, given, (str, Path), "a text or a path")
+    return Path(given)
 
 
 def make_env(**settings: Any) -> gymnasium.Env[Any, Any]:

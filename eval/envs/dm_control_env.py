@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from dm_env import specs
 from eval.envs.race import ACTION_LIMIT, Race
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds.engine import refuse_start_contact
+from eval.worlds.engine import course_notes
 from eval.worlds.trial import Rules
 from policies.spec import ACTION_SIZE, PolicySpec
 from tracks.families import make_track
@@ -109,7 +110,8 @@ def load(
     """
     vehicle = vehicle or load_vehicle("reference")
     if track is not None:
-        refuse_start_contact(track.family, track, vehicle)
+        for note in course_notes(track.family, track, vehicle):
+            warnings.warn(note, stacklevel=2)
     track = track or make_track(family, level, seed)
     race = Race(track, vehicle, spec or PolicySpec(), rules or Rules())
     physics = RacePhysics.from_model(wrapper.MjModel(race.model))

@@ -128,7 +128,7 @@ class RaceEnv(_OfRaces, gymnasium.Env):
             TypeError: for an unknown argument.
         """
         check_render_mode(render_mode, self.metadata["render_modes"])
-        self._races = Races(RaceConfig(**config), 1)
+        self._races = Races(RaceConfig.of(**config), 1)
         self.action_space = action_space(self._races.spec)
         self.observation_space = observation_space(self._races.spec)
         self.render_mode, self._arguments = render_mode, {"render_mode": render_mode}
@@ -212,7 +212,7 @@ class RaceVectorEnv(_OfRaces, VectorEnv):
             TypeError: for an unknown argument.
         """
         check_render_mode(render_mode, ())
-        self._races = Races(RaceConfig(**config), num_envs, threads)
+        self._races = Races(RaceConfig.of(**config), num_envs, threads)
         self.num_envs, self.render_mode = num_envs, render_mode
         self._arguments = {"num_envs": num_envs, "threads": threads, "render_mode": render_mode}
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}

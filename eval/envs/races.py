@@ -8,9 +8,11 @@ environment and N environments give the same results.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from numbers import Integral
+from numbers import Integral, Real
+from types import NoneType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +27,7 @@ from eval.envs.race import (
 from eval.judging.guard import ActionLimits, check_rate, first_action, guard_action, limits_of
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds.engine import refuse_start_contact
+from eval.worlds.engine import course_notes
 from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.slots import layout_of
 from eval.worlds.trial import ENDINGS, FLYING, Rules, TrialSpec, steps_to_next
@@ -37,6 +39,7 @@ from policies.spec import ActionSpec, PolicySpec, check_spec
 from tracks.common.names import unknown_name
 from tracks.families import LEVELS, check_family, make_track
 from tracks.formats.custom import load_track
+from tracks.input.ranges import check_type
 from tracks.track import Track
 
 SEEDS = 2**31
@@ -105,6 +108,32 @@ class RaceConfig:
     rules: Rules = field(default_factory=Rules)
     """Rules for the end of an episode."""
 
+    @classmethod
+    def of(cls, **arguments: Any) -> RaceConfig:
+        """Return a configuration from arguments, of which `level` and `track_seed` are unchecked.
+
+        Raises:
+            TypeError: for an unknown argument, with the most similar one.
+            ValueError: for an argument of another type.
+        """
+        names = [entry.name for entry in fields(cls)]
+        for name in arguments.keys() - set(names):
+            likely = {"difficulty": "level", "seed": "track_seed"}.get(name, name)
+            raise TypeError(str(unknown_name("argument", likely, names)).replace(likely, name, 1))
+        config = cls(**arguments)
+        path = (str, os.PathLike)
+        check_type("track", config.track, path, "a track family or a track file (.toml)")
+        if not callable(config.vehicle):
+            said = "a name, a file, a Vehicle or a function that draws one"
+            check_type("vehicle", config.vehicle, (*path, Vehicle), said)
+        said = "a policy's name or folder, a spec or None"
+        check_type("spec", config.spec, (*path, PolicySpec, NoneType), said)
+        check_type("rewards", config.rewards, (Mapping,), "weights by name of the reward term")
+        for name, weight in config.rewards.items():
+            check_type(f"rewards[{name!r}]", weight, (Real,), "a number")
+        check_type("rules", config.rules, (Rules,), "an eval.worlds.trial.Rules")
+        return config
+
 
 def levels_of(config: RaceConfig) -> tuple[int, int]:
     """Return the lowest and the highest level.
@@ -116,7 +145,7 @@ def levels_of(config: RaceConfig) -> tuple[int, int]:
     levels = list(given) if isinstance(given, Iterable) else [given, given]
     whole = len(levels) == 2 and all(isinstance(level, Integral) for level in levels)
     if not whole or not LEVELS[0] <= levels[0] <= levels[1] <= LEVELS[-1]:
-        raise ValueError(f"level is {given}, allowed is 0 to 9, or (lowest, highest)")
+        raise ValueError(f"level is {given!r}, allowed is 0 to 9, or (lowest, highest)")
     return int(levels[0]), int(levels[1])
 
 
@@ -201,7 +230,12 @@ class Races:
         check_spec(self.spec)
         check_rate("the spec", self.spec.rate_hz, vehicle.controller.frequency)
         if self._file_track:
-            refuse_start_contact(self._track, self._file_track, vehicle)
+            for note in course_notes(self._track, self._file_track, vehicle):
+                warnings.warn(note, stacklevel=2)
+            ignored = {"level": levels_of(config) != (0, 0), "track_seed": config.track_seed}
+            for setting in [setting for setting, given in ignored.items() if given]:
+                said = f"a track from a file has no levels and seeds: {setting} does not change it"
+                warnings.warn(f"{self._track}: {said}", stacklevel=2)
         self.contract: Contract = contract_of(self.spec)
         layout = layout_of([self._file_track] if self._file_track else [])
         self._world = MujocoWorld(

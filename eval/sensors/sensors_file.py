@@ -72,6 +72,17 @@ class SensorSet:
         return None
 
     @property
+    def without_effect(self) -> list[str]:
+        """Names of models that add no errors, since the sizes of all their errors are neutral."""
+        found = []
+        for name, values in self.models.items():
+            sensor = SENSORS[name]
+            sizes = [entry for entry in sensor.parameters if entry.name in sensor.grows]
+            if sizes and sensor.estimate is None:
+                found += [name] * all(getattr(values, p.name) == p.neutral for p in sizes)
+        return found
+
+    @property
     def random(self) -> bool:
         """Whether what a policy observes depends on the trial's seed."""
         sensors = [SENSORS[name] for name in self.models]

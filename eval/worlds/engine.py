@@ -19,6 +19,7 @@ from eval.worlds.trial import (
     start_progress,
 )
 from tracks.formats.mujoco_scene import add_scene, solid_name
+from tracks.formats.plausibility import track_notes
 from tracks.geometry.camera import Camera, cast_rays_b, nearest
 from tracks.geometry.rotation import to_world
 from tracks.geometry.scene import Counts, Gates, counts
@@ -165,6 +166,24 @@ def refuse_start_contact(name: str, track: Track, vehicle: Vehicle) -> None:
             f"{name}: at start.position {np.round(track.start_pos_w, 3).tolist()} the body of "
             f"{vehicle.name!r} ({sides} m) touches {contact_name(model, data)}; move the start away"
         )
+
+
+def course_notes(name: str, track: Track, vehicle: Vehicle) -> list[str]:
+    """Return notes on what is probably a mistake in a track from a file that `vehicle` flies.
+
+    Raises:
+        ValueError: if the vehicle is in contact at the start.
+    """
+    refuse_start_contact(name, track, vehicle)
+    # Width and height (N, 2) of the gates, and of the body; the vehicle may fly rolled by 90 deg.
+    openings = np.ptp(track.scene.gates.opening_g, axis=1)
+    body = 2 * np.sort(vehicle.body.half_size[1:])
+    small = np.flatnonzero((np.sort(openings) <= body).any(axis=1))
+    return track_notes(name, track) + [
+        f"{name}: gate {gate} is {openings[gate][0]:g} x {openings[gate][1]:g} m, too small for "
+        f"the body of {vehicle.name!r} ({body[1]:g} x {body[0]:g} m)"
+        for gate in small[:1]
+    ]
 
 
 def start_state(track: Track) -> np.ndarray:

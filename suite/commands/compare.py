@@ -39,6 +39,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from suite.judging.comparing import (
         compare_runs,
         compare_seeds,
+        policy_notes,
         read_runs,
         version_notes,
     )
@@ -51,12 +52,15 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     runs = [run for folder in config.runs for run in read_runs(folder)]
     others = [run for folder in config.against for run in read_runs(folder)]
     if len(runs) < 2 and not (runs and others):
-        raise ValueError("RUN is given less than twice; give two folders or more of suite eval")
+        raise ValueError(
+            "a comparison needs the results of two policies or more; give the --out folders of "
+            f"suite eval, such as suite compare runs/a runs/b (given: {len(runs) + len(others)})"
+        )
     if config.seeds or (others and max(len(runs), len(others)) > 1):
         comparisons = [compare_seeds(runs, others)]
     else:
         comparisons = [compare_runs(runs[0], other) for other in (others or runs[1:])]
-    for note in version_notes([*runs, *others]):
+    for note in [*version_notes([*runs, *others]), *policy_notes(runs, others)]:
         console.note(note)
     for comparison in comparisons:
         console.say(comparison["sentence"])

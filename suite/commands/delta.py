@@ -65,7 +65,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     dynamics = recipe.quadrotor or recipe.physics
     context = CheckContext(recipe.quadrotor.vehicle if recipe.quadrotor else None)
     flights = read_checked(config.flights, context, [*config.accept, *COMPENSATED])
-    result = fit_delta(fitting, dynamics, flights, config.out, console)
+    result = fit_delta(fitting, dynamics, flights, config.out, console, config)
     errors = plain(result.errors)
     console.say(markdown(errors_grid({"horizon_s": fitting.horizon_s, **errors})))
     console.say(f"delta: {config.out / 'delta'}")

@@ -39,10 +39,16 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for an unknown family, a level out of range, or an invalid track file.
     """
+    seed_given = config.seed != Config.seed
     if not config.track:
+        if config.difficulty != Config.difficulty or seed_given or config.out != Config.out:
+            raise ValueError(
+                "--difficulty, --seed and --out are for a picture; name its track, such as suite "
+                "tracks zigzag, or leave them out to list the families"
+            )
         return _list_families(console)
     from eval.view.picture import write_grid, write_picture
-    from tracks.families import check_family, make_track
+    from tracks.families import FAMILIES, check_family, make_track
 
     pictures = []
     if is_track_file(config.track):
@@ -54,7 +60,12 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             console.note(note)
         if config.difficulty != Config.difficulty:
             console.note(NO_LEVELS)
+        if seed_given:
+            console.note("nothing in a track from a file is random, so --seed does not change it")
     else:
+        if config.track == "all" or "," in config.track:
+            known = ", ".join(FAMILIES)
+            raise ValueError(f"TRACK is {config.track!r}, allowed is one of {known}, or a file")
         check_family(config.track)
         levels = parse_levels(config.difficulty)
         tracks = [make_track(config.track, level, config.seed) for level in levels]

@@ -124,6 +124,7 @@ def _choose_trials(
 
     The SHA-256 is None if RUN is a policy: there is no evaluation to compare the inputs with.
     """
+    from policies.shipped import locate, names
     from suite.judging.flying import default_policy, manners
     from suite.judging.replay import first_trials, read_digests, read_evaluation
     from suite.judging.requests import Evaluation
@@ -142,6 +143,11 @@ def _choose_trials(
                     f"--{name} is {value}, but {folder} is not a finished run of suite eval; leave "
                     "it out"
                 )
+        if not locate(config.run).exists():
+            raise ValueError(
+                f"{unknown_name('RUN', config.run, names())} The --out folder of a suite eval, a "
+                "checkpoint's folder or a policy file is allowed as well."
+            )
         evaluation = Evaluation(
             policies=(config.run,),
             track=config.track,

@@ -30,15 +30,26 @@ def claim(out: Path, config: Any, seed: int) -> None:
     Raises:
         ValueError: with the differences, if `out` has a run of another configuration.
     """
+    refuse_other_options(out, config)
+    if not (out / "run.json").is_file():
+        write_run_record(out, config, seed)
+
+
+def refuse_other_options(out: Path, config: Any) -> None:
+    """Refuse a folder with a run of other options than `config`, so that no result is overwritten.
+
+    Raises:
+        ValueError: with the differences, except in the name of the folder and in --json.
+    """
     path = out / "run.json"
     if not path.is_file():
-        write_run_record(out, config, seed)
         return
     try:
-        stored = read_json(path)["config"]
+        stored = dict(read_json(path)["config"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not the record of a run ({error}); move it away") from error
-    changes = differences(stored, plain(config))
+    unchanged = {name: stored.get(name) for name in ("out", "json")}
+    changes = differences({**stored, **unchanged}, {**plain(config), **unchanged})
     if changes:
         raise ValueError(
             f"{out} holds a run of another configuration ({first_changes(changes)}); give another "

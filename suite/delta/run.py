@@ -15,7 +15,7 @@ from policies.formats.checkpoint import save_arrays
 from policies.formats.policy_file import DELTA
 from suite.common.console import Console
 from suite.common.provenance import refuse_other_run, write_run_record
-from suite.common.stages import Estimate, announce
+from suite.common.stages import Estimate, announce, refuse_other_options
 from suite.delta.fit import DeltaFit, FitConfig, fit_network, fit_point_mass
 from suite.delta.replay import QUAD, describe_dynamics
 from suite.delta.windows import cut_windows, decision_rate
@@ -89,15 +89,20 @@ def fit_delta(
     flights: CheckedFlights,
     out: Path,
     console: Console,
+    request: Any = None,
 ) -> DeltaFit:
     """Fit the Delta Action Model to flight logs; write delta/, delta.json and table.md into `out`.
 
-    It corrects the trainer's point mass or quadrotor, `dynamics`.
+    It corrects the trainer's point mass or quadrotor, `dynamics`. run.json records `request`, the
+    options of the command, or else `config`.
 
     Raises:
-        ValueError: for flights that are too few or too short, or lack a column.
+        ValueError: for flights that are too few or too short, or lack a column, and if `out` has a
+            fit with other options.
     """
-    refuse_other_run(out, config)
+    request = request or config
+    refuse_other_run(out, request)
+    refuse_other_options(out, request)
     # Hold some of the flights out.
     logs, short = long_enough(flights.logs, config.horizon_s)
     for warning in [*flights.warnings, *short]:
@@ -144,7 +149,7 @@ def fit_delta(
         "curve": result.curve,
         "findings": flights.findings,
     }
-    write_run_record(out, config, config.seed)
+    write_run_record(out, request, config.seed)
     stored = {**plain(config), **description, "rate_hz": rate_hz}
     save_arrays(out / "delta", result.params, kind=DELTA, seed=config.seed, extra={"fit": stored})
     summary = plain(record)

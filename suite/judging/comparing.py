@@ -117,6 +117,24 @@ def version_notes(runs: Sequence[Run]) -> list[str]:
     ]
 
 
+def policy_notes(runs: Sequence[Run], others: Sequence[Run] = ()) -> list[str]:
+    """Return notes on compared runs of one policy, and of other commanded speeds or the monitor.
+
+    Each of `runs` is compared with each of `others`, or the first one with the rest.
+    """
+    pairs = [(run, other) for run in runs for other in others] or [
+        (runs[0], other) for other in runs[1:]
+    ]
+    notes = []
+    for run, other in pairs:
+        names = f"{run.name} and {other.name}"
+        if run.manner != other.manner:
+            notes.append(f"{names}: --speed or --monitor differ, which the difference includes")
+        elif run.digest and run.digest == other.digest:
+            notes.append(f"{names}: have the same policy, so no difference is expected")
+    return notes
+
+
 def compare_runs(first: Run, other: Run) -> dict[str, Any]:
     """Return the difference of two runs on the same trials, as numbers and as a sentence.
 

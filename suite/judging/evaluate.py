@@ -24,7 +24,7 @@ from eval.worlds.trial import TrialResult
 from policies.policy import Policy
 from suite.common.console import Console
 from suite.common.provenance import engines, refuse_other_run, write_run_record
-from suite.common.stages import announce
+from suite.common.stages import announce, refuse_other_options
 from suite.judging.comparing import paired_sentence
 from suite.judging.flying import (
     Manner,
@@ -80,6 +80,9 @@ def evaluate(
     # Read the options: trials, and entries.
     trial_set, out = read_trial_set(evaluation), Path(out)
     refuse_other_run(out, evaluation)
+    # Journals of an interrupted evaluation are checked when they are opened.
+    if not any(out.glob("journal-*.jsonl")):
+        refuse_other_options(out, evaluation)
     sources = tuple(evaluation.policies or (default_policy(),))
     policies = [load_in_manner(source, evaluation.trust) for source in sources]
     labels = policy_labels(sources, [policy.name for policy in policies])

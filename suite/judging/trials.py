@@ -151,8 +151,7 @@ def read_trial_set(
     from eval.sensors import SENSORS
     from eval.sensors.sensors_file import load_sensors
     from eval.worlds import differences, world_class
-    from eval.worlds.engine import refuse_start_contact
-    from tracks.formats.plausibility import track_notes
+    from eval.worlds.engine import course_notes
 
     world_class(options.simulator)
     check_ranges(options, options=True)
@@ -173,6 +172,11 @@ def read_trial_set(
             "noise) all flights on a track from a file are equal"
             for name in once
         ]
+    notes += [
+        f"sensors {sensors.name!r}: {name} has no effect, because the sizes of all its errors are "
+        f"zero or left out; give one, such as {SENSORS[name].grows[0]!r}"
+        for name in sensors.without_effect
+    ]
     if sensors.estimator is None and any(SENSORS[name].measure for name in sensors.models):
         notes.append(
             f"sensors {sensors.name!r}: the IMU has no effect, because only an estimator "
@@ -181,26 +185,10 @@ def read_trial_set(
     if levels != [0] and options.difficulty != type(options).difficulty:
         notes += [f"{name}: {NO_LEVELS}" for name in tracks]
     for name, custom in tracks.items():
-        refuse_start_contact(name, custom, vehicle)
-        notes += [*track_notes(name, custom), *_too_small(name, custom, vehicle)]
+        notes += course_notes(name, custom, vehicle)
     trials = trial_list(names, levels, options.trials, options.seed, once)
     simulator_differences = differences(options.simulator, vehicle)
     return TrialSet(trials, tracks, vehicle, sensors, simulator_differences, notes)
-
-
-def _too_small(name: str, track: Track, vehicle: Vehicle) -> list[str]:
-    """Return a note if the vehicle's body is larger than the opening of a gate."""
-    import numpy as np
-
-    # Width and height (N, 2) of the gates, and of the body; the vehicle may fly rolled by 90 deg.
-    openings = np.ptp(track.scene.gates.opening_g, axis=1)
-    body = 2 * np.sort(vehicle.body.half_size[1:])
-    small = np.flatnonzero((np.sort(openings) <= body).any(axis=1))
-    return [
-        f"{name}: gate {gate} is {openings[gate][0]:g} x {openings[gate][1]:g} m, too small for "
-        f"the body of {vehicle.name!r} ({body[1]:g} x {body[0]:g} m)"
-        for gate in small[:1]
-    ]
 
 
 def log_name(track: str, difficulty: int, seed: int) -> str:

@@ -206,7 +206,8 @@ def with_sensors(config: TrainConfig, sensors: str) -> TrainConfig:
             f"--sensors {sensors}: its estimator follows flights of the judge, not of the "
             "trainer; train with vio, or with what suite identify --sensors writes"
         )
-    if seen.models and not view_models(seen.models) and not seen.has_delay:
+    acting = {name: seen.models[name] for name in seen.models if name not in seen.without_effect}
+    if seen.models and not view_models(acting) and not seen.has_delay:
         raise ValueError(
             f"--sensors {sensors}: {', '.join(seen.models)} does not change what a policy sees, so "
             "training with it has no effect; leave --sensors out"

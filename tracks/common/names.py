@@ -46,7 +46,7 @@ def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> ValueError:
     The message has the name, the closest allowed name (or those that contain it), and all allowed
     names.
     """
-    allowed = list(allowed)
+    allowed, name = list(allowed), str(name)  # a program may give anything as a name
     similar = [guess] if (guess := closest(name, allowed)) else _containing(name, allowed)
     hint = f" Did you mean {', '.join(map(repr, similar))}?" if similar else ""
     return ValueError(f"unknown {kind} {name[:LONGEST]!r}.{hint} Known: {', '.join(allowed)}.")

@@ -31,6 +31,8 @@ FARTHEST_M = 1e5
 """Largest allowed coordinate, as in a flight log [m]."""
 LEAST_M, MOST_M = 1e-3, 1e5
 """Smallest and largest allowed length [m]."""
+ANGLE_MOST_DEG = 3600.0
+"""Largest allowed angle, ten turns: the heading along a course may count its turns [deg]."""
 MOST_TABLES = 1000
 """Largest number of gates, and of solids of each kind; so many are read in about a second."""
 _RESERVED = (
@@ -38,6 +40,11 @@ _RESERVED = (
     *(f"rotor_{number} {part}" for number in range(1, 5) for part in ("arm", "disk")),
 )
 """Names that other geoms of the suite's MuJoCo models have."""
+_TOP_KEYS = (
+    *("schema", "name", "start", "gates"),
+    *("boxes", "cylinders", "capsules", "spheres", "meshes"),
+)
+"""All keys at the top of a file."""
 _GATE_KEYS = (
     *("center", "yaw_deg", "pitch_deg", "roll_deg", "quat_wxyz", "width", "height", "radius"),
     *("corners", "polygon", "frame_width", "frame_depth"),
@@ -60,6 +67,7 @@ def load_track(path: str | os.PathLike[str]) -> Track:
             opening or a mesh that is not convex, a start inside a solid).
     """
     top = read_toml(Path(path))
+    top.expect(_TOP_KEYS)
     top.whole("schema", 1, least=1, most=1)
     name = top.text("name", top.path.stem)
     gate_tables = _tables(top, "gates")
@@ -74,7 +82,6 @@ def load_track(path: str | os.PathLike[str]) -> Track:
     capsules, capsule_names = _solids_of_kind(top, "capsules", _rod, names)
     spheres, sphere_names = _solids_of_kind(top, "spheres", _sphere, names)
     meshes, mesh_names = _meshes(top, names)
-    top.close()
 
     all_boxes, frame_names = with_frames(gates, Boxes(*_columns(boxes, [(3,), (3, 3), (3,)])))
     scene = Scene(
@@ -218,7 +225,7 @@ def rotation(table: Table) -> np.ndarray:
     """
     if table.has("quat_wxyz"):
         return quat_to_rot(_unit(table, "quat_wxyz", table.vector("quat_wxyz", 4)))
-    angles = np.deg2rad([table.number(f"{angle}_deg", 0.0) for angle in ("yaw", "pitch", "roll")])
+    angles = np.deg2rad([_angle(table, f"{angle}_deg", 0.0) for angle in ("yaw", "pitch", "roll")])
     (cy, cp, cr), (sy, sp, sr) = np.cos(angles), np.sin(angles)
     yaw = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     pitch = np.array([[cp, 0, -sp], [0, 1, 0], [sp, 0, cp]])
@@ -232,6 +239,10 @@ def _place(table: Table, key: str, default: Iterable[float] = REQUIRED) -> np.nd
 
 def _length(table: Table, key: str, default: float = REQUIRED) -> float:
     return table.number(key, default, least=LEAST_M, most=MOST_M)
+
+
+def _angle(table: Table, key: str, default: float) -> float:
+    return table.number(key, default, least=-ANGLE_MOST_DEG, most=ANGLE_MOST_DEG)
 
 
 def _unit(table: Table, key: str, vector: np.ndarray) -> np.ndarray:
@@ -253,7 +264,7 @@ def _start(top: Table, gates: Gates) -> tuple[np.ndarray, float]:
     if pos_w[2] <= 0:
         raise table.error("position", pos_w.tolist(), "a position above the ground (z > 0)")
     to_gate = gates.center_w[0] - pos_w
-    yaw_deg = table.number("yaw_deg", float(np.rad2deg(np.arctan2(to_gate[1], to_gate[0]))))
+    yaw_deg = _angle(table, "yaw_deg", float(np.rad2deg(np.arctan2(to_gate[1], to_gate[0]))))
     table.close()
     return pos_w, float(np.deg2rad(yaw_deg))
 

@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from tracks.track import Track
 
+if TYPE_CHECKING:
+    import trimesh
+
 OPENING_MOST_M, STEP_MOST_M = 20.0, 200.0
-"""Largest plausible opening of a gate, and distance between gates that follow each other [m]."""
+"""Largest plausible opening of a gate, and distance between gates that follow each other, of the
+start from gate 0, and of a solid from all of these [m]."""
+FRAME_MOST_M = 5.0
+"""Largest plausible width and depth of a gate's frame, the largest of a race are about 1 m [m]."""
+THICK_MOST_M = 30.0
+"""Largest plausible size of a solid along its thinnest side; the thinnest of a building is less,
+and an object of 0.3 m has it if centimetres are read as metres [m]."""
+CLEAR_M = 0.5
+"""Distance before and after a gate's centre that a drone cannot fly round [m]."""
 QUARTER_DEG = np.pi / 4
 """A yaw of 45 deg, if it is written in radians [deg]."""
 ROUNDING = 0.005
@@ -25,19 +38,21 @@ def track_notes(name: str, track: Track) -> list[str]:
     gates, notes = track.scene.gates, []
     center_w, ahead_w = gates.center_w, gates.rot_w[:, :, 0]
     opening_m = float(np.ptp(gates.opening_g, axis=1).max())
-    step_m = float(np.linalg.norm(np.diff(center_w, axis=0), axis=1).max(initial=0.0))
-    if opening_m > OPENING_MOST_M or step_m > STEP_MOST_M:
+    frame_m = float(max(gates.frame_width.max(), gates.frame_depth.max()))
+    way_w = np.diff(np.vstack([track.start_pos_w, center_w]), axis=0)  # to each gate
+    length_m = np.linalg.norm(way_w, axis=1)
+    step_m = float(length_m.max())
+    if opening_m > OPENING_MOST_M or frame_m > FRAME_MOST_M or step_m > STEP_MOST_M:
         notes.append(
-            f"its largest gate is {opening_m:g} m wide and gates are up to {step_m:g} m apart; is "
-            "the file in centimetres or millimetres? Lengths are in metres"
+            f"its largest gate is {opening_m:g} m wide, with a frame of up to {frame_m:g} m, and "
+            f"start and gates are up to {step_m:g} m apart; is the file in centimetres or "
+            "millimetres? Lengths are in metres"
         )
     yaw_deg = np.rad2deg(np.arctan2(ahead_w[:, 1], ahead_w[:, 0]))
     written = _in_radians(yaw_deg)
     if written.any() and np.abs(yaw_deg).max() < 2.0 * np.pi + ROUNDING:
         gate = int(np.argmax(written))
         notes.append(f"gate {gate} has a yaw of {yaw_deg[gate]:.4g} deg; is yaw_deg in radians?")
-    way_w = np.diff(np.vstack([track.start_pos_w, center_w]), axis=0)  # to each gate
-    length_m = np.linalg.norm(way_w, axis=1)
     way_w = way_w / np.maximum(length_m, 1e-9)[:, None]
     start_deg = np.rad2deg(track.start_yaw)
     # The cosines for the yaw as read, and for radians that were written as degrees.
@@ -46,17 +61,22 @@ def track_notes(name: str, track: Track) -> list[str]:
     ]
     if _in_radians(start_deg) and heading[0] < AWAY and heading[1] > TOWARDS:
         notes.append(f"the start has a yaw of {start_deg:.4g} deg; is start.yaw_deg in radians?")
+    elif heading[0] < AGAINST:
+        notes.append("the start faces away from gate 0; turn start.yaw_deg by 180 deg?")
     for gate in np.flatnonzero((length_m[1:] > 1e-3) & (length_m[1:] < STEP_LEAST_M))[:1]:
         apart_m = length_m[gate + 1]
         notes.append(f"gates {gate} and {gate + 1} are only {apart_m:.2g} m apart; in metres?")
     cosine = (way_w * ahead_w).sum(axis=1), (way_w[1:] * ahead_w[:-1]).sum(axis=1)
-    for gate in np.flatnonzero((cosine[0][:-1] < AGAINST) & (cosine[1] < AGAINST))[:1]:
+    against = np.flatnonzero((cosine[0][:-1] < AGAINST) & (cosine[1] < AGAINST))
+    for gate in against[:1]:
         notes.append(f"gate {gate} faces against the path to and from it; turn its yaw by 180 deg?")
+    if cosine[0][0] < AGAINST and 0 not in against:
+        notes.append("the start is behind gate 0, on the side where the drone leaves it")
     # A gate may be listed again, for another lap, but not next to itself.
     step_w, turn = np.diff(center_w, axis=0), (ahead_w[1:] * ahead_w[:-1]).sum(axis=1)
     for gate in np.flatnonzero((np.linalg.norm(step_w, axis=1) < 1e-3) & (turn > 0.999))[:1]:
         notes.append(f"gates {gate} and {gate + 1} have the same place and direction")
-    return [f"{name}: {note}" for note in [*notes, *_blocked(track)]]
+    return [f"{name}: {note}" for note in [*notes, *_misplaced(track)]]
 
 
 def _in_radians(yaw_deg: np.ndarray | float) -> np.ndarray:
@@ -65,13 +85,43 @@ def _in_radians(yaw_deg: np.ndarray | float) -> np.ndarray:
     return (quarters != 0) & (np.abs(yaw_deg - quarters * QUARTER_DEG) < ROUNDING)
 
 
-def _blocked(track: Track) -> list[str]:
-    """Return a note on a solid that contains a gate's centre."""
+def _misplaced(track: Track) -> list[str]:
+    """Return notes on a solid in front of or in a gate, and on too large and too distant ones."""
     # Imported here, because trimesh takes long to import and only custom tracks need it.
-    from tracks.formats.custom import is_inside
     from tracks.formats.meshes import solid_meshes
 
+    gates, notes = track.scene.gates, {}
+    course_w = np.vstack([track.start_pos_w, gates.center_w])
     for name, mesh in solid_meshes(track):
-        for gate in np.flatnonzero(is_inside(mesh, track.scene.gates.center_w))[:1]:
-            return [f"the centre of gate {gate} is inside {name!r}"]
-    return []
+        corners_w = np.asarray(mesh.vertices)
+        thick_m = float(np.ptp(corners_w, axis=0).min())
+        # Distance of the boxes around the solid and around the course.
+        gap_w = np.maximum(corners_w.min(0) - course_w.max(0), course_w.min(0) - corners_w.max(0))
+        far_m = float(np.linalg.norm(np.maximum(gap_w, 0.0)))
+        for gate in np.flatnonzero(_on_the_way(mesh, gates.center_w, gates.rot_w[:, :, 0])):
+            said = (
+                f"{name!r} is within {CLEAR_M:g} m in front of or behind the centre of gate {gate}"
+            )
+            notes.setdefault("blocked", said)
+        if thick_m > THICK_MOST_M:
+            said = f"{name!r} is {thick_m:.3g} m or more in all directions; is its file in metres?"
+            notes.setdefault("large", said)
+        if far_m > STEP_MOST_M:
+            notes.setdefault("far", f"{name!r} is {far_m:.3g} m away from all gates and the start")
+    return list(notes.values())
+
+
+def _on_the_way(mesh: trimesh.Trimesh, center_w: np.ndarray, ahead_w: np.ndarray) -> np.ndarray:
+    """Return the gates (N,) whose axis meets a convex mesh within `CLEAR_M` of the centre."""
+    point_w, normal_w = np.asarray(mesh.triangles)[:, 0], np.asarray(mesh.face_normals)
+    # The faces' normals point inwards or outwards, depending on the file.
+    inside = ((np.asarray(mesh.vertices).mean(0) - point_w) * normal_w).sum(-1)
+    normal_w = normal_w * np.where(inside > 0.0, -1.0, 1.0)[:, None]
+    # A part of an axis is inside where it is below all faces: above + slope * distance < 0.
+    above = (center_w[:, None] * normal_w).sum(-1) - (point_w * normal_w).sum(-1)
+    slope = ahead_w @ normal_w.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing_m = -above / slope
+    first_m = np.where(slope < 0.0, crossing_m, -CLEAR_M).max(axis=1, initial=-CLEAR_M)
+    last_m = np.where(slope > 0.0, crossing_m, CLEAR_M).min(axis=1, initial=CLEAR_M)
+    return (first_m < last_m) & ~((slope == 0.0) & (above >= 0.0)).any(axis=1)

@@ -15,6 +15,7 @@ import functools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Annotated, Any, TypeGuard, get_args, get_type_hints
 
 
@@ -32,6 +33,8 @@ class Range:
     """Whether values must be less than `high`."""
     ordered: bool = False
     """Whether a tuple's numbers must not decrease, as in a range from low to high."""
+    whole: bool = False
+    """Whether only whole numbers are allowed; `_fields` takes it from the annotated type."""
 
     def holds(self, value: float) -> bool:
         """Return whether `value` is allowed; NaN is not."""
@@ -57,6 +60,16 @@ Trials = Annotated[int, Range(1, 100_000)]
 """A number of trials or flights."""
 
 
+def check_type(name: str, value: object, kinds: tuple[type, ...], allowed: str) -> None:
+    """Refuse an argument that is of none of these types.
+
+    Raises:
+        ValueError: with the argument's name, its value and what is allowed.
+    """
+    if not isinstance(value, kinds) or isinstance(value, bool) and bool not in kinds:
+        raise ValueError(f"{name} is {shown(value)}, allowed is {allowed}")
+
+
 def check_ranges(config: Any, where: str = "", options: bool = False) -> None:
     """Refuse numbers outside their fields' ranges.
 
@@ -70,6 +83,9 @@ def check_ranges(config: Any, where: str = "", options: bool = False) -> None:
         name = f"--{path[-1].replace('_', '-')}" if options else where + ".".join(path)
         ends = value if isinstance(value, tuple) else (value,)
         text = " ".join(map(shown, ends)) if options else shown(value)
+        number, kind = ("a whole number, ", Integral) if allowed.whole else ("a number, ", Real)
+        for end in ends:
+            check_type(name, end, (kind,), f"{number}{allowed}")
         if not all(allowed.holds(end) for end in ends):
             raise ValueError(f"{name} is {text}, allowed is {allowed}")
         if allowed.ordered and list(ends) != sorted(ends):
@@ -116,6 +132,8 @@ def _fields(cls: type) -> tuple[tuple[str, str, Range | None], ...]:
     for field in dataclasses.fields(cls):
         metadata = list(_metadata(hints[field.name]))
         allowed = next((entry for entry in metadata if isinstance(entry, Range)), None)
+        if allowed and float not in (types := set(_types(hints[field.name]))):
+            allowed = dataclasses.replace(allowed, whole=int in types)
         names = (getattr(entry, "name", None) for entry in metadata)
         display_name = next((name for name in names if isinstance(name, str)), field.name)
         fields.append((field.name, display_name, allowed))
@@ -127,6 +145,13 @@ def _metadata(hint: Any) -> Iterator[Any]:
     yield from getattr(hint, "__metadata__", ())
     for part in get_args(hint):
         yield from _metadata(part)
+
+
+def _types(hint: Any) -> Iterator[Any]:
+    """Yield the types of which a type is made."""
+    yield hint
+    for part in get_args(hint):
+        yield from _types(part)
 
 
 def _number(value: float) -> str:

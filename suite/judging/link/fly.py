@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from eval.judging.monitor import Monitored
 from eval.worlds.trial import Rules, track_of
 from policies.block_policy import BlockPolicy, for_one_row
@@ -39,7 +41,7 @@ from suite.judging.link.flights import (
 from suite.judging.link.messages import Wire, dialect
 from suite.judging.link.server import COMPANION, VEHICLE, WAIT_S
 from suite.judging.link.udp import UdpLink
-from suite.judging.link.watchdog import Limits
+from suite.judging.link.watchdog import Limits, refuse_high_floor
 from suite.judging.requests import Evaluation
 from suite.judging.trials import TrialSet, read_trial_set, refuse_equal_names
 from tracks.common.files import write_json
@@ -88,6 +90,10 @@ def fly_over_link(
     dialect()
     trial_set = read_trial_set(evaluation, repeated=True)
     refuse_equal_names({trial.track for trial in trial_set.trials})
+    for trial in trial_set.trials:
+        track = track_of(trial_set.tracks, trial)
+        points_w = np.vstack([track.start_pos_w, track.scene.gates.center_w])
+        refuse_high_floor(points_w, limits)
     name = policy or default_policy()
     # The commanded speed is part of how the policy is loaded; the monitor is added below.
     (plain,) = manners(evaluation.speed, monitor=False)

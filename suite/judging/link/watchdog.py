@@ -64,6 +64,20 @@ def allowed_box(points_w: np.ndarray, limits: Limits) -> Box:
     return Box(low, high)
 
 
+def refuse_high_floor(points_w: np.ndarray, limits: Limits) -> None:
+    """Refuse a floor that is not below points (N, 3), the start and the gates of a track [m].
+
+    Raises:
+        ValueError: with the heights.
+    """
+    lowest_m = points_w[:, 2].min()
+    if limits.floor_m >= lowest_m:
+        raise ValueError(
+            f"--floor-m is {limits.floor_m:g}, allowed is less than {lowest_m:.3g}, the lowest "
+            "height of the start and the gates [m]: below the floor the companion hands over"
+        )
+
+
 def state_fault(state: State, box: Box, limits: Limits) -> str | None:
     """Return the reason for which a state cannot be used, or None."""
     if state.fault:

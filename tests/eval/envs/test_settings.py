@@ -50,6 +50,10 @@ REFUSED = {
     RaceVectorEnv: [
         ({"rewards": {"gates": 1.0}}, "unknown reward term 'gates'. Did you mean 'gate'"),
         ({"level": (3, 0)}, r"level is \(3, 0\), allowed is 0 to 9"),
+        ({"level": "3"}, "level is '3', allowed is 0 to 9"),
+        ({"vehicle": {}}, "vehicle is {}, allowed is a name"),
+        ({"track": ["zigzag"]}, r"track is \['zigzag'\], allowed is a track family or"),
+        ({"rewards": {"gate": "x"}}, r"rewards\['gate'\] is 'x', allowed is a number"),
         ({"level": 10}, "level is 10, allowed is 0 to 9"),
         ({"spec": "raec"}, "unknown policy .* 'raec'. Did you mean 'race'"),
         ({"num_envs": 0}, "num_envs is 0, allowed is 1 or more"),
@@ -81,6 +85,12 @@ def test_settings_that_cannot_be_used_are_refused(make, settings, said):
         make(**settings)
 
 
+def test_an_unknown_argument_is_refused_with_the_most_similar_one():
+    for name, known in (("difficulty", "level"), ("tracks", "track")):
+        with pytest.raises(TypeError, match=f"unknown argument '{name}'. Did you mean '{known}'"):
+            RaceEnv(**{name: 3})
+
+
 def test_flags_of_the_spec_and_of_the_environment_are_joined():
     spec = PolicySpec(depth=DepthEncoding(channel_axis=True), action=ActionSpec("ctbr"))
     env = RaceEnv(spec=spec, uint8=True)
@@ -91,9 +101,10 @@ def test_flags_of_the_spec_and_of_the_environment_are_joined():
 
 def test_paths_and_numpy_numbers_are_taken():
     file = Path(tracks.__path__[0]) / "examples" / "yard.toml"
-    env = RaceEnv(track=file, vehicle=Path("reference"), spec=Path("race"), level=np.int64(3))
-    _, info = env.reset(seed=0)
-    assert info["level"] == 3
+    given = {"vehicle": Path("reference"), "spec": Path("race"), "level": np.int64(3)}
+    assert RaceEnv(**given).reset(seed=0)[1]["level"] == 3
+    with pytest.warns(UserWarning, match="no levels and seeds: (level|track_seed) does not change"):
+        RaceEnv(track=file, track_seed=1, **given)
     assert RaceEnv(level=np.array([2, 2])).reset(seed=0)[1]["level"] == 2
 
 
@@ -105,6 +116,19 @@ def test_a_track_on_which_the_vehicle_starts_in_contact_is_refused(tmp_path):
     ):
         with pytest.raises(ValueError, match=r"at start.position .* touches ground; move the"):
             make()
+
+
+def test_a_probable_mistake_in_a_track_file_is_a_warning(tmp_path):
+    path, text = (
+        tmp_path / "narrow.toml",
+        "[[gates]]\ncenter = [0, 0, 1.3]\nwidth = {}\nheight = 1\n",
+    )
+    path.write_text(text.format(0.01))
+    for make in (lambda: RaceEnv(track=path), lambda: load(track=load_track(path))):
+        with pytest.warns(UserWarning, match="gate 0 is 0.01 x 1 m, too small for the body"):
+            make()
+    path.write_text(text.format(1.0))
+    RaceEnv(track=path), load(track=load_track(path))  # a warning is an error here
 
 
 @pytest.mark.parametrize("seed", [(1, 2), np.array([1, 2]), [1, 2]])

@@ -1,11 +1,13 @@
 """The small commands, and what the options of the train command become."""
 
+import re
 import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
+import suite
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from policies import shipped
 from policies.formats import policy_file
@@ -44,7 +46,7 @@ def test_doubts_about_a_vehicle_file_are_printed_once_and_stop_nothing(tmp_path,
     )
     command = "eval --track zigzag --difficulty 0 --trials 2 --time-limit-s 0.1 --workers 2"
     for name, count in ((tmp_path / "mm.toml", 1), ("reference", 0)):
-        assert run(f"{command} --out", tmp_path / "out", "--vehicle", name) == 0
+        assert run(f"{command} --out", tmp_path / f"out{count}", "--vehicle", name) == 0
         assert capfd.readouterr().err.count("divide by 1000") == count
     train = "train --model quad --list-settings --vehicle"
     assert run(train, tmp_path / "mm.toml") == 0
@@ -112,9 +114,10 @@ def test_listed_settings_are_those_of_the_other_options(capsys):
 
 def test_sensors_that_change_nothing_in_a_training_are_refused(tmp_path):
     file = tmp_path / "mine.toml"
-    file.write_text('schema = 1\nname = "mine"\n[[imu]]\nkind = "imu"\ngyro_bias = 0.01\n')
-    with pytest.raises(ValueError, match=r"imu does not change what a policy sees"):
-        resolve(Config(sensors=str(file)))
+    for model in ('[[imu]]\nkind = "imu"\ngyro_bias = 0.01\n', '[depth]\nkind = "tof"\n'):
+        file.write_text(f'schema = 1\nname = "mine"\n{model}')
+        with pytest.raises(ValueError, match=r"(imu|tof) does not change what a policy sees"):
+            resolve(Config(sensors=str(file)))
 
 
 def test_training_goes_on_from_a_policy_by_its_name_and_does_not_write_over_it(
@@ -169,3 +172,41 @@ def test_the_command_line_asks_for_model_and_vehicle_together():
         resolve(Config(recipe="race-paper", vehicle="racer5"))
     with pytest.raises(ValueError, match="Did you mean 'racer5'"):
         resolve(Config(model="quad", vehicle="racer6"))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [
+        ("track", ["zigzag"], "a text, a path or a Track"),
+        ("vehicle", {}, "a name, a path or a Vehicle"),
+        ("trials", 1.5, "a whole number, 1 to"),
+        ("seed", "1", "a whole number, 0 to"),
+        ("workers", "2", "a whole number or None"),
+    ],
+)
+def test_from_python_an_argument_of_another_type_is_refused(name, value, allowed):
+    with pytest.raises(ValueError, match=re.escape(f"{name} is {value!r}, allowed is {allowed}")):
+        suite.evaluate_policy("race-paper", **{name: value})
+    with pytest.raises(ValueError, match="flights is 3, allowed is a text or a path"):
+        suite.diagnose_flights(3, "reference", "out")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("tracks --difficulty 3", "--difficulty, --seed and --out are for a picture"),
+        ("tracks --out pictures", "such as suite tracks zigzag"),
+        ("tracks all", "TRACK is 'all', allowed is one of zigzag, circular, ellipse, random, or"),
+        ("view raec", "unknown RUN 'raec'. Did you mean 'race'?"),
+        (
+            "view nothere",
+            "The --out folder of a suite eval, a checkpoint's folder or a policy file",
+        ),
+    ],
+)
+def test_names_and_options_without_effect_are_refused_with_what_is_allowed(
+    line, words, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert words in refused(capsys, line)
+    assert not list(tmp_path.iterdir())

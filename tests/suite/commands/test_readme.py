@@ -115,8 +115,8 @@ def test_no_page_gives_the_folder_of_another_run():
                 continue
             if name in RUNS:
                 config = cli.parse(name, args)[1]
-                # Processes share a training, and an evaluation replaces another one.
-                shared = {"train": {"process_options": None}, "eval": {"flown": None}}
+                # Processes share a training.
+                shared = {"train": {"process_options": None}}
                 run = (name, dataclasses.replace(config, **shared.get(name, {})))
                 first, place = runs.setdefault(config.out, (run, where))
                 assert first == run, f"{place} and {where}: --out {config.out}"

@@ -86,6 +86,8 @@ def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(tmp_path, monke
     said = (tmp_path / "out" / "table.md").read_text()
     grid = errors_grid({"horizon_s": 0.6, **plain(result.errors)})
     assert said == markdown(grid) and "| point mass with Delta Action Model |" in said
+    with pytest.raises(ValueError, match=r"\(seed is 0 there, 7 here\); give another --out"):
+        fit_delta(replace(CONFIG, seed=7), PHYSICS, flights, tmp_path / "out", console)
 
 
 class Record(NamedTuple):

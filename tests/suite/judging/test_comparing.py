@@ -96,7 +96,10 @@ def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path, capsys):
     assert compare_runs(*read_runs(a), *read_runs(old))["trials"] == 40
     with pytest.raises(ValueError, match="10 trials are in only one of them"):
         compare_runs(*read_runs(a), *read_runs(run_of(tmp_path / "d", [True] * 30)))
-    for folder, said in ((tmp_path, "no trials.parquet"), (None, "less than twice")):
+    for folder, said in (
+        (tmp_path, "no trials.parquet"),
+        (None, r"of two policies .* \(given: 1\)"),
+    ):
         with pytest.raises(ValueError, match=said):
             compare.run(compare.Config((a, folder) if folder else (a,)), Quiet())
 
@@ -181,3 +184,14 @@ def test_other_versions_are_noted(tmp_path, capsys):
         (folder / "run.json").write_text(json.dumps({"packages": {"mujoco": version}}))
     compare.run(compare.Config(tuple(folders)), Quiet())
     assert "(mujoco: 3.3.0, 3.4.0)" in " ".join(capsys.readouterr().err.split())
+
+
+def test_runs_of_one_policy_or_of_other_speeds_are_noted(tmp_path, capsys):
+    a, b, fast = (
+        run_of(tmp_path / name, [True, False], judged, policy, weights="w")
+        for name, judged, policy in (("a", None, "p"), ("b", None, "p"), ("c", SPEEDS, "p@1"))
+    )
+    for other, said in ((b, "have the same policy"), (fast, "--speed or --monitor differ")):
+        for config in (compare.Config((a, other)), compare.Config((a,), against=(other,))):
+            compare.run(config, Quiet())
+            assert said in " ".join(capsys.readouterr().err.split())

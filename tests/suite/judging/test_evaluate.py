@@ -57,8 +57,16 @@ def test_what_a_folder_holds_is_not_written_over_without_a_word(pilots, tmp_path
     asked = ("--track zigzag --policy", pilots["diver"], "--trials")
     assert evaluate(tmp_path, *asked, 1) == 0
     assert "overwritten" not in printed(capsys)
-    assert evaluate(tmp_path, *asked, 2) == 0
+    assert evaluate(tmp_path, *asked, 1) == 0
     assert "holds an evaluation; its results will be overwritten" in printed(capsys)
+    for words, said in (
+        ((2,), "trials is 1 there, 2 here"),
+        ((1, "--seed", 3), "seed is 0 there, 3 here"),
+        ((1, "--policy", pilots["other"]), "policies is"),
+    ):
+        line = f"eval --difficulty 0 --out {tmp_path} {' '.join(asked)}"
+        told = refused(capsys, line, *words)
+        assert said in told and "give another --out" in told
     said = refused(capsys, "collect --out", tmp_path, "--policy", pilots["diver"])
     assert "holds a run of another kind" in said
 

@@ -42,7 +42,14 @@ def write(folder, text):
         (GATE.replace("1.5]", "1.5]\nyaw_deg = 180") + GATE.replace("[0, 0, 1.5]", "[5, 0, 1.5]")
          + "[start]\nposition = [-3, 0, 1.5]\n", "gate 0 faces against the path"),
         (GATE + '[[spheres]]\nname = "tree"\ncenter = [0, 0, 1.5]\nradius = 0.3\n',
-         "the centre of gate 0 is inside 'tree'"),
+         "'tree' is within 0.5 m in front of or behind the centre of gate 0"),
+        (GATE + '[[boxes]]\ncenter = [-0.4, 0, 1.5]\nsize = [0.002, 1, 1]\n', "'box 0' is within"),
+        (GATE + '[[boxes]]\ncenter = [2500, 0, 1]\nsize = [1, 1, 1]\n', "2.5e+03 m away from all"),
+        (GATE + '[[boxes]]\ncenter = [50, 0, 0]\nsize = [60, 60, 60]\n', "is its file in metres?"),
+        (GATE + "frame_width = 20.0\n", "with a frame of up to 20 m"),
+        (GATE + "[start]\nposition = [-250, 0, 1.5]\n", "start and gates are up to 250 m apart"),
+        (GATE + "[start]\nposition = [3, 0, 1.5]\n", "the start is behind gate 0"),
+        (GATE + "[start]\nposition = [-3, 0, 1.5]\nyaw_deg = 180\n", "the start faces away"),
     ],
 )  # fmt: skip
 def test_probable_mistakes_in_a_track_are_noted(tmp_path, text, said):
@@ -53,6 +60,10 @@ def test_probable_mistakes_in_a_track_are_noted(tmp_path, text, said):
 def test_a_second_lap_through_the_same_gates_is_no_mistake(tmp_path):
     lap = GATE + GATE.replace("0, 1.5]", "5, 1.5]")
     assert not track_notes("mine", load_track(write(tmp_path, lap + lap)))
+    # Neither is a plate that can be flown round, nor a large floor.
+    plate = "[[boxes]]\ncenter = [-0.7, 0, 1.5]\nsize = [0.1, 0.5, 0.5]\n"
+    floor = "[[boxes]]\ncenter = [0, 0, 0.05]\nsize = [300, 300, 0.1]\nyaw_deg = 3600\n"
+    assert not track_notes("mine", load_track(write(tmp_path, lap + plate + floor)))
 
 
 def test_the_example_is_read_as_it_says(root):
@@ -108,6 +119,9 @@ BAD = [
     ("schema = 1\n", "has no gate"),
     ("gates = [\n", "is not TOML"),
     ("gate = 3\n" + GATE, "key 'gate'.*Did you mean 'gates'"),
+    (GATE.replace("gates", "gate"), "key 'gate' at the top is unknown. Did you mean 'gates'"),
+    ("[[euler]]\nx = 1\n", "key 'euler' at the top is unknown. Allowed: "),
+    (GATE + "yaw_deg = 9000\n", "yaw_deg is 9000, allowed is a number from -3600 to 3600"),
     (GATE + "yaw = 3\n", r"key 'yaw' in \[gates\[0\]\].*Did you mean 'yaw_deg'"),
     ("schema = 2\n" + GATE, "schema is 2, allowed is"),
     ("[[gates]]\ncenter=[0,0,1]\nwidth = 1\n", r"has no 'height'"),

@@ -249,6 +249,8 @@ def test_a_real_vehicle_needs_the_operators_word(capsys, tmp_path, monkeypatch):
     for one in ("--vehicle racer5", "--track tracks/examples/yard.toml"):
         said = refused(capsys, f"{LINK} {tmp_path} --confirm {one}")
         assert "the vehicle file (--vehicle) and the course (--track)" in said
+    high = refused(capsys, "fly --floor-m 3 --out", tmp_path / "high")
+    assert "--floor-m is 3, allowed is less than 1" in high and not (tmp_path / "high").exists()
     assert "--link flies one flight" in refused(capsys, *confirmed, "--trials", "3")
     assert "--time-limit-s ends simulated" in refused(capsys, *confirmed, "--time-limit-s", "5")
 
