@@ -28,7 +28,7 @@ from suite.diagnose.data.windows import (
     cut,
     take,
 )
-from suite.diagnose.estimate.gauss_newton import TINY, Z95, gauss_newton_step
+from suite.diagnose.estimate.gauss_newton import TINY, Z95, solve
 from suite.diagnose.estimate.parameters import Candidate
 from suite.diagnose.estimate.permutation import folds_of
 from suite.diagnose.evidence.evidence import Evaluation
@@ -185,7 +185,9 @@ class RolloutSource(Source):
             linear = model.linearise(estimate, self.coarser, directions)
             options = (found.last.evidence.limits, of_rollouts(found.last).noise, indices)
             equations = rollout_evidence(model, linear, *options)[1].equations
-            change, _ = gauss_newton_step(equations, estimate.theta, model.space)
+            # Without bounds, as a bound would hide the error of a number that lies on it.
+            scale, most = self.space.array("step")[list(indices)], np.full(len(indices), np.inf)
+            change = solve(*equations.sums(), -most, most, scale)
             model_error = self.coarser_share * np.abs(change)
         return sizes_by_effect(found, slope, partial(rollout_size, windows=windows), model_error)
 
