@@ -29,7 +29,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "verdict": diagnosis.verdict.label,
         "effects": effects_json(diagnosis),
         "negligible": [
-            {"name": name, "size": size._asdict(), "relevant": False}
+            {"name": name, "size": size._asdict(), "relevant": size.relevant(limits)}
             for one in diagnosis.findings
             for name, size in one.negligible
         ],

@@ -35,6 +35,11 @@ ONLY_VIEWS = (
     "flights of 1 s stay far from the measured ones."
 )
 """The sentence for `no_gap` if rollouts could not be used."""
+NEGLIGIBLE = {
+    False: "Significant but too small to matter",
+    True: "Perhaps only an error of the model, or cancelled by another effect",
+}
+"""Reason why an effect was left out, by whether its own size is relevant."""
 USE = (
     "Use the corrected vehicle: give the new vehicle.toml, in --out, to suite eval, train and loop "
     "(--vehicle)."
@@ -91,9 +96,9 @@ def answer(result: Mapping[str, Any]) -> str:
         agreed = sentence.removesuffix(".").removesuffix(" within the measurement noise")
         sentence = f"{agreed}, except for {rest}."
     words = [heading, *effects, sentence] if effects else [sentence]
-    if verdict == "no_gap" and result["negligible"]:
-        names = ", ".join(entry["name"] for entry in result["negligible"])
-        words.append(f"Significant but too small to matter: {names}.")
+    for is_large, reason in NEGLIGIBLE.items() if verdict == "no_gap" else ():
+        names = [one["name"] for one in result["negligible"] if one["relevant"] == is_large]
+        words += [f"{reason}: {', '.join(names)}."] * bool(names)
     return " ".join(words)
 
 

@@ -260,7 +260,6 @@ def test_without_noise_the_models_own_error_is_no_finding(vehicle, drive):
     logs = flights(vehicle, duration_s=6.0, noise=0.0, motors=True)
     found = diagnosis_json(diagnose(logs, vehicle, drive=drive))
     assert (found["verdict"], found["effects"]) == ("no_gap", [])
-    assert all(not one["relevant"] for one in found["negligible"])
 
 
 def slow_and_complete(monkeypatch, **options):

@@ -222,8 +222,12 @@ def test_an_answer_has_the_effect_its_values_and_its_size_or_what_is_too_small()
     assert "causes 0.8 m/s² (RMS). This explains a part" in partly
     changed = summary.answer(entries("named", [DRAG], reference=["a"]))
     assert "has changed since the reference" in changed
-    small = entries("no_gap", negligible=[{"name": "torque_trim"}])
-    assert summary.answer(small).endswith("Significant but too small to matter: torque_trim.")
+    left_out = [("torque_trim", False), ("inertia_scale", True)]
+    small = entries("no_gap", negligible=[{"name": n, "relevant": is_so} for n, is_so in left_out])
+    assert summary.answer(small).endswith(
+        "Significant but too small to matter: torque_trim. "
+        "Perhaps only an error of the model, or cancelled by another effect: inertia_scale."
+    )
 
 
 def measured(verdict, after, effects=(), reason=None, floor=0.15, offset=7.9, **more):
