@@ -206,7 +206,7 @@ class RolloutSource(Source):
             "coloured": structure.coloured,
         }
         share = remaining_share(*gaps) if found.named else 0.0
-        if not self.is_relevant(gaps[1]):
+        if not (structure.size.relevant(self.limits) or self.is_relevant(gaps[1])):
             return Remaining(False, share, reason=TOO_SMALL, details=details)
         # Slow errors are those that a low polynomial over a window describes: noise has few.
         slow = of_rollouts(found.last).slow_errors(found.last.block)
@@ -357,7 +357,7 @@ def structure_where(
     """
     slow, expected = slow_errors
     shape = residual.shapes[0] if residual.shapes else None
-    if shape is not None and shape.p_value > limits.shape_p_value:
+    if shape and (shape.p_value > limits.shape_p_value or not residual.size.relevant(limits)):
         shape = None
     # Axes along which the residual is correlated in time.
     coloured = [

@@ -26,6 +26,7 @@ from suite.diagnose.estimate.permutation import CandidateScore, permutation_test
 from suite.diagnose.evidence.rollout import Flown
 from suite.diagnose.evidence.rollouts import RolloutEvidence
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.verdict.gap import EffectSize
 from suite.diagnose.verdict.model_error import beyond_error
 
 AXES = ("force x", "force y", "force z", "torque x", "torque y", "torque z")
@@ -58,6 +59,8 @@ class ResidualStructure(NamedTuple):
     """Scores of all shapes, the best first."""
     coloured: dict[str, float]
     """p-value of a smooth (autocorrelated) random disturbance along each of `AXES`, by axis."""
+    size: EffectSize
+    """Size of the best shape, if it is significant, else 0; the drift is not computed."""
 
 
 def disturbance_equations(
@@ -96,7 +99,7 @@ def residual_structure(
         limits=equations.limits,
     )
     coloured = {axis: _energy_p_value(equations, i) for i, axis in enumerate(AXES)}
-    return ResidualStructure(scores, coloured)
+    return ResidualStructure(scores, coloured, _size(equations, scores))
 
 
 def beyond_model_error(
@@ -115,19 +118,33 @@ def beyond_model_error(
         if shape.p_value > equations.limits.shape_p_value:
             return True
         columns = shape.candidate.indices
-        value, width = _fit(equations, columns)
+        value, covariance = _fit(equations, columns)
         error = share * np.abs(_fit(coarse, columns)[0] - value)
-        return beyond_error(value, error, width)
+        return beyond_error(value, error, Z95 * np.sqrt(np.maximum(np.diag(covariance), 0.0)))
 
-    return structure._replace(shapes=[shape for shape in structure.shapes if is_kept(shape)])
+    shapes = [shape for shape in structure.shapes if is_kept(shape)]
+    return structure._replace(shapes=shapes, size=_size(equations, shapes))
 
 
 def _fit(equations: DisturbanceEquations, columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coefficients (C,) of columns of the shapes, and half-widths of 95 % intervals."""
+    """Return the coefficients (C,) of columns of the shapes, and their covariance (C, C)."""
     hessian, gradient = _along(equations, equations.unit[..., list(columns)])
     covariance = np.linalg.pinv(hessian.sum(axis=0))
-    half_width = Z95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    return covariance @ gradient.sum(axis=0), half_width
+    return covariance @ gradient.sum(axis=0), covariance
+
+
+def _size(equations: DisturbanceEquations, shapes: Sequence[CandidateScore]) -> EffectSize:
+    """Return the RMS force and torque that the best of `shapes` adds, without the fit's noise."""
+    if not shapes or shapes[0].p_value > equations.limits.shape_p_value:
+        return EffectSize(0.0, 0.0, None)
+    columns = list(shapes[0].candidate.indices)
+    value, covariance = _fit(equations, columns)
+    unit = equations.unit[..., columns]
+    power = (unit @ value) ** 2 - np.einsum("wkc,cd,wkd->wk", unit, covariance, unit)
+    # Three forces, then three torques, at each knot.
+    mean = power.reshape(len(power), -1, 2, 3).sum(axis=-1).mean(axis=(0, 1))
+    force, torque = np.sqrt(np.maximum(mean, 0.0)).tolist()
+    return EffectSize(force, torque, None)
 
 
 def _along(equations: DisturbanceEquations, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict import actuators, model_error
 from suite.diagnose.verdict import residual_structure as structure
-from suite.diagnose.verdict.gap import Gap, gap_of, overlap, start_correction
+from suite.diagnose.verdict.gap import EffectSize, Gap, gap_of, overlap, start_correction
 from tests.support.diagnosis_flights import NOISE, fly, fly_all
 from tests.support.vehicles import LAGGED, PLAIN, REMEMBERING, with_effects, with_lag
 
@@ -123,11 +123,17 @@ def test_a_shape_that_grows_with_the_models_error_is_left_out_and_one_that_stays
 
     fine, coarse = of(0.3, 0.2), of(0.9, 0.21)
     shapes = [CandidateScore(Candidate(n, (k,), n), 9.0, 5e-4, 0.0) for k, n in enumerate(names)]
-    found = structure.ResidualStructure(shapes, {})
+    found = structure.ResidualStructure(shapes, {}, structure._size(fine, shapes))
+    # RMS of both shapes over the knots, without the variance of the fitted coefficient.
+    force, torque = (np.sqrt((size**2 - 1.0 / 1500.0) * 15.0 / 4.0) for size in (0.3, 0.2))
+    assert found.size == (pytest.approx(force), 0.0, None)
     for share, kept in ((0.5, ["torque"]), (0.1, ["force", "torque"])):
         left = structure.beyond_model_error(found, fine, coarse, share)
         assert [shape.candidate.label for shape in left.shapes] == kept
-    by_chance = found._replace(shapes=[found.shapes[0]._replace(p_value=0.2)])
+        assert left.size == (found.size if share == 0.1 else (0.0, pytest.approx(torque), None))
+    by_chance = found._replace(
+        shapes=[found.shapes[0]._replace(p_value=0.2)], size=EffectSize(0.0, 0.0, None)
+    )
     assert structure.beyond_model_error(by_chance, fine, coarse, 0.5) == by_chance
 
 

@@ -29,10 +29,11 @@ def slow_errors(size=1.0):
     return energy, np.full((10, STATE), 5.0)
 
 
-def left(p_value=0.5, coloured=0.5):
+def left(p_value=0.5, coloured=0.5, force=1.0):
     shape = Candidate("force with the speed", (), "force with the speed")
     shapes = [CandidateScore(shape, 1.0, p_value, 0.0)]
-    return structure.ResidualStructure(shapes, dict.fromkeys(structure.AXES, coloured))
+    size = gaps.EffectSize(force, 0.0, None)
+    return structure.ResidualStructure(shapes, dict.fromkeys(structure.AXES, coloured), size)
 
 
 SWING = Swing(1.4, (1.3, 1.5))
@@ -75,6 +76,7 @@ def test_structure_is_a_shape_a_colour_or_the_largest_channel():
     quiet, loud = slow_errors(), slow_errors(3.0)
     assert structure_where(quiet, left(), False) is None
     assert structure_where(quiet, left(p_value=1e-4), False) == "force with the speed"
+    assert structure_where(quiet, left(p_value=1e-4, force=0.04), False) is None, "too small"
     coloured = structure_where(quiet, left(coloured=1e-6), False)
     assert coloured == ("a changing force along body x, y, z; a changing torque along body x, y, z")
     assert structure_where(loud, left(), False) == "errors of velocity x"
@@ -182,7 +184,7 @@ def test_what_was_withdrawn_has_explained_nothing(found_drag):
     lasts = (found_drag.search.last, bare.last)
     with_drag, without = (of_rollouts(last).slow_errors(last.block) for last in lasts)
     assert with_drag[0].sum() / with_drag[1].sum() < 1.5
-    assert structure_where(without, structure.ResidualStructure([], {}), True) is not None
+    assert structure_where(without, left(), True) is not None
 
 
 def windows(until_s=1.0, without=()):
@@ -305,11 +307,12 @@ def test_effects_that_cancel_each_other_are_no_names(found_drag):
 
 
 def test_an_error_that_is_small_enough_is_not_structure(found_drag):
-    source, none = found_drag.source, gaps.Channel(1e-3, 0.0)
-    channels = found_drag.before.channels.items()
-    near = found_drag.before._replace(
-        channels={horizon: dict.fromkeys(groups, none) for horizon, groups in channels}
-    )
-    held = source.held._replace(flight=np.zeros(400, int), start_s=0.25 * np.arange(400))
-    rest = replace(source, held=held).remaining(found_drag.search.refitted(()), (near, near), 0)
+    bare, both = found_drag.search.refitted(()), (found_drag.before, found_drag.before)
+
+    def remains(relevance):
+        limits = replace(THRESHOLDS, relevance=relevance)
+        return replace(found_drag.source, limits=limits).remaining(bare, both, 0)
+
+    assert remains(THRESHOLDS.relevance).structured
+    rest = remains((100.0, 100.0, 100.0))
     assert not rest.structured and rest.reason == TOO_SMALL
