@@ -170,6 +170,13 @@ def _best_candidate(
     allowed = max(min(limits.rival_chi2, limits.rival_share * explained), 0.0)
     close = [trial for trial in trials if trial.cost - lowest <= allowed]
     significant = [trial for trial in close if trial.name.p_value <= evidence.name_p_value]
+    if not significant and tested:
+        # A large effect is not linear, and its score without it may be wrong: test it at its fit.
+        at_fit = [trial for trial in close if trial.name.candidate == tested]
+        p_values = [_p_value_at_fit(task, current, others, unnamed, trial) for trial in at_fit]
+        significant = [
+            trial for trial, p in zip(at_fit, p_values, strict=True) if p <= evidence.name_p_value
+        ]
     if not significant:
         return None
     best = min(significant, key=lambda t: (*evidence.preference(t.at, t.name.candidate), t.cost))
@@ -181,6 +188,26 @@ def _best_candidate(
         t.name.candidate.label: t.cost - best.cost for t in trials if t.name.candidate != chosen
     }
     return replace(best.name, rivals=tuple(rivals), worse_by=worse_by), best.at
+
+
+def _p_value_at_fit(
+    task: SearchTask,
+    current: Evaluation,
+    others: Sequence[int],
+    unnamed: Sequence[Candidate],
+    trial: _Trial,
+) -> float:
+    """Return the p-value of a fitted candidate among the `unnamed`, next to the `others`.
+
+    The residual without it is extrapolated from the fit, where the slopes are those of the fit.
+    """
+    near = current.evidence.relinearise(trial.at)
+    change, block = trial.at.theta - current.at.theta, near.block
+    fitted = [k for k, index in enumerate(block.along) if change[index]]
+    residual = block.residual + block.slope[..., fitted] @ change[[block.along[k] for k in fitted]]
+    without = Evaluation(near.evidence, current.at, replace(block, residual=residual))
+    scores = near.evidence.scores(without, others, unnamed, task.seed)
+    return next((s.p_value for s in scores if s.candidate == trial.name.candidate), 1.0)
 
 
 def _replace_or_drop(
