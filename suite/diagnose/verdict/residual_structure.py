@@ -10,7 +10,7 @@ energy than noise gives (a score test of a smooth random disturbance).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -114,16 +114,19 @@ def beyond_model_error(
     of the change of a shape's coefficients counts as the error.
     """
 
+    def error_of(columns: Sequence[int]) -> np.ndarray:
+        return share * np.abs(_fit(coarse, columns)[0] - _fit(equations, columns)[0])
+
     def is_kept(shape: CandidateScore) -> bool:
         if shape.p_value > equations.limits.shape_p_value:
             return True
         columns = shape.candidate.indices
         value, covariance = _fit(equations, columns)
-        error = share * np.abs(_fit(coarse, columns)[0] - value)
-        return beyond_error(value, error, Z95 * np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+        width = Z95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        return beyond_error(value, error_of(columns), width)
 
     shapes = [shape for shape in structure.shapes if is_kept(shape)]
-    return structure._replace(shapes=shapes, size=_size(equations, shapes))
+    return structure._replace(shapes=shapes, size=_size(equations, shapes, error_of))
 
 
 def _fit(equations: DisturbanceEquations, columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -133,12 +136,20 @@ def _fit(equations: DisturbanceEquations, columns: Sequence[int]) -> tuple[np.nd
     return covariance @ gradient.sum(axis=0), covariance
 
 
-def _size(equations: DisturbanceEquations, shapes: Sequence[CandidateScore]) -> EffectSize:
-    """Return the RMS force and torque that the best of `shapes` adds, without the fit's noise."""
+def _size(
+    equations: DisturbanceEquations,
+    shapes: Sequence[CandidateScore],
+    error_of: Callable[[Sequence[int]], np.ndarray | float] = lambda _: 0.0,
+) -> EffectSize:
+    """Return the RMS force and torque that the best of `shapes` adds, without the fit's noise.
+
+    The model's own error of the coefficients by columns, `error_of`, is subtracted from them.
+    """
     if not shapes or shapes[0].p_value > equations.limits.shape_p_value:
         return EffectSize(0.0, 0.0, None)
     columns = list(shapes[0].candidate.indices)
     value, covariance = _fit(equations, columns)
+    value = np.sign(value) * np.maximum(np.abs(value) - error_of(columns), 0.0)
     unit = equations.unit[..., columns]
     power = (unit @ value) ** 2 - np.einsum("wkc,cd,wkd->wk", unit, covariance, unit)
     # Three forces, then three torques, at each knot.

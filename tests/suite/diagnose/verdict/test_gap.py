@@ -124,13 +124,18 @@ def test_a_shape_that_grows_with_the_models_error_is_left_out_and_one_that_stays
     fine, coarse = of(0.3, 0.2), of(0.9, 0.21)
     shapes = [CandidateScore(Candidate(n, (k,), n), 9.0, 5e-4, 0.0) for k, n in enumerate(names)]
     found = structure.ResidualStructure(shapes, {}, structure._size(fine, shapes))
+
     # RMS of both shapes over the knots, without the variance of the fitted coefficient.
-    force, torque = (np.sqrt((size**2 - 1.0 / 1500.0) * 15.0 / 4.0) for size in (0.3, 0.2))
-    assert found.size == (pytest.approx(force), 0.0, None)
+    def rms(value):
+        return pytest.approx(np.sqrt((value**2 - 1.0 / 1500.0) * 15.0 / 4.0))
+
+    assert found.size == (rms(0.3), 0.0, None)
+    # The model's own error is a share of the change from `fine` to `coarse`.
+    least = {0.5: (0.0, rms(0.2 - 0.5 * 0.01), None), 0.1: (rms(0.3 - 0.1 * 0.6), 0.0, None)}
     for share, kept in ((0.5, ["torque"]), (0.1, ["force", "torque"])):
         left = structure.beyond_model_error(found, fine, coarse, share)
         assert [shape.candidate.label for shape in left.shapes] == kept
-        assert left.size == (found.size if share == 0.1 else (0.0, pytest.approx(torque), None))
+        assert left.size == least[share]
     by_chance = found._replace(
         shapes=[found.shapes[0]._replace(p_value=0.2)], size=EffectSize(0.0, 0.0, None)
     )
