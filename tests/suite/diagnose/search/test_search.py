@@ -16,8 +16,15 @@ from suite.diagnose.estimate.gauss_newton import chi2_fall, intervals95, solve
 from suite.diagnose.estimate.parameters import ParameterSpace, candidates, effects_in, make_space
 from suite.diagnose.estimate.permutation import folds_of
 from suite.diagnose.evidence.evidence import Evaluation, Evidence, flights_agree
-from suite.diagnose.search.evaluation import cross_validated_chi2, linear_change
-from suite.diagnose.search.search import could_be_best, needs_all_parts, search
+from suite.diagnose.search.evaluation import NamedEffect, cross_validated_chi2, linear_change
+from suite.diagnose.search.search import (
+    SearchTask,
+    _p_value_at_fit,
+    _Trial,
+    could_be_best,
+    needs_all_parts,
+    search,
+)
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.vehicles import PLAIN
 
@@ -291,3 +298,35 @@ def test_a_delay_longer_than_a_jump_is_named_and_not_a_lower_gain():
     flown = replace(flown, parameters=replace(SPACE, entries=entries))
     stuck = search(flown.relinearise(BEGIN), among)
     assert "command_delay" not in [one.label for one in stuck.candidates]
+
+
+class Bent(Response):
+    """Readings that move by x `command` in the end, but set out in another direction."""
+
+    def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
+        block = super().linearise(at, indices)
+        x = at.theta[DELAY] / 0.03
+        moved = x * self.command + 10.0 * x * (1.0 - x) * self.fine_s
+        slope = np.zeros((*moved.shape, len(block.along)))
+        if DELAY in block.along:
+            along = self.command + 10.0 * (1.0 - 2.0 * x) * self.fine_s
+            slope[..., block.along.index(DELAY)] = along / 0.03
+        return replace(block, residual=self.measured - moved, slope=slope)
+
+    def response(self, delay: float) -> np.ndarray:
+        return self.measured
+
+
+def test_a_fitted_effect_is_tested_at_its_fit_where_its_slopes_hold():
+    """At the start they explain a hundredth of what the effect does."""
+    command, away, noise = np.random.default_rng(0).standard_normal((3, COUNT, 20))
+    flown = Bent(away, command, command + noise)
+    (delay,) = [c for c in COMMANDED if c.indices == (DELAY,)]
+    current = flown.relinearise(BEGIN)
+    (score,) = flown.scores(current, [], [delay], 0)
+    assert score.p_value > THRESHOLDS.name_p_value
+    theta = START.copy()
+    theta[DELAY] = 0.03
+    trial = _Trial(0.0, NamedEffect(delay, score.p_value, 0.0), Estimate(theta, BEGIN.free))
+    task = SearchTask([delay], lambda _: None, 0)
+    assert _p_value_at_fit(task, current, [], [delay], trial) <= THRESHOLDS.name_p_value

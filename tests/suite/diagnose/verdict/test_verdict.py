@@ -1,5 +1,6 @@
 """The verdict and its reasons: what counts, what held-out flights confirm, what remains."""
 
+from copy import copy
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -316,3 +317,20 @@ def test_an_error_that_is_small_enough_is_not_structure(found_drag):
     assert remains(THRESHOLDS.relevance).structured
     rest = remains((100.0, 100.0, 100.0))
     assert not rest.structured and rest.reason == TOO_SMALL
+
+
+def test_a_bound_does_not_hide_the_models_own_error(found_drag):
+    """The error is the change of the fit with coarser inputs, here a little too much drag."""
+    found, model = found_drag.search, copy(found_drag.source.model)
+    windows = of_rollouts(found.last).windows
+    coarser = windows._replace(row_vel_w=0.995 * np.asarray(windows.row_vel_w))
+    source = replace(found_drag.source, model=model, coarser=coarser, coarser_share=1.0)
+    sizes = source.sizes(found)
+    assert sizes != found_drag.source.sizes(found)
+    at = dict(zip(found.indices, found.estimate.theta[found.indices], strict=True))
+    entries = [
+        replace(entry, low=at.get(k, entry.low), high=at.get(k, entry.high))
+        for k, entry in enumerate(model.space.entries)
+    ]
+    model.space = replace(model.space, entries=tuple(entries))
+    assert source.sizes(found) == sizes
