@@ -28,7 +28,7 @@ from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.actuators import TestedEffect
 from suite.diagnose.verdict.disturbances import Swing
 from suite.diagnose.verdict.gap import EffectSize, Gap, upper_size
-from suite.diagnose.verdict.model_error import beyond_error
+from suite.diagnose.verdict.model_error import beyond_error, less_error
 
 LEAST_GAP = 1e-9
 """Lower limit of a gap minus its noise floor in a division, in the gap's unit."""
@@ -204,7 +204,7 @@ def sizes_by_effect(
     parameters by `model_error` (K,); this is subtracted before the upper end is computed.
     """
     entries, width, change = found.last.evidence.space.entries, found.half_widths(), found.moved
-    certain = np.sign(change) * np.maximum(np.abs(change) - model_error, 0.0)
+    certain = less_error(change, model_error)
     error, sizes = np.broadcast_to(model_error, change.shape), {}
     effects = np.array([entries[index].effect for index in found.indices])
     columns_of = {named.candidate.name: effects == named.candidate.name for named in found.named}

@@ -82,6 +82,11 @@ def beyond_error(change: np.ndarray, error: np.ndarray, width: np.ndarray) -> bo
     return bool((distance - error > least).any())
 
 
+def less_error(change: np.ndarray, error: np.ndarray | float) -> np.ndarray:
+    """Return `change` (K,) moved towards zero by the model's own `error`, at most to zero."""
+    return np.sign(change) * np.maximum(np.abs(change) - error, 0.0)
+
+
 def _difference(linear: Linearisation, other: np.ndarray) -> np.ndarray:
     """Return by how much the residuals `other` (W, N, 19) differ; NaN where one diverges."""
     difference = other - linear.residual

@@ -27,7 +27,7 @@ from suite.diagnose.evidence.rollout import Flown
 from suite.diagnose.evidence.rollouts import RolloutEvidence
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.gap import EffectSize
-from suite.diagnose.verdict.model_error import beyond_error
+from suite.diagnose.verdict.model_error import beyond_error, less_error
 
 AXES = ("force x", "force y", "force z", "torque x", "torque y", "torque z")
 
@@ -114,8 +114,8 @@ def beyond_model_error(
     of the change of a shape's coefficients counts as the error.
     """
 
-    def error_of(columns: Sequence[int]) -> np.ndarray:
-        return share * np.abs(_fit(coarse, columns)[0] - _fit(equations, columns)[0])
+    def error_of(columns: Sequence[int], value: np.ndarray) -> np.ndarray:
+        return share * np.abs(_fit(coarse, columns)[0] - value)
 
     def is_kept(shape: CandidateScore) -> bool:
         if shape.p_value > equations.limits.shape_p_value:
@@ -123,7 +123,7 @@ def beyond_model_error(
         columns = shape.candidate.indices
         value, covariance = _fit(equations, columns)
         width = Z95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        return beyond_error(value, error_of(columns), width)
+        return beyond_error(value, error_of(columns, value), width)
 
     shapes = [shape for shape in structure.shapes if is_kept(shape)]
     return structure._replace(shapes=shapes, size=_size(equations, shapes, error_of))
@@ -139,17 +139,18 @@ def _fit(equations: DisturbanceEquations, columns: Sequence[int]) -> tuple[np.nd
 def _size(
     equations: DisturbanceEquations,
     shapes: Sequence[CandidateScore],
-    error_of: Callable[[Sequence[int]], np.ndarray | float] = lambda _: 0.0,
+    error_of: Callable[[Sequence[int], np.ndarray], np.ndarray | float] = lambda *_: 0.0,
 ) -> EffectSize:
     """Return the RMS force and torque that the best of `shapes` adds, without the fit's noise.
 
-    The model's own error of the coefficients by columns, `error_of`, is subtracted from them.
+    The model's own error is subtracted from the coefficients; `error_of` returns it for columns and
+    their coefficients.
     """
     if not shapes or shapes[0].p_value > equations.limits.shape_p_value:
         return EffectSize(0.0, 0.0, None)
     columns = list(shapes[0].candidate.indices)
     value, covariance = _fit(equations, columns)
-    value = np.sign(value) * np.maximum(np.abs(value) - error_of(columns), 0.0)
+    value = less_error(value, error_of(columns, value))
     unit = equations.unit[..., columns]
     power = (unit @ value) ** 2 - np.einsum("wkc,cd,wkd->wk", unit, covariance, unit)
     # Three forces, then three torques, at each knot.
