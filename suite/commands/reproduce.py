@@ -21,9 +21,9 @@ from tracks.common.names import unknown_name
 class Config(Command):
     """Make one of the pages of docs/results; the same command again continues where it stopped.
 
-    Pages: table2, robustness, perception, ablation, schemes, faults, gpu, simulators. `all` makes
-    the published ones, `status` lists the policies and code that are newer. suite reproduce alone
-    prints a line about each, suite reproduce PAGE --help the options of a page.
+    Pages: table2, robustness, perception, four_gates, ablation, schemes, faults, gpu, simulators.
+    `all` makes the published ones, `status` lists the policies and code that are newer. suite
+    reproduce alone prints a line about each, suite reproduce PAGE --help the options of a page.
 
     PAGE.json with the numbers, charts, and PAGE.md with the tables go to --out. If PAGE.md exists,
     only the part between its two comments is replaced.

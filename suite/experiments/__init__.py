@@ -11,6 +11,7 @@ EXPERIMENTS: dict[str, str] = {
     "robustness": "policies under every physical effect and under growing disturbances",
     "perception": "policies through every sensor model, as its magnitude grows",
     "ablation": "trainings with the vector field and without it, flown on unseen worlds",
+    "four_gates": "the shipped policies on the tracks of the paper's ablation",
     "schemes": "PPO, our method, and our method without the field, measured as they learn",
     "faults": "faults of a log's interface put into good logs: how many are named, by kind",
     "gpu": "training and judging on an accelerator: speed, memory, and the CPU's outcomes",

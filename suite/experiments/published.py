@@ -20,6 +20,7 @@ PUBLISHED = {
     "stereo-depth all imu+gates delay gate_map state_drift state_noise state_loss gate_detection "
     "wrong_gate image_motion stereo tof exposure frame_loss",
     "simulators": "--seed 9750000",
+    "four_gates": "",
     "ablation": "",
     "schemes": "--set episode.start_speed=3.0 episode.image_stride=3 --ppo-iterations 2315",
     "faults": "--seed 7920000",

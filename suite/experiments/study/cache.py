@@ -24,6 +24,7 @@ FLIES = ("tracks", "policies", "eval")
 MEASURED = {
     "ablation": ("suite/train",),
     "schemes": ("suite/train",),
+    "four_gates": ("suite/train",),
     "faults": ("suite/experiments/injected", "eval/importers", "eval/logs/faults"),
 }
 """Page -> folders with the code that it measures, besides `FLIES`."""

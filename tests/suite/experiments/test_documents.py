@@ -17,7 +17,7 @@ from suite.experiments.pages.paper import ablation as printed
 from suite.experiments.schemes import Config as SchemesConfig
 from suite.experiments.schemes import document, first_times, schemes
 from suite.experiments.simulators import REASONS, Config, changed_trials, conditions
-from suite.experiments.study import judging
+from suite.experiments.study import judging, validation
 from suite.experiments.study.cache import Workspace
 from suite.experiments.study.conditions import ConditionResult
 from suite.experiments.study.training import Spread, TrainingResult, summaries
@@ -229,6 +229,47 @@ def test_the_ablation_from_one_command_and_again(tmp_path, monkeypatch, small_sc
     monkeypatch.setattr(training_run, "make_update", pytest.fail)
     assert reproduce(tmp_path, "ablation", *args) == 0, "nothing is trained again"
     assert (tmp_path / "docs" / "ablation.md").read_text() == text
+
+
+@pytest.fixture
+def measured(monkeypatch):
+    """Measure no flight: return the recipes that would be flown."""
+    recipes = []
+    scores = {"success_cross": 0.5, "collision_free": 1.0, "v_max": 6.44, "v_max_most": 7.0}
+
+    def make_validation(recipe, trials, seed, seconds):
+        recipes.append((recipe, trials, seed, seconds))
+        return lambda params: {**scores, "gates": 3.25, "reward": 0.0}
+
+    monkeypatch.setattr(validation, "make_validation", make_validation)
+    return recipes
+
+
+def test_shipped_policies_fly_the_ablations_tracks_in_the_dynamics_of_their_training(
+    tmp_path, measured, capsys
+):
+    args = "--policy race --policy race-paper --trials 10 --seconds 4 --seed 7".split()
+    assert reproduce(tmp_path, "four_gates", *args) == 0
+    (race, *rest), (point_mass, *_) = measured
+    assert rest == [10, 7, 4.0] and race.spec.rate_hz == 30 and race.quadrotor.vehicle
+    assert point_mass.quadrotor is None
+    tracks = settings(Ablation(set=(), worlds=48))[0].recipe.episode
+    assert race.episode == point_mass.episode == tracks and tracks.gates == 4
+    text, numbers = page(tmp_path, "four_gates")
+    assert "| race | 50 % [24, 76] | 100 % [72, 100] | 6.4 | 7.0 | 3.25 |" in text
+    assert "| paper, with the field | 95 % | 97 % | 6.5 | - | - |" in text
+    assert [row["policy"] for row in numbers["rows"]] == ["race", "race-paper"]
+    assert numbers["rows"][0]["intervals"]["success_cross"] == wilson(5, 10)._asdict()
+    assert reproduce(tmp_path, "four_gates", "--policy", "race-papr") == 2
+    assert "Did you mean 'race-paper'?" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_shipped_policy_passes_four_gates(tmp_path):
+    args = "--policy race-paper --trials 8 --seconds 8".split()
+    assert reproduce(tmp_path, "four_gates", *args) == 0
+    _, numbers = page(tmp_path, "four_gates")
+    assert numbers["rows"][0]["gates"] > 3.5 and numbers["rows"][0]["v_max"] > 4.0
 
 
 @pytest.mark.slow

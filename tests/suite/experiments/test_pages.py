@@ -144,6 +144,9 @@ def test_the_field_and_other_ways_to_learn():
     rows = rows_of("ablation", "setting", "field 0.4", "progress 0.4")
     shares = (percent(row["over"]["success_cross"]["mean"]) for row in rows)
     assert "| the paper's | 200 | {} % | {} % |".format(*shares) in text
+    (race,) = rows_of("four_gates", "policy", "race")
+    passed = f"all four gates in {300 * race['success_cross']:.0f} of\n300 trials"
+    assert f"{passed}, with a v_max of {race['v_max']:.1f} m/s" in text
     starts = ("| ours, with the field |", "| ours, with L_proj ", "| PPO ")
     rows = rows_of("schemes", "scheme", "ours", "projection", "ppo")
     for start, row in zip(starts, rows, strict=True):
