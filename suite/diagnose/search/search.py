@@ -83,7 +83,7 @@ def search(
     # If even the best model leaves more than noise, decide again with the residual as noise.
     misfit = last.evidence.misfit_as_noise(last)
     if misfit is not None:
-        say("the model leaves more than noise: names are judged by what it leaves")
+        say("the remaining error is more than noise: effects are tested again, with it as noise")
         named, at = _settle(task, misfit, last.at, named)
         judged = _final_fit(misfit, at, named)
         block = last.evidence.linearise(judged.at, fitted_by(named))
@@ -142,6 +142,9 @@ def _best_candidate(
         single = [c for c in shortlist if not c.parts][: limits.short_list]
         shortlist = [c for c in shortlist if c.parts or c in single]
     # Fit each of them, and keep those that pass the tests of the evidence.
+    if shortlist and shortlist != [tested]:
+        instead = f" in the place of {tested.label}" if tested else ""
+        task.say(f"fitting {', '.join(c.label for c in shortlist if c != tested)}{instead}")
     errors_before = cross_validated_chi2(current, others)
     chi2_before, trials = float(equations.chi2.sum()), list[_Trial]()
     for candidate in shortlist:
@@ -149,10 +152,6 @@ def _best_candidate(
         gains = errors_before - cross_validated_chi2(fitted, [*others, *candidate.indices])
         share = evidence.explained_share(current.block, fitted, candidate, gains)
         chi2 = float((fitted.block.residual**2).sum())
-        outcome = f"lowers the squared error by {chi2_before - chi2:,.0f} times the noise variance"
-        if share is None:
-            outcome = "rejected: flights disagree, or a value is implausible or explains too little"
-        task.say(f"fitted {candidate.label}: {outcome}")
         if share is not None:
             name = NamedEffect(
                 candidate, scores[candidate].p_value, scores[candidate].gain,
