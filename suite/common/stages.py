@@ -41,20 +41,30 @@ def refuse_other_options(out: Path, config: Any) -> None:
     Raises:
         ValueError: with the differences, except in the name of the folder and in --json.
     """
+    if changes := changed_options(out, config):
+        raise ValueError(
+            f"{out} holds a run of another configuration ({first_changes(changes)}); give another "
+            "--out, or move the folder away to start over"
+        )
+
+
+def changed_options(out: Path, config: Any) -> list[str]:
+    """Return the differences between the options of the run in `out`, if any, and `config`.
+
+    The name of the folder and --json do not count.
+
+    Raises:
+        ValueError: where the record of the run cannot be read.
+    """
     path = out / "run.json"
     if not path.is_file():
-        return
+        return []
     try:
         stored = dict(read_json(path)["config"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not the record of a run ({error}); move it away") from error
     unchanged = {name: stored.get(name) for name in ("out", "json")}
-    changes = differences({**stored, **unchanged}, {**plain(config), **unchanged})
-    if changes:
-        raise ValueError(
-            f"{out} holds a run of another configuration ({first_changes(changes)}); give another "
-            "--out, or move the folder away to start over"
-        )
+    return differences({**stored, **unchanged}, {**plain(config), **unchanged})
 
 
 @dataclass(frozen=True)
