@@ -6,6 +6,7 @@ policies in simulation and scores them, uses policies through this protocol only
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,7 +16,7 @@ import numpy as np
 from policies import shipped
 from policies.spec import PolicyError, PolicySpec
 from tracks.common.names import closest, unknown_name
-from tracks.input.ranges import shown
+from tracks.input.ranges import as_path, check_type, shown
 
 Hidden = Any
 """Hidden state (memory) of a policy for n trials; only the policy reads it."""
@@ -141,12 +142,13 @@ def load_policy(name_or_path: str | Path, trust: bool = False) -> Policy:
         PolicyError: for an unknown name, or a file that cannot be used or is not safe; the message
             says why and what to do.
     """
-    text = str(name_or_path)
+    path = as_path("policy", name_or_path, "a name, as a text, or a path")
+    check_type("trust", trust, (bool,), "True or False")
+    text = os.fspath(name_or_path)
     if text in shipped.names():
         from policies.native import load_native
 
         return load_native(shipped.locate(text), text)
-    path = Path(name_or_path)
     if path.suffix == ".c" and path.is_file() or _is_c_folder(path):
         from policies.formats.c.c_file import load_c
 

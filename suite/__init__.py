@@ -6,10 +6,13 @@ Other packages are imported at the first use of a name, so that `import suite` t
 
 from __future__ import annotations
 
-import warnings
+import os
 from collections.abc import Iterable, Sequence
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from tracks.input.ranges import PATH, as_path, check_type
 
 if TYPE_CHECKING:
     import gymnasium
@@ -93,41 +96,44 @@ def evaluate_policy(
     from eval.judging.outputs import action_report, notes_of, object_faults
     from eval.logs.faults.vehicle import vehicle_doubts
     from eval.vehicles.vehicle import Vehicle
+    from eval.worlds.engine import warn_of
     from policies.policy import check_is_policy, load_policy
     from suite.judging.flying import fly_trials, policy_for_workers
     from suite.judging.requests import Evaluation
     from suite.judging.trials import read_trial_set
-    from tracks.input.ranges import check_type
     from tracks.track import Track
 
-    path = (str, Path)
-    check_type("track", track, (*path, Track), "a text, a path or a Track; several in one text "
+    check_type("track", track, (*PATH, Track), "a text, a path or a Track; several in one text "
                "with commas")  # fmt: skip
-    check_type("vehicle", vehicle, (*path, Vehicle), "a name, a path or a Vehicle")
+    check_type("difficulty", difficulty, (str, Integral), "a level, or several as a text: '0,3'")
+    check_type("vehicle", vehicle, (*PATH, Vehicle), "a name, a path or a Vehicle")
+    check_type("sensors", sensors, PATH, "a name or a path")
     check_type("workers", workers, (int, type(None)), "a whole number or None")
-    loaded = load_policy(policy) if isinstance(policy, str | Path) else policy
+    loaded = load_policy(policy) if isinstance(policy, PATH) else policy
     check_is_policy(loaded)
     given: dict[str, Any] = {"track": track, "vehicle": vehicle}
-    sources = {name: str(each) for name, each in given.items() if isinstance(each, str | Path)}
+    sources = {name: os.fspath(each) for name, each in given.items() if isinstance(each, PATH)}
     objects = {name: each for name, each in given.items() if name not in sources}
-    request: dict[str, Any] = {"difficulty": str(difficulty), "sensors": str(sensors), **sources}
+    request: dict[str, Any] = {
+        "difficulty": str(difficulty),
+        "sensors": os.fspath(sensors),
+        **sources,
+    }
     evaluation = Evaluation(trials=trials, seed=seed, simulator=simulator, **request)
-    is_source = isinstance(policy, str | Path)
+    is_source = isinstance(policy, PATH)
     trial_set = read_trial_set(evaluation, repeated=not is_source, **objects)
     before = notes_of(loaded)
     notes = dict.fromkeys([*before, *trial_set.notes])
-    for note in (*vehicle_doubts(trial_set.vehicle), *trial_set.differences, *notes):
-        warnings.warn(str(note), stacklevel=2)
+    warn_of([*vehicle_doubts(trial_set.vehicle), *trial_set.differences, *notes])
     flown, processes = loaded, 1 if workers is None else workers
     if is_source:
-        flown = policy_for_workers(loaded, str(policy), False, processes)
+        flown = policy_for_workers(loaded, os.fspath(policy), False, processes)
     results = fly_trials(flown, evaluation, trial_set, processes)
     # An object is probed after its flights, so that the probe cannot change them.
     doubts = () if before or hasattr(loaded, "notes") else object_faults(loaded)
     known = {doubt.fault for doubt in doubts}
     in_flight = action_report(results, loaded.spec.action, known)["warnings"]
-    for doubt in (*doubts, *in_flight):
-        warnings.warn(f"policy {loaded.name!r}: {doubt}", stacklevel=2)
+    warn_of(f"policy {loaded.name!r}: {doubt}" for doubt in (*doubts, *in_flight))
     return results
 
 
@@ -159,7 +165,7 @@ def train_policy(
     options = Config(
         recipe=recipe, iterations=iterations, set=_all("settings", settings), seed=seed
     )
-    outcome = train(resolve(options), _path("out", out), _console(progress))
+    outcome = train(resolve(options), as_path("out", out), _console(progress))
     return Path(outcome.policy)
 
 
@@ -190,8 +196,8 @@ def diagnose_flights(
         tuple(map(Path, _all(name, given)))
         for name, given in (("flights", flights), ("reference", reference))
     )
-    file = str(_path("vehicle", vehicle))
-    config = Config(flights=paths, vehicle=file, reference=before, out=_path("out", out))
+    file = str(as_path("vehicle", vehicle))
+    config = Config(flights=paths, vehicle=file, reference=before, out=as_path("out", out))
     return diagnose_files(config, _console(progress))
 
 
@@ -212,8 +218,8 @@ def identify_vehicle(
     from suite.diagnose.identify.run import identify_files
 
     paths = [*map(Path, _all("flights", flights))]
-    start = str(_path("vehicle", vehicle))
-    return identify_files(paths, start, _path("out", out), (), _console(progress))
+    start = str(as_path("vehicle", vehicle))
+    return identify_files(paths, start, as_path("out", out), (), _console(progress))
 
 
 def _all(name: str, given: Any) -> tuple[Any, ...]:
@@ -222,16 +228,8 @@ def _all(name: str, given: Any) -> tuple[Any, ...]:
         tuple(given) if isinstance(given, Iterable) and not isinstance(given, str) else (given,)
     )
     for entry in entries:
-        _path(name, entry)
+        as_path(name, entry)
     return entries
-
-
-def _path(name: str, given: Any) -> Path:
-    """Return the argument `name`, a text or a path, as a path."""
-    from tracks.input.ranges import check_type
-
-    check_type(name, given, (str, Path), "a text or a path")
-    return Path(given)
 
 
 def make_env(**settings: Any) -> gymnasium.Env[Any, Any]:
@@ -240,6 +238,8 @@ def make_env(**settings: Any) -> gymnasium.Env[Any, Any]:
 
     from eval.envs.gymnasium_env import ID
 
+    mode = settings.get("render_mode")
+    check_type("render_mode", mode, (str, type(None)), "None or 'rgb_array'")
     return gymnasium.make(ID, **settings)
 
 
@@ -250,7 +250,9 @@ def register_effect(effect: Effect) -> None:
         ValueError: for a name in use, or an effect with inconsistent parts.
     """
     from eval.effects import EFFECTS
+    from eval.effects.interface import Effect
 
+    check_type("effect", effect, (Effect,), "an Effect")
     EFFECTS.register(effect.name, effect)
 
 

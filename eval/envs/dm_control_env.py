@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -14,10 +14,11 @@ from dm_env import specs
 from eval.envs.race import ACTION_LIMIT, Race
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds.engine import course_notes
+from eval.worlds.engine import course_notes, warn_of
 from eval.worlds.trial import Rules
 from policies.spec import ACTION_SIZE, PolicySpec
 from tracks.families import make_track
+from tracks.input.ranges import check_type
 from tracks.track import Track
 
 
@@ -108,10 +109,13 @@ def load(
         ValueError: for an unknown track, a contact at the start of `track`, or a spec that this
             environment cannot fly.
     """
+    check_type("track", track, (Track, NoneType), "a Track or None")
+    check_type("vehicle", vehicle, (Vehicle, NoneType), "a Vehicle or None")
+    check_type("spec", spec, (PolicySpec, NoneType), "a PolicySpec or None")
+    check_type("rules", rules, (Rules, NoneType), "an eval.worlds.trial.Rules or None")
     vehicle = vehicle or load_vehicle("reference")
     if track is not None:
-        for note in course_notes(track.family, track, vehicle):
-            warnings.warn(note, stacklevel=2)
+        warn_of(course_notes(track.family, track, vehicle))
     track = track or make_track(family, level, seed)
     race = Race(track, vehicle, spec or PolicySpec(), rules or Rules())
     physics = RacePhysics.from_model(wrapper.MjModel(race.model))

@@ -5,8 +5,9 @@ Importing this file registers them under `ID`, for `gymnasium.make` and `gymnasi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from numbers import Integral
+from types import NoneType
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -21,6 +22,7 @@ from eval.worlds.trial import FLYING
 from policies.contract import Contract
 from policies.spec import PolicySpec
 from tracks.common.names import unknown_name
+from tracks.input.ranges import check_type
 
 if TYPE_CHECKING:
     from eval.view.chase import Scenery
@@ -54,13 +56,15 @@ def observation_space(spec: PolicySpec) -> gymnasium.spaces.Dict:
 
 def check_render_mode(mode: str | None, allowed: Sequence[str]) -> None:
     """Refuse a render mode that is neither None nor allowed."""
+    names = f"{' or '.join(['None', *map(repr, allowed)])}; `RaceEnv` renders"
+    check_type("render_mode", mode, (str, NoneType), names)
     if mode not in (None, *allowed):
-        names = " or ".join(["None", *map(repr, allowed)])
-        raise ValueError(f"render_mode is {mode!r}, allowed is {names}; `RaceEnv` renders")
+        raise ValueError(f"render_mode is {mode!r}, allowed is {names}")
 
 
 def track_seed_of(options: dict[str, Any] | None) -> Any:
     """Return the `track_seed` in the options of `reset`, and refuse others."""
+    check_type("options", options, (Mapping, NoneType), "a dict or None")
     for name in options or {}:
         if name != "track_seed":
             raise unknown_name("option of reset", name, ["track_seed"])

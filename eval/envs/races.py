@@ -8,7 +8,6 @@ environment and N environments give the same results.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from numbers import Integral, Real
@@ -27,7 +26,7 @@ from eval.envs.race import (
 from eval.judging.guard import ActionLimits, check_rate, first_action, guard_action, limits_of
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds.engine import course_notes
+from eval.worlds.engine import course_notes, warn_of
 from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.slots import layout_of
 from eval.worlds.trial import ENDINGS, FLYING, Rules, TrialSpec, steps_to_next
@@ -39,7 +38,7 @@ from policies.spec import ActionSpec, PolicySpec, check_spec
 from tracks.common.names import unknown_name
 from tracks.families import LEVELS, check_family, make_track
 from tracks.formats.custom import load_track
-from tracks.input.ranges import check_type
+from tracks.input.ranges import PATH, check_type
 from tracks.track import Track
 
 SEEDS = 2**31
@@ -121,13 +120,14 @@ class RaceConfig:
             likely = {"difficulty": "level", "seed": "track_seed"}.get(name, name)
             raise TypeError(str(unknown_name("argument", likely, names)).replace(likely, name, 1))
         config = cls(**arguments)
-        path = (str, os.PathLike)
-        check_type("track", config.track, path, "a track family or a track file (.toml)")
-        if not callable(config.vehicle):
-            said = "a name, a file, a Vehicle or a function that draws one"
-            check_type("vehicle", config.vehicle, (*path, Vehicle), said)
+        check_type("track", config.track, PATH, "a track family or a track file (.toml)")
+        said = "a name, a file, a Vehicle or a function that draws one"
+        check_type("vehicle", config.vehicle, (*PATH, Vehicle, Callable), said)
         said = "a policy's name or folder, a spec or None"
-        check_type("spec", config.spec, (*path, PolicySpec, NoneType), said)
+        check_type("spec", config.spec, (*PATH, PolicySpec, NoneType), said)
+        check_type("action", config.action, (str, NoneType), "a kind of action, as a text, or None")
+        for name in ("channel_axis", "uint8"):
+            check_type(name, getattr(config, name), (bool, np.bool_), "True or False")
         check_type("rewards", config.rewards, (Mapping,), "weights by name of the reward term")
         for name, weight in config.rewards.items():
             check_type(f"rewards[{name!r}]", weight, (Real,), "a number")
@@ -151,8 +151,10 @@ def levels_of(config: RaceConfig) -> tuple[int, int]:
 
 def check_track_seed(seed: Any) -> None:
     """Refuse a seed of the track that is neither None nor a whole number from 0."""
-    if seed is not None and (not isinstance(seed, Integral) or seed < 0):
-        raise ValueError(f"track_seed is {seed!r}, allowed is a whole number from 0, or None")
+    allowed = "a whole number from 0, or None"
+    check_type("track_seed", seed, (Integral, NoneType), allowed)
+    if seed is not None and seed < 0:
+        raise ValueError(f"track_seed is {seed!r}, allowed is {allowed}")
 
 
 def resolved_vehicle(config: RaceConfig, rng: np.random.Generator) -> Vehicle:
@@ -212,8 +214,11 @@ class Races:
             ValueError: for an unknown track, vehicle, kind of action or reward term, an invalid
                 level, spec or track_seed, no slots, or a contact at the start of a track file.
         """
-        if slots < 1:
-            raise ValueError(f"num_envs is {slots}, allowed is 1 or more")
+        allowed = "a whole number, 1 or more"
+        for name, number in (("num_envs", slots), ("threads", threads)):
+            check_type(name, number, (Integral,), allowed)
+            if number < 1:
+                raise ValueError(f"{name} is {number}, allowed is {allowed}")
         levels_of(config)
         check_track_seed(config.track_seed)
         self.config, self.slots, self._track = config, slots, os.fspath(config.track)
@@ -230,12 +235,10 @@ class Races:
         check_spec(self.spec)
         check_rate("the spec", self.spec.rate_hz, vehicle.controller.frequency)
         if self._file_track:
-            for note in course_notes(self._track, self._file_track, vehicle):
-                warnings.warn(note, stacklevel=2)
             ignored = {"level": levels_of(config) != (0, 0), "track_seed": config.track_seed}
-            for setting in [setting for setting, given in ignored.items() if given]:
-                said = f"a track from a file has no levels and seeds: {setting} does not change it"
-                warnings.warn(f"{self._track}: {said}", stacklevel=2)
+            said = f"{self._track}: a track from a file has no levels and seeds: "
+            warn_of(course_notes(self._track, self._file_track, vehicle))
+            warn_of(f"{said}{name} does not change it" for name in ignored if ignored[name])
         self.contract: Contract = contract_of(self.spec)
         layout = layout_of([self._file_track] if self._file_track else [])
         self._world = MujocoWorld(

@@ -21,7 +21,7 @@ from eval.importers.options import ImportOptions
 from eval.importers.rows import continuous, measured, turn_axes
 from eval.importers.signals import Recording, Signal, collect, make_signal
 from eval.logs.columns import ESTIMATE, GROUPS, FlightLogError
-from eval.logs.faults.drive.commands import is_share
+from eval.logs.faults.drive.commands import clip_commands, is_share
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.pose import BAD, CALM_RATE, TIMES_BETTER, WIDTH_S, turns_of
 from eval.logs.faults.relation import match, rms, smooth
@@ -83,6 +83,9 @@ def recording_of(
             # The mapping's unit is wrong: `check_throttle` finds it by the values of the file.
             column = replace(column, factor=tuple(float(np.sign(f)) for f in column.factor))
             parts[signal] = _in_log_unit(part, column, name)
+        if column.mixer:
+            time_s, value = parts[signal]
+            parts[signal] = time_s, clip_commands(value)
     parts.pop("time", None)
     # Angles become quaternions, unless the file has quaternions too.
     euler: dict[str, Part] = {}
@@ -167,7 +170,7 @@ def _estimates(
 
 
 def _in_log_unit(part: Part, column: Column, name: str) -> Part:
-    """Return a signal in the flight log's unit, with the motor mixer applied."""
+    """Return a signal in the flight log's unit, with the motor mixer applied, not yet clipped."""
     time_s, value = part
     if value.shape[1] != len(column.factor):
         wanted = f"give {len(column.factor)} columns, or one whose cells hold as many"
@@ -175,7 +178,7 @@ def _in_log_unit(part: Part, column: Column, name: str) -> Part:
         raise FlightLogError(name, column.names[0], None, reason)
     value = value * np.asarray(column.factor)
     if column.mixer:
-        value = np.clip(value @ MIXERS[column.mixer].T, 0.0, 1.0)  # motor drivers clip as well
+        value = value @ MIXERS[column.mixer].T
     return time_s, value
 
 

@@ -15,7 +15,7 @@ from typing import Any, TextIO
 
 from eval.worlds.trial import TrialResult, TrialSpec
 from tracks.common.files import naming, plain, replacing_file, to_json, write_json, write_text
-from tracks.common.provenance import stamp
+from tracks.common.provenance import differences, first_changes, stamp
 from tracks.input.reading import LOG_BYTES, check_file, parse_json, read_bytes
 
 SCHEMA = 1
@@ -226,10 +226,10 @@ class Journal:
                 ) from error
             if result is not None:
                 self.done[result.trial] = result
-            elif difference := _differences(entry, about):
+            elif changes := differences(_settings(entry), about):
                 raise ValueError(
-                    f"{self.path}: holds trials flown otherwise ({difference}); give another --out "
-                    "or move the file away"
+                    f"{self.path}: holds trials flown otherwise ({first_changes(changes)}); give "
+                    "another --out or move the file away"
                 )
             kept_bytes += len(line)
         return kept_bytes
@@ -264,14 +264,10 @@ class Journal:
         self.close()
 
 
-def _differences(entry: Any, about: dict[str, Any]) -> str:
-    """Return the differences between a journal's first line and these settings, or ""."""
-    old = entry.get("about") if isinstance(entry, dict) else None
-    if not isinstance(old, dict):
-        return "it does not say how"
-    names = sorted(name for name in old.keys() | about.keys()
-                   if name not in old or name not in about or old[name] != about[name])  # fmt: skip
-    return ", ".join(f"another {name}" for name in names)
+def _settings(entry: Any) -> dict[str, Any]:
+    """Return the settings in a journal's first line; {} where it has none."""
+    stored = entry.get("about") if isinstance(entry, dict) else None
+    return stored if isinstance(stored, dict) else {}
 
 
 def _result(entry: Any) -> TrialResult:

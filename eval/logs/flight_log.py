@@ -23,6 +23,7 @@ from policies.spec import ACTIONS
 from tracks.common.files import to_json
 from tracks.common.provenance import stamp
 from tracks.geometry.rotation import quat_to_rot
+from tracks.input.ranges import as_path, check_type
 from tracks.input.reading import InputError, parse_json
 
 SCHEMA = 1
@@ -289,7 +290,7 @@ def read_flight(path: str | Path, partial: bool = False, limits: bool = True) ->
         FlightLogError: where the file cannot be read or breaks a rule; the message has the file,
             the column, the first bad row (counted from 1) and the reason.
     """
-    columns, text, warnings = read_columns(Path(path))
+    columns, text, warnings = read_columns(as_path("path", path))
     about, more = flight_metadata(text, str(path))
     warnings += more
     log = log_from_columns(columns, about, str(path), limits)
@@ -359,7 +360,9 @@ def write_flight(path: str | Path, log: FlightLog) -> Path:
         FlightLogError: where the log would be refused on reading, or the ending is another.
         OSError: where the file cannot be written; nothing is left under its name.
     """
+    file = as_path("path", path)
+    check_type("log", log, (FlightLog,), "a FlightLog")
     columns = columns_from_log(log)
     check_columns(columns, log.name, bool(log.partial))
     about = {**log.about, **stamp(SCHEMA, log.about.get("seed"))}
-    return write_columns(Path(path), columns, to_json(about))
+    return write_columns(file, columns, to_json(about))

@@ -22,6 +22,7 @@ from tracks.common.files import write_text
 from tracks.common.names import printable
 from tracks.common.toml_table import REQUIRED, Table, load_shipped, shipped_names, to_toml
 from tracks.geometry.camera import Camera
+from tracks.input.ranges import as_path, check_type
 
 SCHEMA = 1
 """Version of the file's layout."""
@@ -92,10 +93,12 @@ def save_vehicle(vehicle: Vehicle, path: str | os.PathLike[str], comment: str = 
     Raises:
         ValueError: for a vehicle that the check refuses.
     """
+    check_type("vehicle", vehicle, (Vehicle,), "a Vehicle")
+    check_type("comment", comment, (str,), "a text")
     table = vehicle_table(vehicle)
     parse_vehicle(table)
     head = "".join(f"# {printable(line)}\n" for line in comment.splitlines())
-    write_text(path, head + to_toml(table))
+    write_text(as_path("path", path), head + to_toml(table))
 
 
 def vehicle_table(vehicle: Vehicle) -> dict[str, Any]:

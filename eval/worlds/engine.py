@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterable
+
 import mujoco
 import numpy as np
 
@@ -184,6 +187,12 @@ def course_notes(name: str, track: Track, vehicle: Vehicle) -> list[str]:
         f"the body of {vehicle.name!r} ({body[1]:g} x {body[0]:g} m)"
         for gate in small[:1]
     ]
+
+
+def warn_of(notes: Iterable[object], stacklevel: int = 2) -> None:
+    """Issue each note as a Python warning; level 1 is the caller's line, 2 that of its caller."""
+    for note in notes:
+        warnings.warn(str(note), stacklevel=stacklevel + 1)
 
 
 def start_state(track: Track) -> np.ndarray:

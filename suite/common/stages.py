@@ -7,7 +7,7 @@ starts, it prints an estimate of the time and the memory of the remaining work.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import psutil
 from suite.common.console import Console, duration, size
 from suite.common.provenance import write_run_record
 from tracks.common.files import plain, write_json
-from tracks.input.ranges import shown
+from tracks.common.provenance import differences, first_changes
 from tracks.input.reading import read_json
 
 MARK = "stage.json"
@@ -41,52 +41,30 @@ def refuse_other_options(out: Path, config: Any) -> None:
     Raises:
         ValueError: with the differences, except in the name of the folder and in --json.
     """
-    path = out / "run.json"
-    if not path.is_file():
-        return
-    try:
-        stored = dict(read_json(path)["config"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: not the record of a run ({error}); move it away") from error
-    unchanged = {name: stored.get(name) for name in ("out", "json")}
-    changes = differences({**stored, **unchanged}, {**plain(config), **unchanged})
-    if changes:
+    if changes := changed_options(out, config):
         raise ValueError(
             f"{out} holds a run of another configuration ({first_changes(changes)}); give another "
             "--out, or move the folder away to start over"
         )
 
 
-def differences(stored: Any, new: Any, name: str = "") -> list[str]:
-    """Return the differences of two plain values (as in JSON), as "name is X there, Y here".
+def changed_options(out: Path, config: Any) -> list[str]:
+    """Return the differences between the options of the run in `out`, if any, and `config`.
 
-    `stored` is of an earlier run ("there"), `new` of this one ("here"). The names of nested values
-    are appended to `name`.
+    The name of the folder and --json do not count.
+
+    Raises:
+        ValueError: where the record of the run cannot be read.
     """
-    there, here = _by_name(stored), _by_name(new)
-    if isinstance(there, Mapping) and isinstance(here, Mapping):
-        changes = []
-        for key in dict.fromkeys([*here, *there]):
-            path = f"{name}.{key}" if name else str(key)
-            changes += differences(there.get(key), here.get(key), path)
-        if changes or isinstance(stored, Mapping):
-            return changes
-    return [] if stored == new else [f"{name} is {shown(stored)} there, {shown(new)} here"]
-
-
-def _by_name(value: Any) -> Any:
-    """Return a list of records by their numbers, and one of changes "name=value" by their names."""
-    if isinstance(value, list) and all(isinstance(one, Mapping) for one in value):
-        return {number: one for number, one in enumerate(value, 1)}
-    if isinstance(value, list) and all(isinstance(one, str) and "=" in one for one in value):
-        return dict(one.split("=", 1) for one in value)
-    return value
-
-
-def first_changes(changes: Sequence[str]) -> str:
-    """Return the first four changes and the number of further ones, for a message."""
-    more = f"; and {len(changes) - 4} more" if changes[4:] else ""
-    return "; ".join(changes[:4]) + more
+    path = out / "run.json"
+    if not path.is_file():
+        return []
+    try:
+        stored = dict(read_json(path)["config"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: not the record of a run ({error}); move it away") from error
+    unchanged = {name: stored.get(name) for name in ("out", "json")}
+    return differences({**stored, **unchanged}, {**plain(config), **unchanged})
 
 
 @dataclass(frozen=True)

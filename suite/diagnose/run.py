@@ -11,6 +11,7 @@ from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console
 from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.report import html
+from suite.common.stages import changed_options
 from suite.diagnose.config import Config
 from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.diagnose import diagnose
@@ -24,7 +25,7 @@ from suite.diagnose.sources.rollout_source import rollouts_of
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict.actuators import actuator_mismatches
 from tracks.common.files import check_no_input, plain, write_json, write_text
-from tracks.common.provenance import stamp
+from tracks.common.provenance import first_changes, stamp
 
 SCHEMA = 1
 """Version of diagnosis.json."""
@@ -40,6 +41,12 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     """
     out = config.out
     refuse_other_run(out, config)
+    # A diagnosis is quick to repeat, and often repeated with one option more: no refusal.
+    if changes := changed_options(out, config):
+        console.note(
+            f"{out} holds a diagnosis with other options ({first_changes(changes)}), which will be "
+            "overwritten; give another --out to keep it"
+        )
     check_no_input(out / "vehicle.toml", [config.vehicle])
     vehicle = load_vehicle(config.vehicle)
     refuse_own_motion(vehicle)

@@ -22,7 +22,7 @@ from eval.worlds.trial import TrialResult, TrialSpec
 from policies.policy import Policy
 from suite.common.console import Console
 from suite.common.provenance import engines, refuse_other_run, write_run_record
-from suite.common.stages import announce, differences, first_changes
+from suite.common.stages import announce
 from suite.judging.flying import (
     Manner,
     default_policy,
@@ -37,7 +37,7 @@ from suite.judging.flying import (
 from suite.judging.requests import Collection
 from suite.judging.trials import TrialSet, log_name, read_trial_set, refuse_equal_names, show_notes
 from tracks.common.files import write_json
-from tracks.common.provenance import git_commit, stamp
+from tracks.common.provenance import differences, first_changes, git_commit, stamp
 from tracks.common.work import Workers
 from tracks.input.reading import read_json
 
@@ -84,6 +84,8 @@ def collect(
     identity = without_paths(settings)
     # Rows of flights that exist, then of the missing ones.
     rows = _existing_rows(out, identity)
+    if (out / JOURNAL).is_file():  # of an interrupted call: refused with what differs
+        Journal(out / JOURNAL, identity).close()
     _refuse_other_logs(out, trial_set)
     with Journal(out / JOURNAL, identity) as journal:
         as_flown = _write_vehicle(collection, trial_set.vehicle, out, console)

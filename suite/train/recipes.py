@@ -29,6 +29,7 @@ from suite.train.config import (
 from suite.train.overrides import phase_configs, without_quadrotor
 from tracks.common.names import unknown_name
 from tracks.geometry.camera import Camera
+from tracks.input.ranges import check_type
 
 
 def race_paper() -> TrainConfig:
@@ -332,6 +333,7 @@ def named_recipe(name: str) -> TrainConfig:
     Raises:
         ValueError: if there is none, with the known names.
     """
+    check_type("recipe", name, (str,), "a name, as a text")
     if name not in RECIPES:
         raise unknown_name("recipe", name, RECIPES)
     return RECIPES[name]()

@@ -32,9 +32,10 @@ from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.running import hosts
-from suite.common.stages import Estimate, announce, differences, first_changes
+from suite.common.stages import Estimate, announce
 from suite.train.worlds import Worlds, WorldsAhead
 from tracks.common.files import recover_folder
+from tracks.common.provenance import differences, first_changes
 from tracks.common.work.threads import threads
 
 SAVE_PERIOD_S = 30.0

@@ -12,6 +12,8 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 from unicodedata import category
 
+from tracks.input.ranges import check_type
+
 LONGEST = 80
 """Largest number of characters of a name that are compared and printed, because a key of a file may
 have megabytes."""
@@ -98,8 +100,9 @@ class Registry(Mapping[str, T]):
         """Add `value` under `name`, for this process.
 
         Raises:
-            ValueError: for a name that exists, or a value of the wrong kind.
+            ValueError: for a name that exists or is no text, or a value of the wrong kind.
         """
+        check_type(f"{self._kind} (register)", name, (str,), "a name, as a text")
         if name in self:
             raise ValueError(f"{self._kind} {name!r} exists already; register another name")
         self._values[name] = self._checked(name, value, "register")
@@ -111,8 +114,9 @@ class Registry(Mapping[str, T]):
         Raises:
             ValueError: for an unknown name; the message has the closest known name.
         """
+        check_type(self._kind, name, (str,), "a name, as a text")
         if name not in self:
-            error = unknown_name(self._kind, str(name), self)
+            error = unknown_name(self._kind, name, self)
             raise ValueError(f"{error} Another one comes with its package: install that first.")
         return self[name]
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from tracks.common.names import closest, printable, unknown_name
 from tracks.input import reading
-from tracks.input.ranges import is_number, shown
+from tracks.input.ranges import as_path, is_number, shown
 
 T = TypeVar("T")
 
@@ -64,7 +64,7 @@ def load_shipped(
         refused: naming the file.
         ValueError: for a source that is neither a path nor a shipped name.
     """
-    path = Path(source)
+    path = as_path(kind, source, "a name, as a text, or a path")
     if path.suffix != ".toml" and len(path.parts) == 1 and not path.is_file():
         if str(source) not in shipped_names(folder):
             raise unknown_name(f"{kind} (or file)", str(source), shipped_names(folder))

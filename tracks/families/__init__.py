@@ -9,6 +9,7 @@ a random generator. Another package adds one with an entry point of the group
 from __future__ import annotations
 
 from collections.abc import Callable
+from numbers import Integral
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from tracks.common.names import Registry
 from tracks.families import judged, random
 from tracks.families.layout import GATE_COUNT, Layout
 from tracks.geometry.scene import Counts, counts
+from tracks.input.ranges import check_type
 from tracks.track import Track
 
 FAMILIES: Registry[Callable[[float, np.random.Generator], Layout]] = Registry(
@@ -51,10 +53,13 @@ def make_track(family: str, level: int, seed: int) -> Track:
             range, the seed is negative, or the track has more solids than `MAX_COUNTS`.
     """
     check_family(family)
+    levels, seeds = "a whole number from 0 to 9", "a whole number, 0 or more"
+    check_type("level", level, (Integral,), levels)
+    check_type("seed", seed, (Integral,), seeds)
     if level not in LEVELS:
-        raise ValueError(f"level is {level!r}, allowed is a whole number from 0 to 9")
-    if seed != int(seed) or seed < 0:
-        raise ValueError(f"seed is {seed!r}, allowed is a whole number, 0 or more")
+        raise ValueError(f"level is {level!r}, allowed is {levels}")
+    if seed < 0:
+        raise ValueError(f"seed is {seed!r}, allowed is {seeds}")
     level, seed = int(level), int(seed)
     rng = np.random.default_rng(np.random.SeedSequence([seed, level, *family.encode()]))
     d = (level + rng.random()) / 10

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +19,7 @@ from tracks.formats.mesh_reader import load_convex_parts
 from tracks.geometry.gates import rectangle, regular_polygon, with_frames
 from tracks.geometry.rotation import quat_to_rot
 from tracks.geometry.scene import Boxes, Gates, Rods, Scene, Spheres
+from tracks.input.ranges import as_path
 from tracks.track import Track
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def load_track(path: str | os.PathLike[str]) -> Track:
             missing, unknown, of the wrong shape or impossible (a gate below the ground, an
             opening or a mesh that is not convex, a start inside a solid).
     """
-    top = read_toml(Path(path))
+    top = read_toml(as_path("path", path))
     top.expect(_TOP_KEYS)
     top.whole("schema", 1, least=1, most=1)
     name = top.text("name", top.path.stem)

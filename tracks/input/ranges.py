@@ -13,9 +13,11 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Annotated, Any, TypeGuard, get_args, get_type_hints
 
 
@@ -60,7 +62,7 @@ Trials = Annotated[int, Range(1, 100_000)]
 """A number of trials or flights."""
 
 
-def check_type(name: str, value: object, kinds: tuple[type, ...], allowed: str) -> None:
+def check_type(name: str, value: object, kinds: tuple[Any, ...], allowed: str) -> None:
     """Refuse an argument that is of none of these types.
 
     Raises:
@@ -68,6 +70,20 @@ def check_type(name: str, value: object, kinds: tuple[type, ...], allowed: str) 
     """
     if not isinstance(value, kinds) or isinstance(value, bool) and bool not in kinds:
         raise ValueError(f"{name} is {shown(value)}, allowed is {allowed}")
+
+
+PATH = (str, os.PathLike)
+"""Types of a path."""
+
+
+def as_path(name: str, value: object, allowed: str = "a text or a path") -> Path:
+    """Return the argument `name` as a path.
+
+    Raises:
+        ValueError: for an argument that is neither a text nor a path.
+    """
+    check_type(name, value, PATH, allowed)
+    return Path(value)  # pyrefly: ignore[bad-argument-type]
 
 
 def check_ranges(config: Any, where: str = "", options: bool = False) -> None:

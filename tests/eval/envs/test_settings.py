@@ -4,12 +4,14 @@ import os
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "disable")
 
 import numpy as np
 import pytest
 
+import suite
 import tracks
 from eval.envs.gymnasium_env import RaceEnv, RaceVectorEnv
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -33,6 +35,7 @@ def test_dm_control_refuses_a_bad_action(action):
         env.step(np.array(action))
 
 
+BAD_MODE: Any = ["human"]
 CTBR = PolicySpec(action=ActionSpec("ctbr"))
 
 
@@ -46,6 +49,10 @@ REFUSED = {
             {"spec": PolicySpec(rate_hz=300.0), "vehicle": SLOW},
             "the spec decides at 300 Hz; .* 200 Hz",
         ),
+        ({"track": "zigzag"}, "track is 'zigzag', allowed is a Track or None"),
+        ({"vehicle": "racer5"}, "vehicle is 'racer5', allowed is a Vehicle or None"),
+        ({"spec": "race"}, "spec is 'race', allowed is a PolicySpec or None"),
+        ({"rules": {}}, "rules is {}, allowed is an eval.worlds.trial.Rules or None"),
     ],
     RaceVectorEnv: [
         ({"rewards": {"gates": 1.0}}, "unknown reward term 'gates'. Did you mean 'gate'"),
@@ -56,7 +63,11 @@ REFUSED = {
         ({"rewards": {"gate": "x"}}, r"rewards\['gate'\] is 'x', allowed is a number"),
         ({"level": 10}, "level is 10, allowed is 0 to 9"),
         ({"spec": "raec"}, "unknown policy .* 'raec'. Did you mean 'race'"),
-        ({"num_envs": 0}, "num_envs is 0, allowed is 1 or more"),
+        ({"num_envs": 0}, "num_envs is 0, allowed is a whole number, 1 or more"),
+        ({"num_envs": 1.5}, "num_envs is 1.5, allowed is a whole number, 1 or more"),
+        ({"threads": "2"}, "threads is '2', allowed is a whole number, 1 or more"),
+        ({"action": ["ctbr"]}, r"action is \['ctbr'\], allowed is a kind of action"),
+        ({"uint8": "no"}, "uint8 is 'no', allowed is True or False"),
     ],
     RaceEnv: [
         ({"spec": PolicySpec(rate_hz=0.0)}, "spec.rate_hz.* is 0"),
@@ -149,6 +160,16 @@ def test_any_sequence_of_seeds_is_taken(seed):
         (lambda env: type(env)(track_seed=5.7), "track_seed is 5.7, allowed is a whole number"),
         (lambda env: type(env)(render_mode="rgb_array"), "render_mode is 'rgb_array', .* None"),
         (lambda env: RaceEnv(render_mode="human"), "'human', allowed is None or 'rgb_array'"),
+        (
+            lambda env: RaceEnv(render_mode=BAD_MODE),
+            r"render_mode is \['human'\], allowed is None",
+        ),
+        (
+            lambda env: type(env)(render_mode=np.arange(2)),
+            r"render_mode is array.*, allowed is None",
+        ),
+        (lambda env: suite.make_env(render_mode=3), "render_mode is 3, allowed is None or 'rgb_"),
+        (lambda env: env.reset(options=3), "options is 3, allowed is a dict or None"),
         (lambda env: RaceEnv().reset(options={"track_sed": 5}), "Did you mean 'track_seed'"),
     ],
 )

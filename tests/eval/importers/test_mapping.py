@@ -9,7 +9,7 @@ import pyarrow.parquet as pa_parquet
 import pytest
 from scipy.spatial.transform import Rotation
 
-from eval.importers import import_log, mapping
+from eval.importers import import_log
 from eval.importers.formats import table
 from eval.importers.mapping_file import MIXERS, SHIPPED, Column, LogMap, map_file, read_map
 from eval.importers.options import ImportOptions
@@ -136,10 +136,20 @@ def test_the_firmwares_mixer_turns_the_body_the_way_that_it_says():
     assert list(roll > 0) == [False, False, True, True]
     assert list(pitch > 0) == [True, False, False, True]
     assert list(yaw > 0) == [True, False, True, False]
-    column = Column(("thrust", "roll", "pitch", "yaw"), (1.0,) * 4, mixer="crazyflie")
-    asked = np.array([[0.5, 0.0, 0.0, 0.0], [1.2, 0.0, 0.0, 0.0], [-0.2, 0.0, 0.0, 0.0]])
-    motors = mapping._in_log_unit((np.arange(3.0), asked), column, "log")[1]
-    np.testing.assert_allclose(motors, [[0.5] * 4, [1.0] * 4, [0.0] * 4])
+
+
+@pytest.mark.parametrize(
+    ("unit", "full", "fixed"),
+    [("65535", 65535, False), ("65535", 1, False), ("1", 65535, True), ("65535", 100, True)],
+)
+def test_mixed_commands_are_clipped_once_their_unit_is_known(tmp_path, truth, unit, full, fixed):
+    asked = np.tile([0.5, 0.1, -0.1, 0.05], (len(truth.time), 1))
+    asked[100:103] = [0.9, 0.8, 0.0, 0.0], [1.2, 0.0, 0.0, 0.0], [-0.2, 0.0, 0.0, 0.0]
+    pwm = f'pwm = {{column = "u", unit = "{unit}", mixer = "crazyflie"}}\n'
+    columns = parts(truth) | {"u": cells(asked * full)}
+    log, findings = imported(tmp_path, POSE + pwm, columns, partial=True)
+    near(log.pwm, np.clip(asked @ MIXERS["crazyflie"].T, 0.0, 1.0), 1e-6)
+    assert [f.status for f in findings if f.fault == "throttle_range"] == ["corrected"] * fixed
 
 
 @pytest.mark.parametrize(

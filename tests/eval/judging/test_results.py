@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 
 import numpy as np
 import pyarrow as pa
@@ -70,11 +71,16 @@ def test_journal_resumes_after_a_kill(tmp_path):
 def test_journal_of_something_else_is_refused(tmp_path):
     path = tmp_path / JOURNAL
     Journal(path, {"policy": "ours", "world": "mujoco"}).close()
-    with pytest.raises(ValueError, match=r"otherwise \(another git_commit, another policy\); give"):
-        Journal(path, {"policy": "theirs", "world": "mujoco", "git_commit": None})
+    said = "otherwise (policy is 'ours' there, 'theirs' here; git_commit is None there, 'a' here); "
+    with pytest.raises(ValueError, match=re.escape(said)):
+        Journal(path, {"policy": "theirs", "world": "mujoco", "git_commit": "a"})
     path.write_text(path.read_text() + "{}\n")
     with pytest.raises(ValueError, match="line 2"):
         Journal(path, {"policy": "ours", "world": "mujoco"})
+    for first in ("[]", '{"about": 3}'):
+        path.write_text(first + "\n")
+        with pytest.raises(ValueError, match="otherwise .*policy is None there, 'ours' here"):
+            Journal(path, {"policy": "ours"})
 
 
 @pytest.mark.parametrize(

@@ -2,9 +2,12 @@
 
 import re
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
 import suite
@@ -182,13 +185,51 @@ def test_the_command_line_asks_for_model_and_vehicle_together():
         ("trials", 1.5, "a whole number, 1 to"),
         ("seed", "1", "a whole number, 0 to"),
         ("workers", "2", "a whole number or None"),
+        ("difficulty", [0, 3], "a level, or several as a text"),
+        ("sensors", None, "a name or a path"),
     ],
 )
 def test_from_python_an_argument_of_another_type_is_refused(name, value, allowed):
     with pytest.raises(ValueError, match=re.escape(f"{name} is {value!r}, allowed is {allowed}")):
         suite.evaluate_policy("race-paper", **{name: value})
-    with pytest.raises(ValueError, match="flights is 3, allowed is a text or a path"):
-        suite.diagnose_flights(3, "reference", "out")  # type: ignore[arg-type]
+
+
+WRONG: tuple[Any, ...] = (3, None, ["race"], {}, b"race", np.arange(3))
+CALLS: dict[str, Callable[[Any], Any]] = {
+    "flights": lambda given: suite.diagnose_flights([given], "reference", "out"),
+    "out": suite.train_policy,
+    "recipe": lambda given: suite.train_policy("out", given),
+    "policy": suite.load_policy,
+    "trust": lambda given: suite.load_policy("race", trust=given),
+    "path": suite.load_track,
+    "path ": suite.read_flight,
+    "path  ": lambda given: suite.write_flight(given, None),  # type: ignore[arg-type]
+    "path   ": lambda given: suite.save_vehicle(suite.load_vehicle("racer5"), given),
+    "log": lambda given: suite.write_flight("it.csv", given),
+    "vehicle": suite.load_vehicle,
+    "vehicle ": lambda given: suite.save_vehicle(given, "it.toml"),
+    "comment": lambda given: suite.save_vehicle(suite.load_vehicle("racer5"), "it.toml", given),
+    "simulator": lambda given: suite.evaluate_policy(simulator=given, trials=1),
+    "track family": lambda given: suite.make_track(given, 0, 0),
+    "level": lambda given: suite.make_track("zigzag", given, 0),
+    "seed": lambda given: suite.make_track("zigzag", 0, given),
+    "effect": suite.register_effect,
+    "track family (register)": lambda given: suite.register_track(given, print),
+    "simulator (register)": lambda given: suite.register_simulator(given, object),
+}
+"""Name of an argument in the message -> the call that takes it."""
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_what_a_function_cannot_load_is_refused_with_what_is_allowed(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for given in WRONG:
+        if name in ("level", "seed") and isinstance(given, int):
+            continue
+        said = f"{name.strip()} is {given!r}, allowed is "
+        with pytest.raises(ValueError, match=f"^{re.escape(said)}"):
+            CALLS[name](given)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -47,13 +47,19 @@ def test_files_come_out_whole_and_bad_flights_are_named(diagnosed):
     assert not (written / "plan").exists()
 
 
-def test_without_a_recording_all_else_is_written(diagnosed, tmp_path, monkeypatch):
+def test_without_a_recording_all_else_is_written(diagnosed, tmp_path, monkeypatch, capsys):
     flights, made = diagnosed[0].parent, diagnosed[1]
     monkeypatch.setattr(diagnose_run, "diagnose", lambda *_, **options: made)
     line = [str(flights / "0.parquet"), "--vehicle", str(flights / "v.toml"), "--no-recording"]
     assert main(["diagnose", *line, "--out", str(tmp_path)]) == 0
     names = {"diagnosis.json", "report.html", "run.json", "vehicle.toml"}
     assert {path.name for path in tmp_path.iterdir()} == names
+    capsys.readouterr()
+    monkeypatch.setattr(diagnose_run, "read_checked", lambda *_, **options: load_vehicle("none"))
+    for more, said in (([], ""), (["--seed", "5"], "seed is 0 there, 5 here")):
+        assert main(["diagnose", *line, "--out", str(tmp_path), *more]) == 2
+        notes = capsys.readouterr().err
+        assert said in notes and ("which will be overwritten" in notes) == bool(said)
 
 
 def test_every_step_is_in_the_report(diagnosed):

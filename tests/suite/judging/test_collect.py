@@ -43,6 +43,23 @@ def test_collect_writes_logs_that_read_back_and_goes_on(pilots, tmp_path, monkey
     assert "other.parquet" in refused(capfd, *args)
 
 
+def test_an_interrupted_collection_names_the_setting_that_differs(
+    pilots, tmp_path, monkeypatch, capfd
+):
+    args = ("--policy", pilots["pursuit"], "--out", tmp_path / "flights")
+    cut_short(monkeypatch, stop_after=1)
+    assert run(TWO, *args) == 130
+    for name, old, new in (
+        ("seed", "7", "8"),
+        ("trials", "2", "1"),
+        ("time_limit_s", "1.5", "9.5"),
+    ):
+        option = f"--{name.replace('_', '-')} "
+        said = refused(capfd, TWO.replace(option + old, option + new), *args)
+        assert f"flown otherwise (collection.{name} is {old} there, {new} here)" in said
+    assert run(TWO, *args) == 0
+
+
 def test_flights_of_another_course_or_code_are_not_taken_for_its_own(
     pilots, tmp_path, monkeypatch, capfd
 ):

@@ -46,14 +46,14 @@ OPPOSITE, FOLLOWED, BENT = -0.5, 0.92, 0.4
 second the gain is reliable. The third is the least growth of the gain from small to large commands
 (`bend`) that shows another rates curve."""
 RANGES = (
-    ("0 to 1", 1.0, (0.03, 0.97), ""),
-    ("percent", 100.0, (8.0, 90.0), "0.01"),
-    ("0 to 1000", 1000.0, (100.0, 900.0), "0.001"),
-    ("1000 to 2000 us", 1000.0, (1080.0, 1920.0), "1000-2000"),
-    ("0 to 65535", 65535.0, (6000.0, 62000.0), f"{1.0 / 65535.0:.10g}"),
+    ("0 to 1", (0.0, 1.0), (0.03, 0.97), ""),
+    ("percent", (0.0, 100.0), (8.0, 90.0), "0.01"),
+    ("0 to 1000", (0.0, 1000.0), (100.0, 900.0), "0.001"),
+    ("1000 to 2000 us", (1000.0, 2000.0), (1080.0, 1920.0), "1000-2000"),
+    ("0 to 65535", (0.0, 65535.0), (6000.0, 62000.0), f"{1.0 / 65535.0:.10g}"),
 )
-"""Range of a throttle in words, its span, limits of its usual median in flight, and the step of
-`--read` that converts it to 0 to 1 (empty where it is correct)."""
+"""Range of a throttle in words and as numbers, limits of its usual median in flight, and the step
+of `--read` that converts it to 0 to 1 (empty where it is correct)."""
 THRUST_FITS, THRUST_EFFECT, THRUST_SAME = 1.35, 2.0, 1.15
 """Limits of the commanded thrust over the force that the path needs. Within the first factor of a
 unit's conversion factor, the ratio is explained by that unit. Within the second factor of 1 it may
@@ -74,6 +74,20 @@ def is_share(value: np.ndarray, quantile: float = 1.0) -> bool:
     return top <= 0.0 or LEAST_TOP <= top <= 1.5
 
 
+def clip_commands(value: np.ndarray) -> np.ndarray:
+    """Return motor commands (T, C) within their range, as motor drivers clip them.
+
+    The range is 0 to 1, or the one of `RANGES` that fits where the commands are in another unit.
+    """
+    row = RANGES[0] if is_share(value, 0.9) else _range_of(float(np.nanmedian(value.mean(axis=1))))
+    return value if row is None else np.clip(value, *row[1])
+
+
+def _range_of(middle: float) -> tuple[str, tuple[float, float], tuple[float, float], str] | None:
+    """Return the row of `RANGES` that fits a median of throttle or motor commands, if any."""
+    return next((row for row in RANGES if row[2][0] <= middle <= row[2][1]), None)
+
+
 def check_throttle(rows: Rows) -> list[Finding]:
     """Return a finding for throttle and for motor commands whose range is not 0 to 1."""
     findings = []
@@ -83,26 +97,26 @@ def check_throttle(rows: Rows) -> list[Finding]:
             continue
         flying = value[np.isfinite(value).all(axis=1)].mean(axis=1)
         middle, top = float(np.median(flying)), float(np.max(flying))
-        fits = [r for r in RANGES if r[2][0] <= middle <= r[2][1]]
+        fit = _range_of(middle)
         figures = f"half of its values are below {middle:.4g} and all below {top:.4g}"
         if top < LEAST_TOP:
             text = f"{figures}, which lifts no vehicle: it was divided by too large a range"
             fix = "correct the unit in the mapping of suite import"
             findings.append(Finding("doubt", subject, text, "throttle_range", top, 0.95, fix))
             continue
-        if not fits:
+        if fit is None:
             text = f"{figures}: no range from 0 to 1, percent, 1000 or 65535"
             findings.append(Finding("doubt", subject, text, "throttle_range", top, 0.95))
             continue
-        range_in_words, span, _, reading = fits[0]
+        range_in_words, (low, high), _, reading = fit
         if not reading:
             text = f"{figures}: it goes from 0 to 1, with {np.sum(flying > 1.5)} rows of outliers"
             about = ("throttle_range", top, 0.6, "leave these rows out of the file")
             findings.append(Finding("doubt", subject, text, *about))
             continue
         text = f"{figures}: it goes from {range_in_words}, not from 0 to 1"
-        findings.append(Finding("corrected", subject, text, "throttle_range", span, 0.98,
-                             option((name, reading))))  # fmt: skip
+        findings.append(Finding("corrected", subject, text, "throttle_range", high - low,
+                             0.98, option((name, reading))))  # fmt: skip
     return findings
 
 
