@@ -273,6 +273,7 @@ def test_the_network_remembers_the_flight_before_a_window(logs):
     assert np.abs(hidden[number]).max() > 1e-2
 
 
+@pytest.mark.slow
 def test_a_fit_cuts_the_error_and_says_what_it_corrects(logs, tmp_path, monkeypatch):
     """As many flights are held out as are fitted: the errors of both are one program."""
     monkeypatch.setattr(quadrotor, "LEAST_PHYSICS_HZ", 100.0)  # a step a row compiles faster

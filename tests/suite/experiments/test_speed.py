@@ -30,6 +30,7 @@ from tests.support.training import fresh_params
 from tracks.geometry.scene import PARKED_Z
 
 
+@pytest.mark.slow
 def test_both_sides_compute_the_same_loss_and_gradient():
     """Ours leaves far solids out of images, so not to the last digit."""
     base = train.bench_config(2, 4)

@@ -201,6 +201,7 @@ def test_view_flies_the_chosen_trials_again(pilots, tmp_path, capfd):
     assert run(*again, *"--count 1".split()) == 0
 
 
+@pytest.mark.slow
 def test_view_finds_the_trials_of_every_policy_of_a_run(pilots, tmp_path, capfd):
     """The first one is often `race`, and the one that fails the user's own."""
     out, again = tmp_path / "out", ("view --out", tmp_path / "seen", tmp_path / "out")

@@ -284,6 +284,7 @@ def test_a_file_of_suite_identify_is_not_sent_back_to_it(tmp_path):
     assert "repeat it if the vehicle has changed" in steps[1]
 
 
+@pytest.mark.slow
 def test_flights_that_no_rollout_comes_near_do_not_agree():
     log = fly(PLAIN, 0, duration_s=4.0, noise=0.1)
     log = replace(log, rate_cmd_b=log.rate_cmd_b + [20.0, 0.0, 0.0])

@@ -111,6 +111,7 @@ def test_the_noise_fits_held_out_flights_unless_theirs_has_another_colour():
     assert not held_out(mixed)["velocity_z"].fits
 
 
+@pytest.mark.slow
 def test_a_drift_and_a_tilt_by_neglected_drag_are_found_where_they_are():
     none = {"position_x": 0.0, "position_y": 0.0}
     drifting = flown(range(20, 22), 0.0, position_drift=0.05, **none)

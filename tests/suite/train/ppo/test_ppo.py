@@ -160,6 +160,7 @@ def _small_scenes(monkeypatch):
     monkeypatch.setattr(run, "make_update", make_update)
 
 
+@pytest.mark.slow
 def test_a_stopped_run_resumes_exactly_and_leaves_a_policy(tmp_path, monkeypatch):
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     assert run.train_ppo(CONFIG, whole, Console()).iterations == 3
