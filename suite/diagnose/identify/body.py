@@ -11,10 +11,12 @@ drive the rotors.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from suite.diagnose.data.steps import torque_between_rows
 from suite.diagnose.data.view import FlightRows, WeakForm
 from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.identify.drive import DRIVES, Accelerations, DrivenVehicle
@@ -23,6 +25,7 @@ from suite.diagnose.identify.fit import (
     Z95,
     Fitted,
     KnownNumbers,
+    NoWholeWindow,
     Residuals,
     Rows,
     Unknown,
@@ -217,6 +220,7 @@ def fit_torque(
     fixed: Mapping[str, float],
     known: KnownNumbers = NONE_KNOWN,
     held: Sequence[str] = (),
+    lag_known: bool = False,
 ) -> Fitted:
     """Fit inertia, lag and delay by `dw/dt = J^-1 (tau - w x J w)`.
 
@@ -226,25 +230,72 @@ def fit_torque(
     too small a slope (errors in variables; Fuller 1987, Sec. 1.1). The inertia would seem larger
     and the yaw torque smaller. The modelled torque is therefore multiplied by the share of its
     variance that is not noise (the reliability ratio). Half of this correction counts as its
-    uncertainty. A number that reaches its limit is reset to its start and held. So are the numbers
-    `held`, with their uncertainty. `fixed` has the other numbers, `lag` and `late` among them;
-    `known` are those that the force fit has identified, with their covariance.
+    uncertainty. The same holds for the torque between the rows of the log (`torque_between_rows`),
+    but without an identified lag (`lag_known`) it counts as uncertainty only. `_beyond_rows`
+    corrects the rest of this error.
+
+    A number that reaches its limit is reset to its start and held. So are the numbers `held`, with
+    their uncertainty. `fixed` has the other numbers, `lag` and `late` among them; `known` are those
+    that the force fit has identified, with their covariance.
 
     Raises:
         NoWholeWindow: if no window has all signals.
     """
+    fitted = _fit_torque(unknowns, flights, driven, fixed, known, held, lag_known)
+    fewer = [flight.with_fewer_speeds() for flight in flights if driven.drive == "rotors"]
+    if not fewer or None in fewer:
+        return fitted
+    try:
+        coarse = _fit_torque(unknowns, fewer, driven, fixed, known, held, lag_known)
+    except NoWholeWindow:
+        return fitted
+    return _beyond_rows(fitted, coarse)
+
+
+def _beyond_rows(fitted: Fitted, coarse: Fitted) -> Fitted:
+    """Return `fitted` as if the log had many more rows of rotor speeds.
+
+    The `coarse` fit has every second one. If the error is of second order in the spacing of the
+    rows, it is a third of the difference of both fits (extrapolation by Richardson 1911, Phil.
+    Trans. R. Soc. A 210). This is added. Half of the difference counts as uncertainty.
+    """
+    shift = np.array(
+        [
+            value - other if fitted.identifies(name) and coarse.identifies(name) else 0.0
+            for name, value, other in zip(fitted.names, fitted.value, coarse.value, strict=True)
+        ]
+    )
+    covariance = fitted.covariance + np.diag((0.5 * shift / Z95) ** 2)
+    return replace(fitted, value=fitted.value + shift / 3.0, covariance=covariance)
+
+
+def _fit_torque(
+    unknowns: Sequence[Unknown],
+    flights: Sequence[FlightGrid],
+    driven: DrivenVehicle,
+    fixed: Mapping[str, float],
+    known: KnownNumbers,
+    held: Sequence[str],
+    lag_known: bool,
+) -> Fitted:
+    """Return the fit of `fit_torque`, to rotor speeds that are interpolated between their rows."""
     # The known numbers join the unknowns, so that their uncertainty widens the intervals.
     steps = {"thrust": 1e-3, "curve": 1e-2, "battery": 1e-2}
     known_unknowns = (Unknown(n, fixed[n], -9.0, 9.0, 1.0, steps[n]) for n in known.names)
     unknowns = [*unknowns, *known_unknowns]
     held = list(held)
     windows = [_torque_windows(flight, driven.drive) for flight in flights]
-    # Correct the bias by noise of the rotor speeds.
+    # Correct the bias by noise of the rotor speeds, and by the torque between the rows.
     starts = {**fixed, **{unknown.name: unknown.start for unknown in unknowns}}
-    reliability = np.ones(3)
+    reliability = between_rows = np.ones(3)
     if driven.drive == "rotors":
         reliability = _reliability(windows, driven.accelerations(starts))
-    correction: dict[str, float] = dict(zip(NOISE_BIASED, -0.5 * np.log(reliability), strict=True))
+        lag_s, spacing_s = fixed["lag"], float(np.mean([one.rotor_spacing_s for one in flights]))
+        vehicle = replace(driven.start, rotors=replace(driven.start.rotors, time_constant=lag_s))
+        between_rows = 1.0 + torque_between_rows(vehicle, spacing_s)
+    uncertain = 0.5 * np.hypot(np.log(reliability), np.log(between_rows))
+    correction: dict[str, float] = dict(zip(NOISE_BIASED, uncertain, strict=True))
+    reliability = reliability * between_rows if lag_known else reliability
     for k, u in enumerate(unknowns):
         of_noise = Z95 * correction.get(u.name, 0.0)
         unknowns[k] = u._replace(method_error=float(np.hypot(u.method_error, of_noise)))

@@ -20,7 +20,14 @@ from eval.logs.flight_log import FlightLog
 from suite.diagnose.data.flights import leaning, turning_of
 from suite.diagnose.data.inertial import InertialLog, specific_force_w
 from suite.diagnose.data.noise import noise_like
-from suite.diagnose.data.sampling import HELD, MEASURED, attitude_at, in_hole, interpolate
+from suite.diagnose.data.sampling import (
+    HELD,
+    MEASURED,
+    attitude_at,
+    in_hole,
+    interpolate,
+    own_spacing_s,
+)
 from suite.diagnose.data.view import FlightRows, WeakForm, weak_form
 from tracks.geometry.rotation import rot_to_quat
 
@@ -31,6 +38,8 @@ MEMORY_S = 0.4
 ROTOR_NOISE = "rotor_noise"
 """Name of a signal: random noise as large as that of the measured rotor speeds. It is added to
 them, to see how such noise changes the model."""
+FEWER = "fewer_"
+"""Prefix of the names of signals: rotor speeds and their noise from every second measured row."""
 LEANING = "leaning"
 """Name of a signal: the attitude that the path's acceleration requires, if none was measured."""
 IMU_ACC = "imu_acc_w"
@@ -54,10 +63,21 @@ class FlightGrid(NamedTuple):
     in_turn: tuple[str, ...] = ()
     """Names of signals of which each row has only some columns, such as the speeds of motors that
     are read one after another."""
+    rotor_spacing_s: float = 0.0
+    """Time between the measured rotor speeds [s]; 0 without any."""
 
     def has(self, *names: str) -> bool:
         """Return whether the flight has all of these signals."""
         return all(name in self.signals for name in names)
+
+    def with_fewer_speeds(self) -> FlightGrid | None:
+        """Return the flight with every second measured rotor speed; None if too few are left."""
+        names = ("rotor_speed", ROTOR_NOISE)
+        if not self.has(*(f"{FEWER}{name}" for name in names)):
+            return None
+        fewer = {name: self.signals[f"{FEWER}{name}"] for name in names}
+        signals, spacing_s = {**self.signals, **fewer}, 2.0 * self.rotor_spacing_s
+        return self._replace(signals=signals, rotor_spacing_s=spacing_s)
 
     def form(self, width_s: float, needs: Sequence[str], slope: bool = False) -> WeakForm:
         """Return the weights of the windows of `width_s` with all signals of `needs`.
@@ -116,7 +136,12 @@ def grid_of(log: FlightLog) -> FlightGrid:
             add_measured(name, of_pose.reshape(len(time_s), -1))
             signals[name] = np.nan_to_num(signals[name])
     if "rotor_speed" in logged:
-        add_measured(ROTOR_NOISE, noise_like(logged["rotor_speed"]))
+        speed, noise = logged["rotor_speed"], noise_like(logged["rotor_speed"])
+        add_measured(ROTOR_NOISE, noise)
+        fewer = every_second(speed)
+        if _enough(fewer):
+            add_measured(f"{FEWER}rotor_speed", fewer)
+            add_measured(f"{FEWER}{ROTOR_NOISE}", np.where(np.isfinite(fewer), noise, np.nan))
     if _complete_rows(quat_wxyz) > 1:
         signals["rot_w"] = attitude_at(grid_s, time_s, quat_wxyz)
         rate_b = turning_of(time_s, quat_wxyz)
@@ -128,7 +153,14 @@ def grid_of(log: FlightLog) -> FlightGrid:
     if log.voltage is not None and _enough(log.voltage):
         volts = interpolate(grid_s, time_s, log.voltage[:, None])[:, 0]
         signals["voltage"] = uniform_filter1d(volts, VOLTAGE_STEPS, mode="nearest")
-    return FlightGrid(log.name, grid_s, signals, in_turn)
+    spacing_s = own_spacing_s(time_s, logged["rotor_speed"]) if "rotor_speed" in logged else 0.0
+    return FlightGrid(log.name, grid_s, signals, in_turn, spacing_s)
+
+
+def every_second(values: np.ndarray) -> np.ndarray:
+    """Return `values` (T, C) with every second of each column's measured rows, NaN elsewhere."""
+    number = np.cumsum(np.isfinite(values), axis=0)
+    return np.where(number % 2 == 1, values, np.nan)
 
 
 def _enough(values: np.ndarray) -> bool:

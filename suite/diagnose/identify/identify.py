@@ -90,17 +90,17 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
     Raises:
         ValueError: if no signal drives the model in all flights, or no fit has a complete window.
     """
-    # Run the fits. If the motors' thrust is known, the loop comes last and may use the lag of the
-    # torque fit, which is better than its own. Otherwise it comes first: the others use its lag.
+    # Run the fits. With motor commands the loop comes last and may use the lag of the torque fit,
+    # which is better than its own. Otherwise it comes first: the others use its lag.
     flights = [grid_of(log) for log in posed(logs)]
     drive = common_drive(flights)
     fits = _Fits(flights, with_merged_effects(vehicle, drive in KNOWN_MOTORS), drive, tuple(leave))
-    if drive not in KNOWN_MOTORS:
+    if drive != "pwm":
         fits.fit_loop()
     for _ in range(ROUNDS):
         fits.fit_force()
         fits.fit_torque()
-    if drive in KNOWN_MOTORS:
+    if drive == "pwm":
         fits.fit_loop()
     lacking = not_attempted(flights, fits.start, drive, fits.results, leave, fits.broken)
     if not fits.results:
@@ -167,7 +167,8 @@ class _Fits:
             fixed |= self.results["force"].values()
             known = self.results["force"].known_numbers(*FORCE_NUMBERS)
         inputs = (flights, self.driven, fixed, known)
-        result = self.attempt("torque", fit_torque, unknowns, *inputs)
+        lag_known = any(fit.identifies("lag") for fit in self.results.values())
+        result = self.attempt("torque", fit_torque, unknowns, *inputs, (), lag_known)
         start_lag_s = self.start.rotors.time_constant
         if result and result.identifies("lag") and result.values()["lag"] < NO_LAG_S < start_lag_s:
             # No rotor follows at once. Commands that are blurred in the log hide its lag, so the

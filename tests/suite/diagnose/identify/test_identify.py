@@ -10,8 +10,9 @@ from suite.diagnose.identify.identify import identify
 from suite.diagnose.identify.numbers import numbers_json
 from tests.support import identified as known
 from tests.support.broken_logs import changed
+from tests.support.diagnosis_flights import fly_all
 from tests.support.tools import program
-from tests.support.vehicles import with_effects
+from tests.support.vehicles import PLAIN, with_effects
 
 TRUE = {
     "motors.thrust": known.MOTORS.thrust,
@@ -56,6 +57,20 @@ def near_truth(found, most=2.5):
 def test_identified_numbers_are_near_the_truth(drive, least):
     found = known.found(drive)
     assert found.drive == drive and len(near_truth(found)) >= least
+
+
+def test_rotors_that_are_faster_than_the_rows_of_the_log_do_not_look_like_less_inertia():
+    """Without a lag the torque falls between two rows, by a tenth here; the loop shows the lag."""
+    logs = fly_all([PLAIN] * 3, range(3), duration_s=6.0, noise=0.2, motors=True)
+    numbers = {number.key: number for number in identify(logs, PLAIN).numbers}
+    for key, truth in (
+        ("inertia", PLAIN.inertia),
+        ("rotors.torque_coefficient", (PLAIN.rotors.torque_coefficient,)),
+    ):
+        found = numbers[key]
+        assert np.allclose(found.value, truth, rtol=0.04), key
+        for (low, high), true in zip(found.ci95, truth, strict=True):
+            assert low < true < high, key
 
 
 @pytest.mark.slow
