@@ -11,7 +11,15 @@ from collections.abc import Collection
 
 import numpy as np
 
-from eval.importers.cleaning import OF_POSE, airborne, check_delay, clean, without_lost
+from eval.importers.cleaning import (
+    OF_POSE,
+    airborne,
+    check_delay,
+    clean,
+    without_far,
+    without_lost,
+    without_repeats,
+)
 from eval.importers.commands import order_motors, rates_wanted, thrust_command
 from eval.importers.mapping import KEPT
 from eval.importers.options import ImportOptions
@@ -111,8 +119,13 @@ def assemble(
     if options.fix:
         recording, more_findings = without_lost(recording)
         findings += more_findings
+    new, more_findings = without_repeats(recording)
+    if options.fix:
+        recording = new
+        findings += more_findings
     # Checks of the frames of position, attitude and gyro.
-    coarse = rows_at(recording, row_times(recording))
+    checked = without_far(new)
+    coarse = rows_at(checked, row_times(checked))
     more_findings, readings, _ = run_checks(coarse, POSE, context, options.fix)
     findings += more_findings
     if options.fix:

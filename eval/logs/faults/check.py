@@ -23,7 +23,7 @@ from eval.logs.faults.drive.motor_map import check_motor_map
 from eval.logs.faults.drive.motors import check_lift, check_motors
 from eval.logs.faults.finding import Finding, findings_of
 from eval.logs.faults.pose import Rows, check_pose
-from eval.logs.faults.position import check_height_sign, check_jumps
+from eval.logs.faults.position import check_height_sign, check_jumps, jumps_of
 from eval.logs.faults.reading import Readings, read_rows, readings_in
 from eval.logs.faults.sensors import (
     check_accelerometer_bias,
@@ -239,6 +239,9 @@ def rows_of(log: FlightLog) -> dict[str, np.ndarray]:
     """
     columns, rows = columns_from_log(log), {"time": log.time_s}
     for group, value in signals_of(columns).items():
+        if group == "pos":  # its jumps are one fault, which `check_jumps` names
+            is_far = jumps_of(log.time_s, value, in_metres=False) > 0.0
+            value = np.where(is_far[:, None], np.nan, value)
         if np.isfinite(value).all(axis=1).sum() > LEAST_ROWS:
             rows[group] = filled(log.time_s, value)
     for name in ("throttle", "baro"):

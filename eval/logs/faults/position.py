@@ -40,6 +40,13 @@ LEAST_M, SURE_SD = 0.1, 10.0
 """Least size of a jump: in metres, and in standard deviations of the usual steps."""
 STEPS = 5
 """Number of steps before and after, of which the median is the velocity."""
+MEDIAN_SAMPLES = 7
+"""Number of samples of the running median with which a position is compared."""
+KEPT_M = 0.02
+"""Distances from the neighbours up to this size are no jump [m]."""
+FAR = 50.0
+"""In an unknown unit, a jump exceeds this many times the smaller of two sizes: the median step, and
+the distance from the running median that nine of ten positions keep."""
 FAULT_M = 0.5
 """A jump below this size is a note [m]: the estimators of real vehicles correct themselves so."""
 
@@ -126,6 +133,42 @@ def _slope(source: str, time_s: np.ndarray, acc: np.ndarray, force: np.ndarray) 
     without_block = unit * (product.sum() - product) / (square.sum() - square)
     value = unit * float(product.sum() / square.sum())
     return Slope(source, value, jackknife_error(without_block), count)
+
+
+def jumps_of(time_s: np.ndarray, pos: np.ndarray, in_metres: bool) -> np.ndarray:
+    """Return how far positions (N, 3) that jump and come back are from their neighbours (N,).
+
+    Others are 0. Without `in_metres` the unit is unknown, and only far jumps count.
+    """
+    from scipy.ndimage import median_filter
+
+    jump, half = np.zeros(len(pos)), MEDIAN_SAMPLES // 2
+    known = np.flatnonzero(np.isfinite(pos).all(axis=1))
+    if len(known) <= MEDIAN_SAMPLES:
+        return jump
+    time_s, pos = time_s[known], pos[known]
+    usual = median_filter(pos, (MEDIAN_SAMPLES, 1), mode="nearest")
+    usual[:half], usual[-half:] = usual[half], usual[-half - 1]
+    distance = np.abs(pos - usual).max(axis=1)
+    reach_s = half * float(np.median(np.diff(time_s)))
+    least = KEPT_M + 0.5 * ACC_MAX * reach_s**2
+    if not in_metres:
+        step = np.linalg.norm(np.diff(pos, axis=0), axis=1)
+        step = step[step > 0.0] if step.any() else step
+        sizes = [float(np.quantile(distance, 0.9)), float(np.median(step))]
+        least = FAR * min((size for size in sizes if size > 0.0), default=np.inf)
+    limit = np.full(len(pos), least)
+    limit[:half] = limit[-half:] = FAR * least  # the median is not around the ends
+    # Outliers move the median, so that their neighbours seem to jump too: compare with the rest.
+    bad, good = np.flatnonzero(distance > limit), np.flatnonzero(distance <= limit)
+    after = np.searchsorted(good, bad)
+    before_s = time_s[bad] - time_s[good[np.maximum(after - 1, 0)]]
+    after_s = time_s[good[np.minimum(after, len(good) - 1)]] - time_s[bad]
+    line = np.stack([np.interp(time_s[bad], time_s[good], column[good]) for column in pos.T], 1)
+    distance = np.abs(pos[bad] - line).max(axis=1)
+    curve_m = KEPT_M + 0.5 * ACC_MAX * np.maximum(before_s * after_s, 0.0)
+    jump[known[bad]] = np.where(distance > (curve_m if in_metres else least), distance, 0.0)
+    return jump
 
 
 def check_jumps(time_s: np.ndarray, pos: np.ndarray) -> list[Finding]:
