@@ -1,0 +1,86 @@
+"""Cells that hold no sample (placeholders, outliers, repeats): left out before the checks."""
+
+import numpy as np
+import pytest
+
+from eval.importers import import_log
+from eval.importers.options import ImportOptions
+from eval.importers.signals import collect
+from eval.logs.faults.check import check_log
+from eval.logs.faults.position import jumps_of
+from eval.logs.flight_log import read_flight
+from tests.support import known_flight
+from tests.support.imported import flight, text, write
+
+
+def imported(folder, change, fix=True):
+    """Import the flight whose parts were changed; return its log and findings that are open."""
+    parts = flight(100.0, 8.0, 1.0)
+    change(parts)
+    path = write(folder / "flight.csv", parts)
+    log, findings = import_log(path, None, ImportOptions(partial=True, trim=False, fix=fix))
+    return log, findings, [f for f in findings if f.status == "doubt"]
+
+
+@pytest.mark.parametrize("number", [0.0, -9999.0])
+@pytest.mark.parametrize("kept", ["most", "every fourth"])
+def test_a_number_that_stands_for_no_position_is_an_empty_cell(tmp_path, number, kept):
+    is_missing = np.random.default_rng(0).random(800) < 0.02
+    if kept == "every fourth":
+        is_missing = np.arange(800) % 4 > 0
+    log, findings, doubts = imported(
+        tmp_path, lambda parts: parts["pos"].__setitem__(is_missing, number)
+    )
+    assert not doubts and f"{is_missing.sum()} samples are {number:g}, " in text(
+        findings, "position"
+    )
+    assert np.abs(log.pos_w[np.isfinite(log.pos_w).all(axis=1)]).max() < 50.0
+
+
+@pytest.mark.parametrize("still", ["rest at zero", "flights from one start", "centimetres"])
+def test_a_position_that_recurs_is_none(still):
+    pos = known_flight.fly(np.arange(0.0, 6.0, 0.01)).pos
+    pos = pos - pos[0]
+    if still == "rest at zero":
+        pos = np.concatenate([np.zeros((200, 3)), pos])
+    elif still == "flights from one start":
+        pos = np.concatenate([pos, pos, pos])
+    else:
+        pos = np.round(0.05 * pos, 2)
+    signals, findings = collect({"pos": (0.01 * np.arange(len(pos)), pos)}, "log")
+    assert len(signals["pos"].value) == len(pos) and not findings
+
+
+@pytest.mark.parametrize("fix", [True, False])
+def test_a_lone_outlier_hides_nothing_from_the_checks(tmp_path, fix):
+    def change(parts):
+        parts["pos"][[0, 300, 302]] += [[1000.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 90.0]]
+
+    log, findings, doubts = imported(tmp_path, change, fix)
+    assert {f.fault for f in doubts} <= {"position_jump"}
+    assert not fix or (len(log.time_s) == 797 and "3 samples jump" in text(findings, "position"))
+
+
+def test_an_outlier_of_a_log_is_its_only_fault(tmp_path):
+    parts = flight(100.0, 8.0, 1.0)
+    parts["pos"][300] += [0.0, 100.0, 0.0]
+    log = read_flight(write(tmp_path / "flight.csv", parts))
+    assert {f.fault for f in check_log(log)[0] if f.status == "doubt"} == {"position_jump"}
+
+
+@pytest.mark.parametrize("in_metres", [True, False])
+def test_the_neighbours_of_outliers_do_not_jump(in_metres):
+    time = np.arange(0.0, 6.0, 0.01)
+    pos, bad = known_flight.fly(time).pos * 2.0, [100, 102, 103, 200, 250, 251]
+    pos[bad] = -50.0
+    assert np.flatnonzero(jumps_of(time, pos, in_metres)).tolist() == bad
+
+
+@pytest.mark.parametrize("fix", [True, False])
+def test_a_pose_that_is_held_in_fast_rows_is_as_one_with_empty_cells(tmp_path, fix):
+    def change(parts):
+        for name in ("pos", "quat"):
+            parts[name] = parts[name][np.arange(800) // 5 * 5]
+
+    log, _, doubts = imported(tmp_path, change, fix)
+    assert {f.fault for f in doubts} <= {"clock_offset"} and (not fix or len(log.time_s) == 160)
