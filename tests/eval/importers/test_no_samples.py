@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from eval.importers import import_log
+from eval.importers.formats.table import unwrapped
 from eval.importers.options import ImportOptions
 from eval.importers.signals import collect
 from eval.logs.faults.check import check_log
@@ -84,3 +85,16 @@ def test_a_pose_that_is_held_in_fast_rows_is_as_one_with_empty_cells(tmp_path, f
 
     log, _, doubts = imported(tmp_path, change, fix)
     assert {f.fault for f in doubts} <= {"clock_offset"} and (not fix or len(log.time_s) == 160)
+
+
+@pytest.mark.parametrize(
+    ("bits", "per_s", "unit"), [(32, 1e6, 1.0), (32, 1e6, 1e-6), (16, 1e3, 1.0), (16, 1e3, 1e-3)]
+)
+def test_a_counter_that_starts_again_is_one_clock(bits, per_s, unit):
+    time_s = np.arange(0.0, 150.0, 0.01)
+    count = np.round(per_s * time_s) + 2.0**bits - 3.0 * per_s
+    found, (finding,) = unwrapped(np.append(np.nan, count % 2.0**bits * unit))
+    np.testing.assert_allclose(found[1:], count * unit, rtol=1e-12)
+    assert f"its {bits}-bit counter starts again {1 if bits == 32 else 3} times" in finding.evidence
+    two_flights = np.concatenate([count, count - 40.0 * per_s]) * unit
+    assert not unwrapped(two_flights)[1] and not unwrapped(count[::-1] * unit)[1]
