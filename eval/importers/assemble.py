@@ -7,7 +7,7 @@ resample to common rows, convert the commands, and check these. Each check retur
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -24,13 +24,14 @@ from eval.importers.commands import order_motors, rates_wanted, thrust_command
 from eval.importers.mapping import KEPT
 from eval.importers.options import ImportOptions
 from eval.importers.rows import GAP_S, GAP_STEPS, row_times, rows_at, sampled_rows, slowest
-from eval.importers.signals import NEEDED, Recording, median_step, with_readings
+from eval.importers.signals import NEEDED, Recording, Signal, median_step, with_readings
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
 from eval.logs.faults.check import DRIVE, POSE, CheckContext, run_checks
 from eval.logs.faults.clock import CUT, PAUSE_S, check_time
 from eval.logs.faults.finding import Finding, finding_lines
 from eval.logs.faults.position import check_jumps
 from eval.logs.faults.reading import BY_ATTITUDE, MOTORS, read_rows
+from eval.logs.faults.sensors import check_copy
 from eval.logs.faults.vehicle import check_vehicle_name
 from eval.logs.flight_log import FlightLog, log_from_columns
 
@@ -126,13 +127,15 @@ def assemble(
     # Checks of the frames of position, attitude and gyro.
     checked = without_far(new)
     coarse = rows_at(checked, row_times(checked))
-    more_findings, readings, _ = run_checks(coarse, POSE, context, options.fix)
+    copied = _copied(checked.signals)
+    findings += copied
+    more_findings, readings, _ = run_checks(coarse, POSE, context, options.fix, copied)
     findings += more_findings
     if options.fix:
         recording = with_readings(recording, readings)
         recording, more_findings = clean(recording)
         findings += more_findings
-    if {"quat", "rate"} <= recording.signals.keys() and options.pose is None:
+    if {"quat", "rate"} <= recording.signals.keys() and options.pose is None and not copied:
         recording, more_findings = check_delay(recording, options.fix)
         findings += more_findings
     # Cut the time on the ground, and resample to common rows.
@@ -192,6 +195,14 @@ def assemble(
     about["findings"] = [finding._asdict() for finding in findings]
     log = log_from_columns(columns, about, recording.name)
     return log, tuple(findings)
+
+
+def _copied(signals: Mapping[str, Signal]) -> list[Finding]:
+    """Return the doubt of `check_copy` on samples with the same times, before rows average them."""
+    pair = {name: signals[name] for name in ("rate", "cmd_rate") if name in signals}
+    first_times = [samples.time_s for samples in pair.values()][:1]
+    same = all(np.array_equal(samples.time_s, *first_times) for samples in pair.values())
+    return check_copy({name: samples.value for name, samples in pair.items()}) if same else []
 
 
 def _unused_options(signals: Collection[str], format: str, options: ImportOptions) -> list[Finding]:

@@ -28,6 +28,7 @@ from eval.logs.faults.reading import Readings, read_rows, readings_in
 from eval.logs.faults.sensors import (
     check_accelerometer_bias,
     check_barometer,
+    check_copy,
     check_still,
     check_voltage,
 )
@@ -69,6 +70,7 @@ Check = Callable[[Rows, CheckContext], list[Finding]]
 CLOCK: tuple[Check, ...] = (lambda rows, _: check_time(rows),)
 """The unit of the time, which all other checks need."""
 POSE: tuple[Check, ...] = (
+    lambda rows, _: check_copy(rows),
     lambda rows, _: check_still(rows),
     lambda rows, _: check_pose(rows),
     lambda rows, against: [] if "attitude" in against.found else check_height_sign(rows),

@@ -98,3 +98,16 @@ def test_a_counter_that_starts_again_is_one_clock(bits, per_s, unit):
     assert f"its {bits}-bit counter starts again {1 if bits == 32 else 3} times" in finding.evidence
     two_flights = np.concatenate([count, count - 40.0 * per_s]) * unit
     assert not unwrapped(two_flights)[1] and not unwrapped(count[::-1] * unit)[1]
+
+
+@pytest.mark.parametrize("hz", [100.0, 400.0])
+def test_a_gyro_that_is_the_rate_command_is_named_and_moves_no_clock(tmp_path, hz):
+    parts = flight(hz, 6.0, 1.0)
+    log, findings = import_log(write(tmp_path / "good.csv", parts))
+    assert not [f for f in [*findings, *check_log(log)[0]] if f.is_open]
+    parts["rate"] = parts["cmd_rate"]
+    log, findings = import_log(write(tmp_path / "log.csv", parts))
+    (doubt,) = (f for f in findings if f.status == "doubt")
+    assert doubt.is_open and "equals the rate command in 100 %" in doubt.evidence
+    assert not {"clock_offset"} & {f.fault for f in findings}
+    assert doubt.evidence in {f.evidence for f in check_log(log)[0]}
