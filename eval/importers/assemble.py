@@ -93,16 +93,16 @@ def assemble(
         readings = tuple(r for r in readings if r[0] not in OF_POSE)
         later = tuple(r for r in readings if any(step in r[1] for step in BY_ATTITUDE))
     recording = with_readings(recording, tuple(r for r in readings if r not in later))
-    context = CheckContext(options.vehicle)
+    context, of_time = CheckContext(options.vehicle), []
     if not recording.has_seconds and any(name in recording.signals for name in NEEDED):
         fastest = min(median_step(samples.time_s) for samples in recording.signals.values())
-        more_findings, readings, _ = run_checks(
+        of_time, readings, _ = run_checks(
             {"time": recording.signals[slowest(recording)].time_s},
             (lambda rows, _: check_time(rows, fastest),),
             context,
             options.fix,
         )
-        findings += more_findings
+        findings += of_time
         recording = with_readings(recording, readings)  # rows need the time in seconds
     origin_s = min((samples.time_s[0] for samples in recording.signals.values()), default=0.0)
     if options.pose is not None:
@@ -159,8 +159,9 @@ def assemble(
     findings += order_motors(rows, recording.motor_side, options.vehicle)
     rows = read_rows(rows, orders)
     findings += rates_wanted(rows, options.vehicle)
-    # Corrected faults are no longer in the rows, so only doubts count.
+    # Corrected faults and a wrong unit of time are no longer in the rows; other doubts are.
     doubts = [finding for finding in findings if finding.status == "doubt"]
+    doubts = [finding for finding in doubts if finding not in of_time]
     more_findings, _, corrected_rows = run_checks(rows, DRIVE, context, options.fix, doubts)
     findings += more_findings
     rows = corrected_rows if options.fix else rows
@@ -199,10 +200,10 @@ def assemble(
 
 def _copied(signals: Mapping[str, Signal]) -> list[Finding]:
     """Return the doubt of `check_copy` on samples with the same times, before rows average them."""
-    pair = {name: signals[name] for name in ("rate", "cmd_rate") if name in signals}
-    first_times = [samples.time_s for samples in pair.values()][:1]
-    same = all(np.array_equal(samples.time_s, *first_times) for samples in pair.values())
-    return check_copy({name: samples.value for name, samples in pair.items()}) if same else []
+    rate, command = (signals.get(name) for name in ("rate", "cmd_rate"))
+    if rate is None or command is None or not np.array_equal(rate.time_s, command.time_s):
+        return []
+    return check_copy({"rate": rate.value, "cmd_rate": command.value})
 
 
 def _unused_options(signals: Collection[str], format: str, options: ImportOptions) -> list[Finding]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from eval.logs.columns import LARGEST, FlightLogError
 from eval.logs.faults.finding import Finding
-from eval.logs.faults.reading import QUATS, TIMES, Readings, option, read_as
+from eval.logs.faults.reading import QUATS, Readings, option, read_as, seconds
 
 NEEDED = ("pos", "quat", "rate")
 """Signals that a flight log must have; a partial log lacks some of them."""
@@ -179,7 +179,7 @@ def with_readings(recording: Recording, readings: Readings) -> Recording:
     signals = dict(recording.signals)
     for name, steps in readings:
         if name == "time":
-            scale = TIMES[steps]
+            scale = seconds(steps)
             signals = {n: Signal(s.time_s * scale, s.value) for n, s in signals.items()}
         elif steps == "drop":
             signals.pop(name, None)

@@ -23,7 +23,7 @@ from eval.logs.faults.drive.motor_map import check_motor_map
 from eval.logs.faults.drive.motors import check_lift, check_motors
 from eval.logs.faults.finding import Finding, findings_of
 from eval.logs.faults.pose import Rows, check_pose
-from eval.logs.faults.position import check_height_sign, check_jumps, jumps_of
+from eval.logs.faults.position import check_clock_rate, check_height, check_jumps, jumps_of
 from eval.logs.faults.reading import Readings, read_rows, readings_in
 from eval.logs.faults.sensors import (
     check_accelerometer_bias,
@@ -73,7 +73,8 @@ POSE: tuple[Check, ...] = (
     lambda rows, _: check_copy(rows),
     lambda rows, _: check_still(rows),
     lambda rows, _: check_pose(rows),
-    lambda rows, against: [] if "attitude" in against.found else check_height_sign(rows),
+    lambda rows, against: [] if "attitude" in against.found else check_clock_rate(rows),
+    lambda rows, against: [] if "attitude" in against.found else check_height(rows),
     lambda rows, _: check_gyro(rows),
     lambda rows, _: check_velocity(rows),
     lambda rows, against: check_accelerometer(rows, "body_frame" in against.found),
@@ -96,6 +97,7 @@ DRIVE: tuple[Check, ...] = (
 
 
 SIGNALS = {
+    "time": "time",
     "attitude": "quat",
     "position": "pos",
     "velocity": "vel",
@@ -168,6 +170,8 @@ def _without_doubted(rows: dict[str, np.ndarray], finding: Finding) -> dict[str,
         return rows
     if readings := readings_in(finding.fix):
         return read_rows(rows, readings)
+    if signal == "time":
+        return rows
     return {name: value for name, value in rows.items() if name != signal}
 
 
