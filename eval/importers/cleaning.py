@@ -15,6 +15,7 @@ from eval.importers.frames import rates_between
 from eval.importers.rows import continuous
 from eval.importers.signals import MAD_TO_SD, Recording, Signal, median_step
 from eval.logs.faults.clock import LATE_S, LEAST_S, SURE, delay_of
+from eval.logs.faults.drive.commands import has_both_signs
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.position import MEDIAN_SAMPLES, jumps_of
 from eval.logs.faults.sensors import is_coarse, lost_samples
@@ -256,6 +257,8 @@ def _motor_effort(recording: Recording) -> Signal | None:
         if samples is None or len(samples.time_s) < 10:
             continue
         thrust_level = np.mean(samples.value**power, axis=1)  # speeds may have the spin's sign
+        if has_both_signs(thrust_level):
+            continue
         high_level = float(np.quantile(thrust_level, 0.95))
         if high_level <= 0.0:
             continue

@@ -80,7 +80,9 @@ def read_as(
     `quat` returns the attitude (N, 4) wxyz at the same times, for the steps of `BY_ATTITUDE`.
     """
     for step in _split(steps):
-        if step in BY_ATTITUDE:
+        if step == "plus-gravity" and signal == "cmd_thrust":
+            value = value + GRAVITY
+        elif step in BY_ATTITUDE:
             assert quat is not None
             value = _turned(value, step, quat())
         elif step == "1000-2000":
@@ -140,7 +142,7 @@ def _allowed(signal: str, step: str) -> bool:
     if step in ("from-body", "from-world"):
         return signal in ("vel", "rate", "acc")
     if step in ("plus-gravity", "1000-2000"):
-        return signal in (("acc",) if step == "plus-gravity" else ("throttle", "pwm"))
+        return signal in (("acc", "cmd_thrust") if step == "plus-gravity" else ("throttle", "pwm"))
     try:
         least = 0.0 if signal == "time" else -np.inf
         return least < float(step) < np.inf and float(step) != 0.0

@@ -8,6 +8,7 @@ from eval.importers.formats.table import unwrapped
 from eval.importers.options import ImportOptions
 from eval.importers.signals import collect
 from eval.logs.faults.check import check_log
+from eval.logs.faults.drive.commands import has_both_signs
 from eval.logs.faults.position import jumps_of
 from eval.logs.flight_log import read_flight
 from tests.support import known_flight
@@ -111,3 +112,15 @@ def test_a_gyro_that_is_the_rate_command_is_named_and_moves_no_clock(tmp_path, h
     assert doubt.is_open and "equals the rate command in 100 %" in doubt.evidence
     assert not {"clock_offset"} & {f.fault for f in findings}
     assert doubt.evidence in {f.evidence for f in check_log(log)[0]}
+
+
+def test_a_thrust_without_gravity_cuts_no_flight_and_gets_its_gravity(tmp_path):
+    parts = flight(100.0, 8.0, 1.0)
+    thrust = parts["cmd_thrust"].copy()
+    parts["cmd_thrust"] -= 9.81
+    assert has_both_signs(parts["cmd_thrust"][:, 0]) and not has_both_signs(thrust[:, 0])
+    log, findings = import_log(write(tmp_path / "flight.csv", parts))
+    (found,) = (f for f in findings if f.status in ("doubt", "corrected"))
+    assert found.fix == "--read cmd_thrust=plus-gravity" and len(log.time_s) == 800
+    assert "no signal shows when the motors run" in text(findings, "ground")
+    np.testing.assert_allclose(log.thrust_cmd, thrust[:, 0], atol=1e-9)
