@@ -63,9 +63,9 @@ def test_a_lone_outlier_hides_nothing_from_the_checks(tmp_path, fix):
     assert not fix or (len(log.time_s) == 797 and "3 samples jump" in text(findings, "position"))
 
 
-def test_an_outlier_of_a_log_is_its_only_fault(tmp_path):
+def test_outliers_of_a_log_are_its_only_fault(tmp_path):
     parts = flight(100.0, 8.0, 1.0)
-    parts["pos"][300] += [0.0, 100.0, 0.0]
+    parts["pos"][[150, 300, 450, 600]] += [0.0, 100.0, 0.0]
     log = read_flight(write(tmp_path / "flight.csv", parts))
     assert {f.fault for f in check_log(log)[0] if f.status == "doubt"} == {"position_jump"}
 
