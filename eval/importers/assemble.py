@@ -7,22 +7,31 @@ resample to common rows, convert the commands, and check these. Each check retur
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from eval.importers.cleaning import OF_POSE, airborne, check_delay, clean, without_lost
+from eval.importers.cleaning import (
+    OF_POSE,
+    airborne,
+    check_delay,
+    clean,
+    without_far,
+    without_lost,
+    without_repeats,
+)
 from eval.importers.commands import order_motors, rates_wanted, thrust_command
 from eval.importers.mapping import KEPT
 from eval.importers.options import ImportOptions
 from eval.importers.rows import GAP_S, GAP_STEPS, row_times, rows_at, sampled_rows, slowest
-from eval.importers.signals import NEEDED, Recording, median_step, with_readings
+from eval.importers.signals import NEEDED, Recording, Signal, median_step, with_readings
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
 from eval.logs.faults.check import DRIVE, POSE, CheckContext, run_checks
 from eval.logs.faults.clock import CUT, PAUSE_S, check_time
 from eval.logs.faults.finding import Finding, finding_lines
 from eval.logs.faults.position import check_jumps
 from eval.logs.faults.reading import BY_ATTITUDE, MOTORS, read_rows
+from eval.logs.faults.sensors import check_copy
 from eval.logs.faults.vehicle import check_vehicle_name
 from eval.logs.flight_log import FlightLog, log_from_columns
 
@@ -84,16 +93,16 @@ def assemble(
         readings = tuple(r for r in readings if r[0] not in OF_POSE)
         later = tuple(r for r in readings if any(step in r[1] for step in BY_ATTITUDE))
     recording = with_readings(recording, tuple(r for r in readings if r not in later))
-    context = CheckContext(options.vehicle)
+    context, of_time = CheckContext(options.vehicle), []
     if not recording.has_seconds and any(name in recording.signals for name in NEEDED):
         fastest = min(median_step(samples.time_s) for samples in recording.signals.values())
-        more_findings, readings, _ = run_checks(
+        of_time, readings, _ = run_checks(
             {"time": recording.signals[slowest(recording)].time_s},
             (lambda rows, _: check_time(rows, fastest),),
             context,
             options.fix,
         )
-        findings += more_findings
+        findings += of_time
         recording = with_readings(recording, readings)  # rows need the time in seconds
     origin_s = min((samples.time_s[0] for samples in recording.signals.values()), default=0.0)
     if options.pose is not None:
@@ -111,15 +120,22 @@ def assemble(
     if options.fix:
         recording, more_findings = without_lost(recording)
         findings += more_findings
+    new, more_findings = without_repeats(recording)
+    if options.fix:
+        recording = new
+        findings += more_findings
     # Checks of the frames of position, attitude and gyro.
-    coarse = rows_at(recording, row_times(recording))
-    more_findings, readings, _ = run_checks(coarse, POSE, context, options.fix)
+    checked = without_far(new)
+    coarse = rows_at(checked, row_times(checked))
+    copied = _copied(checked.signals)
+    findings += copied
+    more_findings, readings, _ = run_checks(coarse, POSE, context, options.fix, copied)
     findings += more_findings
     if options.fix:
         recording = with_readings(recording, readings)
         recording, more_findings = clean(recording)
         findings += more_findings
-    if {"quat", "rate"} <= recording.signals.keys() and options.pose is None:
+    if {"quat", "rate"} <= recording.signals.keys() and options.pose is None and not copied:
         recording, more_findings = check_delay(recording, options.fix)
         findings += more_findings
     # Cut the time on the ground, and resample to common rows.
@@ -143,8 +159,9 @@ def assemble(
     findings += order_motors(rows, recording.motor_side, options.vehicle)
     rows = read_rows(rows, orders)
     findings += rates_wanted(rows, options.vehicle)
-    # Corrected faults are no longer in the rows, so only doubts count.
+    # Corrected faults and a wrong unit of time are no longer in the rows; other doubts are.
     doubts = [finding for finding in findings if finding.status == "doubt"]
+    doubts = [finding for finding in doubts if finding not in of_time]
     more_findings, _, corrected_rows = run_checks(rows, DRIVE, context, options.fix, doubts)
     findings += more_findings
     rows = corrected_rows if options.fix else rows
@@ -179,6 +196,14 @@ def assemble(
     about["findings"] = [finding._asdict() for finding in findings]
     log = log_from_columns(columns, about, recording.name)
     return log, tuple(findings)
+
+
+def _copied(signals: Mapping[str, Signal]) -> list[Finding]:
+    """Return the doubt of `check_copy` on samples with the same times, before rows average them."""
+    rate, command = (signals.get(name) for name in ("rate", "cmd_rate"))
+    if rate is None or command is None or not np.array_equal(rate.time_s, command.time_s):
+        return []
+    return check_copy({"rate": rate.value, "cmd_rate": command.value})
 
 
 def _unused_options(signals: Collection[str], format: str, options: ImportOptions) -> list[Finding]:

@@ -15,19 +15,18 @@ from eval.importers.frames import rates_between
 from eval.importers.rows import continuous
 from eval.importers.signals import MAD_TO_SD, Recording, Signal, median_step
 from eval.logs.faults.clock import LATE_S, LEAST_S, SURE, delay_of
+from eval.logs.faults.drive.commands import has_both_signs
 from eval.logs.faults.finding import Finding
-from eval.logs.faults.position import ACC_MAX
+from eval.logs.faults.position import MEDIAN_SAMPLES, jumps_of
 from eval.logs.faults.sensors import is_coarse, lost_samples
 from eval.logs.velocity import velocity_from_position
 
-POS_LEAST, VEL_LEAST = 0.02, 0.1
-"""Jumps of position [m] and velocity [m/s] up to these sizes are kept."""
+VEL_LEAST = 0.1
+"""Jumps of a velocity up to this size are kept [m/s]."""
 GLITCH_SD = 8.0
 """A velocity further from the path's slope than this many standard deviations is a glitch."""
 EDGE_S = 0.1
 """Time around a gap or an end of the positions in which velocities are not checked [s]."""
-MEDIAN_SAMPLES = 7
-"""Number of samples of the running median with which a position is compared."""
 REPEATED = 0.02
 """Share of repeated or interpolated samples above which they are removed."""
 TEXTS = {"pos": "position", "quat": "attitude"}
@@ -54,7 +53,6 @@ POWER = {
 def clean(recording: Recording) -> tuple[Recording, list[Finding]]:
     """Return the recording (time in s) without impossible samples, and the findings."""
     signals, findings = dict(recording.signals), []
-    findings += _drop_repeats(signals)
     if "quat" in signals and len(signals["quat"].time_s) > MEDIAN_SAMPLES:
         signals["quat"], more_findings = _without_interpolated(signals["quat"])
         findings += more_findings
@@ -80,8 +78,9 @@ def _keep(
             signals[name] = _select(signals[name], good)
 
 
-def _drop_repeats(signals: dict[str, Signal]) -> list[Finding]:
-    """Remove repeated poses in place, with the signals logged at the same times."""
+def without_repeats(recording: Recording) -> tuple[Recording, list[Finding]]:
+    """Return the recording without repeated poses, and the signals logged at the same times."""
+    signals = dict(recording.signals)
     for name in ("quat", "pos"):
         samples = signals.get(name)
         if samples is None or len(samples.time_s) <= MEDIAN_SAMPLES:
@@ -93,8 +92,18 @@ def _drop_repeats(signals: dict[str, Signal]) -> list[Finding]:
             continue
         _keep(signals, OF_POSE, samples, is_new)
         text = f"{100 * share:.0f} % of the poses repeat the one before: left out"
-        return [Finding("corrected", TEXTS[name], text)]
-    return []
+        finding = Finding("corrected", TEXTS[name], text)
+        return replace(recording, signals=signals), [finding]
+    return recording, []
+
+
+def without_far(recording: Recording) -> Recording:
+    """Return the recording, in any unit, without positions that jump far: they hide its faults."""
+    signals = dict(recording.signals)
+    if "pos" in signals:
+        pos = signals["pos"]
+        signals["pos"] = _select(pos, jumps_of(*pos, in_metres=False) == 0.0)
+    return replace(recording, signals=signals)
 
 
 def without_lost(recording: Recording) -> tuple[Recording, list[Finding]]:
@@ -141,18 +150,12 @@ def _without_interpolated(quat: Signal) -> tuple[Signal, list[Finding]]:
 
 
 def _without_jumps(pos: Signal) -> tuple[Signal, list[Finding]]:
-    """Remove positions further from the running median than the largest acceleration allows."""
-    from scipy.ndimage import median_filter
-
-    half = MEDIAN_SAMPLES // 2
-    reach_s = half * median_step(pos.time_s)
-    usual = median_filter(pos.value, (MEDIAN_SAMPLES, 1), mode="nearest")
-    jump_m = np.abs(pos.value - usual).max(axis=1)
-    bad = jump_m > POS_LEAST + 0.5 * ACC_MAX * reach_s**2
-    bad[:half] = bad[len(bad) - half :] = False  # the padded median is no reference at the ends
+    """Remove positions further from their neighbours than the largest acceleration allows."""
+    jump_m = jumps_of(*pos, in_metres=True)
+    bad = jump_m > 0.0
     if not bad.any():
         return pos, []
-    worst = float(jump_m[bad].max())
+    worst = float(jump_m.max())
     text = f"{int(bad.sum())} samples jump by up to {worst:.2g} m and back: left out"
     return _select(pos, ~bad), [Finding("corrected", "position", text)]
 
@@ -254,6 +257,8 @@ def _motor_effort(recording: Recording) -> Signal | None:
         if samples is None or len(samples.time_s) < 10:
             continue
         thrust_level = np.mean(samples.value**power, axis=1)  # speeds may have the spin's sign
+        if has_both_signs(thrust_level):
+            continue
         high_level = float(np.quantile(thrust_level, 0.95))
         if high_level <= 0.0:
             continue

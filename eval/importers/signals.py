@@ -16,7 +16,7 @@ import numpy as np
 
 from eval.logs.columns import LARGEST, FlightLogError
 from eval.logs.faults.finding import Finding
-from eval.logs.faults.reading import QUATS, TIMES, Readings, option, read_as
+from eval.logs.faults.reading import QUATS, Readings, option, read_as, seconds
 
 NEEDED = ("pos", "quat", "rate")
 """Signals that a flight log must have; a partial log lacks some of them."""
@@ -26,6 +26,8 @@ MAD_TO_SD = 1.4826
 """Factor from a median absolute deviation to the standard deviation of normal noise."""
 LEAST_NORM = 1e-3
 """Quaternions with a smaller norm are no attitudes: motion capture writes zeros without a body."""
+FAR_STEPS = 5.0
+"""A placeholder is further from the positions next to it than so many of their usual steps."""
 LEAST_STEP = 1e-15
 """Least step of increasing times, so that a division by it does not overflow."""
 
@@ -119,6 +121,9 @@ def collect(
             if is_lost.any():
                 text = f"{np.sum(is_lost)} samples of {name!r} are zeros, no attitude: left out"
                 findings.append(Finding("note", "attitude", text))
+        if name == "pos":
+            value, notes = _without_placeholders(value)
+            findings += notes
         try:
             samples, finding = make_signal(time_s, value, file, name)
         except FlightLogError as error:
@@ -134,6 +139,35 @@ def collect(
     return signals, tuple(findings)
 
 
+def _without_placeholders(pos: np.ndarray) -> tuple[np.ndarray, list[Finding]]:
+    """Return positions (N, 3) in any unit, NaN where a number stands for "unknown", and the notes.
+
+    Such a position is zero or recurs exactly, and the steps to it and from it are far.
+    """
+    findings = []
+    while True:
+        known = np.flatnonzero((np.abs(pos) <= LARGEST).all(axis=1))
+        value = np.ascontiguousarray(pos[known] + 0.0)  # no -0.0, which has other bytes
+        _, first, index, count = np.unique(
+            value.view([("", value.dtype)] * 3)[:, 0], True, True, True
+        )
+        usual = value[first[np.argmax(count)]] if len(known) else np.zeros(3)
+        is_it = index == np.argmax(count) if len(known) else np.zeros(0, dtype=bool)
+        rest = np.linalg.norm(np.diff(value[~is_it], axis=0), axis=1)
+        enters, leaves = (np.flatnonzero(np.diff(is_it.astype(int)) == k) for k in (1, -1))
+        size = np.linalg.norm(np.diff(value, axis=0), axis=1)
+        steps = [float(np.median(size[k])) for k in (enters, leaves) if len(k)]
+        recurs = max(len(enters), len(leaves)) > 1 or not usual.any()
+        if not (steps and recurs and rest.any()):
+            return pos, findings
+        if min(steps) < FAR_STEPS * float(np.median(rest[rest > 0.0])):
+            return pos, findings
+        pos = pos.copy()
+        pos[known[is_it]] = np.nan
+        text = f"{is_it.sum()} samples are {', '.join(f'{v:g}' for v in usual)}, no position"
+        findings.append(Finding("note", "position", f"{text}: left out"))
+
+
 def with_readings(recording: Recording, readings: Readings) -> Recording:
     """Return the recording with its signals converted, such as by a changed sign or order.
 
@@ -145,7 +179,7 @@ def with_readings(recording: Recording, readings: Readings) -> Recording:
     signals = dict(recording.signals)
     for name, steps in readings:
         if name == "time":
-            scale = TIMES[steps]
+            scale = seconds(steps)
             signals = {n: Signal(s.time_s * scale, s.value) for n, s in signals.items()}
         elif steps == "drop":
             signals.pop(name, None)

@@ -27,6 +27,10 @@ from tracks.common.names import closest
 SUMMARY = "CSV or Parquet, described by a mapping file (--map)"
 ASKED_LAST = True
 """Other formats are tried before this one, which accepts any table."""
+WRAPS = tuple((bits, 2.0**bits * unit) for bits in (32, 16) for unit in (1.0, 1e-3, 1e-6))
+"""Bits of a counter, and the number at which it starts again, in its own or a larger unit."""
+WRAP_STEPS, COUNTER_STEPS = 5.0, 100.0
+"""A counter goes on within the first number of usual steps, and counts more than the second."""
 _LIST_ENTRY = re.compile(r"^(.*)\[(\d)\]$")
 """Name of one number of a list column, such as `pos[0]`."""
 
@@ -54,7 +58,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
         warnings += more_warnings
     flag = "--pose-map" if path == options.pose else "--map"
     hint = "name it in the mapping's [time]" if file_map else f"describe the columns with {flag}"
-    time_s = _time(columns, mapping, name, hint)
+    time_s, clock_findings = _time(columns, mapping, name, hint)
 
     def find(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray] | None:
         values = [_values(columns, column, name) for column in names]
@@ -66,11 +70,14 @@ def read(path: Path, options: ImportOptions) -> Recording:
     recording = recording_of(path, mapping, find, lambda c: _missing(columns, c), options)
     notes = tuple(Finding("note", "file", text) for text in warnings)
     about |= recording.about
-    return replace(recording, findings=(*notes, *recording.findings), about=about)
+    findings = (*notes, *clock_findings, *recording.findings)
+    return replace(recording, findings=findings, about=about)
 
 
-def _time(columns: Mapping[str, np.ndarray], mapping: LogMap, name: str, hint: str) -> np.ndarray:
-    """Return the times (N,) of the rows [s]; `hint` says how to name the column."""
+def _time(
+    columns: Mapping[str, np.ndarray], mapping: LogMap, name: str, hint: str
+) -> tuple[np.ndarray, list[Finding]]:
+    """Return the times (N,) of the rows [s], and findings; `hint` says how to name the column."""
     if "time" not in mapping.columns:
         present = ", ".join(list(columns)[:12])
         reason = f"no column for the time; {hint}. There are: {present}"
@@ -81,7 +88,29 @@ def _time(columns: Mapping[str, np.ndarray], mapping: LogMap, name: str, hint: s
     if len(values) and values.dtype.kind in "iu" and abs(int(values[0])) > 2**52:
         # Unix times in nanoseconds exceed a float64's precision: subtract the first as integers.
         values = (values - values[0]).astype(np.int64)  # unsigned differences wrap below 0
-    return values.astype(np.float64) * column.factor[0]
+    values, findings = unwrapped(values.astype(np.float64))
+    return values * column.factor[0], findings
+
+
+def unwrapped(time: np.ndarray) -> tuple[np.ndarray, list[Finding]]:
+    """Return times (N,) in any unit as one clock where a full counter starts again, and a finding.
+
+    A step back counts as such where the time goes on as usual after it.
+    """
+    known = np.flatnonzero(np.isfinite(time))
+    step = np.diff(time[known])
+    usual = float(np.median(step[step > 0.0])) if (step > 0.0).any() else 0.0
+    for bits, period in WRAPS:
+        is_back = step < -0.5 * period
+        onward = step[is_back] + period
+        if not is_back.any() or period < COUNTER_STEPS * usual:
+            continue
+        if (onward > 0.0).all() and (onward < WRAP_STEPS * usual).all():
+            time = time.copy()
+            time[known[1:]] += period * np.cumsum(is_back)
+            text = f"its {bits}-bit counter starts again {is_back.sum()} times: taken as one clock"
+            return time, [Finding("corrected", "time", text)]
+    return time, []
 
 
 def numbers(columns: Mapping[str, np.ndarray], column: str, name: str) -> np.ndarray:

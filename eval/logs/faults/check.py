@@ -23,11 +23,12 @@ from eval.logs.faults.drive.motor_map import check_motor_map
 from eval.logs.faults.drive.motors import check_lift, check_motors
 from eval.logs.faults.finding import Finding, findings_of
 from eval.logs.faults.pose import Rows, check_pose
-from eval.logs.faults.position import check_height_sign, check_jumps
+from eval.logs.faults.position import check_clock_rate, check_height, check_jumps, jumps_of
 from eval.logs.faults.reading import Readings, read_rows, readings_in
 from eval.logs.faults.sensors import (
     check_accelerometer_bias,
     check_barometer,
+    check_copy,
     check_still,
     check_voltage,
 )
@@ -69,9 +70,11 @@ Check = Callable[[Rows, CheckContext], list[Finding]]
 CLOCK: tuple[Check, ...] = (lambda rows, _: check_time(rows),)
 """The unit of the time, which all other checks need."""
 POSE: tuple[Check, ...] = (
+    lambda rows, _: check_copy(rows),
     lambda rows, _: check_still(rows),
     lambda rows, _: check_pose(rows),
-    lambda rows, against: [] if "attitude" in against.found else check_height_sign(rows),
+    lambda rows, against: [] if "attitude" in against.found else check_clock_rate(rows),
+    lambda rows, against: [] if "attitude" in against.found else check_height(rows),
     lambda rows, _: check_gyro(rows),
     lambda rows, _: check_velocity(rows),
     lambda rows, against: check_accelerometer(rows, "body_frame" in against.found),
@@ -94,6 +97,7 @@ DRIVE: tuple[Check, ...] = (
 
 
 SIGNALS = {
+    "time": "time",
     "attitude": "quat",
     "position": "pos",
     "velocity": "vel",
@@ -166,6 +170,8 @@ def _without_doubted(rows: dict[str, np.ndarray], finding: Finding) -> dict[str,
         return rows
     if readings := readings_in(finding.fix):
         return read_rows(rows, readings)
+    if signal == "time":
+        return rows
     return {name: value for name, value in rows.items() if name != signal}
 
 
@@ -239,6 +245,9 @@ def rows_of(log: FlightLog) -> dict[str, np.ndarray]:
     """
     columns, rows = columns_from_log(log), {"time": log.time_s}
     for group, value in signals_of(columns).items():
+        if group == "pos":  # its jumps are one fault, which `check_jumps` names
+            is_far = jumps_of(log.time_s, value, in_metres=False) > 0.0
+            value = np.where(is_far[:, None], np.nan, value)
         if np.isfinite(value).all(axis=1).sum() > LEAST_ROWS:
             rows[group] = filled(log.time_s, value)
     for name in ("throttle", "baro"):

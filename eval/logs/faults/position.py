@@ -1,4 +1,4 @@
-"""Checks of a position: the sign of its z by the vertical force, and jumps.
+"""Checks of a position: its unit and clock and the sign of z by the vertical force, and jumps.
 
 Gravity dominates the force, so `pose.check_pose` hardly depends on this sign: with z inverted, the
 force still points along body z. But the vertical acceleration of the path then has the wrong sign.
@@ -17,9 +17,10 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import rotate
 from eval.logs.faults.finding import Finding, unseen
-from eval.logs.faults.pose import Rows
+from eval.logs.faults.pose import WIDTH_S as GYRO_S
+from eval.logs.faults.pose import Rows, turns_of
 from eval.logs.faults.reading import option
-from eval.logs.faults.relation import jackknife_error, smooth
+from eval.logs.faults.relation import jackknife_error, match, pooled_scale, smooth
 from eval.logs.velocity import velocity_from_position
 
 WIDTH_S = 0.4
@@ -32,6 +33,11 @@ NEARER = 0.5
 """Least size of the slope: above it, a slope of 1 or -1 fits the flight better than 0."""
 CHANCE = 1e-4
 """Largest probability of such a slope where both accelerations are unrelated."""
+CLOCK, SURE_SLOPE, NEAR_SLOPE = 1.1, 4.0, 0.3
+"""Least factor of a wrong clock on the gyro; the path's slope is then as many standard errors from
+1, and within this share of that distance from the value by this factor."""
+FOOT_M, FOOT_WITHIN = 0.3048, 0.15
+"""A foot [m], and the largest relative error of the most certain slope that shows this unit."""
 FLYING = 0.3
 """Rows with less than this share of the median force are not used: on the ground or in a fall."""
 ACC_MAX = 60.0
@@ -40,6 +46,13 @@ LEAST_M, SURE_SD = 0.1, 10.0
 """Least size of a jump: in metres, and in standard deviations of the usual steps."""
 STEPS = 5
 """Number of steps before and after, of which the median is the velocity."""
+MEDIAN_SAMPLES = 7
+"""Number of samples of the running median with which a position is compared."""
+KEPT_M = 0.02
+"""Distances from the neighbours up to this size are no jump [m]."""
+FAR = 50.0
+"""In an unknown unit, a jump exceeds this many times the smaller of two sizes: the median step, and
+the distance from the running median that nine of ten positions keep."""
 FAULT_M = 0.5
 """A jump below this size is a note [m]: the estimators of real vehicles correct themselves so."""
 
@@ -64,14 +77,36 @@ class Slope(NamedTuple):
         return sign * self.value > max(NEARER, least)
 
 
-def check_height_sign(rows: Rows) -> list[Finding]:
-    """Return the finding on the sign of the position's z."""
+def check_clock_rate(rows: Rows) -> list[Finding]:
+    """Return the finding on a clock by which rates and accelerations have one wrong factor.
+
+    If times are too long by a factor, the attitude's turns are too small by it, and the path's
+    accelerations by its square.
+    """
+    if "quat" not in rows or "rate" not in rows or not (slopes := _slopes(rows)):
+        return []
+    turns = smooth(rows["time"], turns_of(rows["time"], rows["quat"]), GYRO_S)
+    found = match(turns, smooth(rows["time"], rows["rate"], GYRO_S))
+    scale = pooled_scale(found)[0]
+    if not np.isfinite(scale) or found.is_turned or 1.0 / CLOCK < scale < CLOCK:
+        return []
+    one = min(slopes, key=lambda slope: slope.error)
+    far = abs(one.value - 1.0)
+    if far < SURE_SLOPE * one.error or abs(one.value - scale**-2) > NEAR_SLOPE * far:
+        return []
+    text = f"the gyro is {scale:.3g} times the attitude's turns, and the path's vertical "
+    text += f"acceleration is {one.value:.2f} times that of the {one.source}: its steps are "
+    text += f"{scale:.3g} times the true ones"
+    fix = "the unit or rate of the time column in the mapping, or "
+    fix += option(("time", f"{1.0 / scale:.4g}"))
+    return [Finding("doubt", "time", text, "time_unit", scale, 0.95, fix)]
+
+
+def check_height(rows: Rows) -> list[Finding]:
+    """Return the finding on the sign of the position's z, and on its unit."""
     if not {"pos", "quat"} <= rows.keys():
         return []
-    vel = velocity_from_position(rows["time"], rows["pos"])
-    acc = velocity_from_position(rows["time"], vel)[:, 2]
-    found = [_slope(name, rows["time"], acc, force) for name, force in _forces(rows)]
-    slopes = [slope for slope in found if slope is not None]
+    slopes = _slopes(rows)
     if not slopes:
         text = "no accelerometer, thrust command or rotor speed shows the sign of z"
         return unseen("position", text, "position_axes")
@@ -81,11 +116,26 @@ def check_height_sign(rows: Rows) -> list[Finding]:
     right, inverted = (any(slope.shows(sign) for slope in slopes) for sign in (1.0, -1.0))
     if right == inverted:
         return unseen("position", f"{text}: too uncertain for the sign of z", "position_axes")
+    feet = [FOOT_M * slope.value for slope in sorted(slopes, key=lambda slope: slope.error)]
+    if right and min(feet) > 0.5 and abs(feet[0] - 1.0) < FOOT_WITHIN:
+        fix = option(("pos", f"{FOOT_M:g}"))
+        about = ("position_unit", 1.0 / FOOT_M, 0.97, fix)
+        return [Finding("corrected", "position", f"{text}: it is in feet", *about)]
     if right:
         return [Finding("ok", "position", text)]
     text = f"{text}: z has the other sign"
     fix = option(("pos", "x,y,-z"))
     return [Finding("corrected", "position", text, "position_axes", None, 0.98, fix)]
+
+
+def _slopes(rows: Rows) -> list[Slope]:
+    """Return the slopes for all sources of the force; none without a pose."""
+    if not {"pos", "quat"} <= rows.keys():
+        return []
+    vel = velocity_from_position(rows["time"], rows["pos"])
+    acc = velocity_from_position(rows["time"], vel)[:, 2]
+    found = [_slope(name, rows["time"], acc, force) for name, force in _forces(rows)]
+    return [slope for slope in found if slope is not None]
 
 
 def _forces(rows: Rows) -> Iterator[tuple[str, np.ndarray]]:
@@ -126,6 +176,42 @@ def _slope(source: str, time_s: np.ndarray, acc: np.ndarray, force: np.ndarray) 
     without_block = unit * (product.sum() - product) / (square.sum() - square)
     value = unit * float(product.sum() / square.sum())
     return Slope(source, value, jackknife_error(without_block), count)
+
+
+def jumps_of(time_s: np.ndarray, pos: np.ndarray, in_metres: bool) -> np.ndarray:
+    """Return how far positions (N, 3) that jump and come back are from their neighbours (N,).
+
+    Others are 0. Without `in_metres` the unit is unknown, and only far jumps count.
+    """
+    from scipy.ndimage import median_filter
+
+    jump, half = np.zeros(len(pos)), MEDIAN_SAMPLES // 2
+    known = np.flatnonzero(np.isfinite(pos).all(axis=1))
+    if len(known) <= MEDIAN_SAMPLES:
+        return jump
+    time_s, pos = time_s[known], pos[known]
+    usual = median_filter(pos, (MEDIAN_SAMPLES, 1), mode="nearest")
+    usual[:half], usual[-half:] = usual[half], usual[-half - 1]
+    distance = np.abs(pos - usual).max(axis=1)
+    reach_s = half * float(np.median(np.diff(time_s)))
+    least = KEPT_M + 0.5 * ACC_MAX * reach_s**2
+    if not in_metres:
+        step = np.linalg.norm(np.diff(pos, axis=0), axis=1)
+        step = step[step > 0.0] if step.any() else step
+        sizes = [float(np.quantile(distance, 0.9)), float(np.median(step))]
+        least = FAR * min((size for size in sizes if size > 0.0), default=np.inf)
+    limit = np.full(len(pos), least)
+    limit[:half] = limit[-half:] = FAR * least  # the median is not around the ends
+    # Outliers move the median, so that their neighbours seem to jump too: compare with the rest.
+    bad, good = np.flatnonzero(distance > limit), np.flatnonzero(distance <= limit)
+    after = np.searchsorted(good, bad)
+    before_s = time_s[bad] - time_s[good[np.maximum(after - 1, 0)]]
+    after_s = time_s[good[np.minimum(after, len(good) - 1)]] - time_s[bad]
+    line = np.stack([np.interp(time_s[bad], time_s[good], column[good]) for column in pos.T], 1)
+    distance = np.abs(pos[bad] - line).max(axis=1)
+    curve_m = KEPT_M + 0.5 * ACC_MAX * np.maximum(before_s * after_s, 0.0)
+    jump[known[bad]] = np.where(distance > (curve_m if in_metres else least), distance, 0.0)
+    return jump
 
 
 def check_jumps(time_s: np.ndarray, pos: np.ndarray) -> list[Finding]:

@@ -80,7 +80,9 @@ def read_as(
     `quat` returns the attitude (N, 4) wxyz at the same times, for the steps of `BY_ATTITUDE`.
     """
     for step in _split(steps):
-        if step in BY_ATTITUDE:
+        if step == "plus-gravity" and signal == "cmd_thrust":
+            value = value + GRAVITY
+        elif step in BY_ATTITUDE:
             assert quat is not None
             value = _turned(value, step, quat())
         elif step == "1000-2000":
@@ -101,12 +103,17 @@ def read_rows(rows: Mapping[str, np.ndarray], readings: Readings) -> dict[str, n
     found = dict(rows)
     for signal, steps in readings:
         if signal == "time":
-            found["time"] = found["time"] * TIMES[steps]
+            found["time"] = found["time"] * seconds(steps)
         elif steps == "drop":
             found.pop(signal, None)
         elif signal in found:
             found[signal] = read_as(signal, found[signal], steps, lambda: found["quat"])
     return found
+
+
+def seconds(steps: str) -> float:
+    """Return the factor of a reading of the time: that of a unit, or a number."""
+    return TIMES[steps] if steps in TIMES else float(steps)
 
 
 def axes_matrix(step: str) -> np.ndarray:
@@ -124,8 +131,8 @@ def _split(steps: str) -> list[str]:
 
 def _allowed(signal: str, step: str) -> bool:
     """Return whether `step` is a step of `signal`."""
-    if signal == "time" or step == "drop":
-        return step in TIMES or (step == "drop" and signal != "time")
+    if step == "drop" or step in TIMES:
+        return (step == "drop") != (signal == "time")
     if signal in QUATS:
         return step in _QUAT_STEPS
     if signal in MOTORS and _ORDER.match(step):
@@ -135,9 +142,10 @@ def _allowed(signal: str, step: str) -> bool:
     if step in ("from-body", "from-world"):
         return signal in ("vel", "rate", "acc")
     if step in ("plus-gravity", "1000-2000"):
-        return signal in (("acc",) if step == "plus-gravity" else ("throttle", "pwm"))
+        return signal in (("acc", "cmd_thrust") if step == "plus-gravity" else ("throttle", "pwm"))
     try:
-        return np.isfinite(float(step)) and float(step) != 0.0
+        least = 0.0 if signal == "time" else -np.inf
+        return least < float(step) < np.inf and float(step) != 0.0
     except ValueError:
         return False
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from eval.effects.interface import GRAVITY
@@ -30,6 +32,8 @@ LOST_S, LOST_HOLDS, LOST_RATE = 0.2, 5.0, 0.3
 turns faster [rad/s]."""
 LOST_SHARE = 0.1
 """Share of lost rows above which the signal is doubtful."""
+COPIED = 0.95
+"""Share of rows in which the gyro equals the rate command, above which it is no measurement."""
 COARSE = 4.0
 """A signal is coarse if its median change between samples is below this many steps of its
 resolution. Repeated samples of a coarse signal may be real."""
@@ -166,6 +170,24 @@ def check_still(rows: Rows) -> list[Finding]:
             fix += "" if is_lost[1:].all() else " or suite import, which leaves this part out"
             findings.append(Finding("doubt", subject, text, fault, share, 0.95, fix))
     return findings
+
+
+def check_copy(rows: Mapping[str, np.ndarray]) -> list[Finding]:
+    """Return the doubt on a gyro whose samples equal the rate command: one column was read twice.
+
+    Both signals have the same times; no body follows a command without a delay.
+    """
+    if not {"rate", "cmd_rate"} <= rows.keys() or rows["rate"].shape != rows["cmd_rate"].shape:
+        return []
+    rate, command = rows["rate"], rows["cmd_rate"]
+    known = np.isfinite(rate).all(axis=1) & np.isfinite(command).all(axis=1)
+    turns = known & (np.abs(command) > 0.0).all(axis=1)
+    share = float(np.mean(np.isclose(rate, command)[turns].all(axis=1))) if turns.any() else 0.0
+    if share < COPIED or not np.ptp(command[turns], axis=0).all():
+        return []
+    text = f"it equals the rate command in {100 * share:.0f} % of the rows, without a delay"
+    fix = "map the gyro's columns: the measured rates, not the set points"
+    return [Finding("doubt", "gyro", text, "gyro_axes", None, 0.97, fix)]
 
 
 def _dead_axes(rows: Rows) -> list[Finding]:

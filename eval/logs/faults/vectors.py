@@ -185,7 +185,7 @@ def _unit(
         return [Finding(status, subject, f"{figures}: {words}", fault, scale, sure, fix)]
     sure = 0.97 if high / low < 1.15 else 0.9 if high / low < 1.5 else 0.6
     fix = option((signal, f"{1.0 / scale:.4g}"))
-    text = f"{figures}, which is no unit's doing; check its range and scale"
+    text = f"{figures}, which is no unit's doing; check its range and scale, and the clock"
     return [Finding("doubt", subject, text, fault, scale, sure, fix)]
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from eval.importers import import_log
-from eval.importers.cleaning import airborne, clean
+from eval.importers.cleaning import airborne, clean, without_repeats
 from eval.importers.options import ImportOptions
 from eval.importers.pose import _in_seconds, align, with_pose
 from eval.importers.rows import averaged, row_times, smoothed
@@ -175,14 +175,16 @@ def test_a_lone_position_does_not_end_the_check_of_velocities(signals):
 def test_repeated_poses_are_left_out_with_what_is_logged_with_them(signals):
     for samples in signals.values():
         samples.value[1::3] = samples.value[0::3]
-    cleaned, findings = clean(Recording("log", signals))
+    cleaned, findings = without_repeats(Recording("log", signals))
     assert {len(cleaned.signals[name].time_s) for name in signals} == {400}
     assert "33 % of the poses repeat" in findings[0].evidence
 
 
 def test_whole_millimetres_are_not_repeats(signals):
     coarse = np.round(0.02 * signals["pos"].value, 3)
-    cleaned, findings = clean(Recording("log", {"pos": Signal(signals["pos"].time_s, coarse)}))
+    cleaned, findings = without_repeats(
+        Recording("log", {"pos": Signal(signals["pos"].time_s, coarse)})
+    )
     assert len(cleaned.signals["pos"].time_s) == 600
     assert not [finding for finding in findings if "repeat" in finding.evidence]
 

@@ -61,6 +61,9 @@ be a physical effect or a wrong mass, and within the third it is m/s^2, whatever
 OFFSET, OFFSET_RMS = 3.0, 3.0
 """Least constant difference of command and gyro that no unit explains: in rad/s, and relative to
 the body rates (root mean square)."""
+BOTH_SIGNS, ZERO = 0.05, 0.02
+"""Share of negative and of positive values that no thrust has, since rotors only push; and the
+share of the largest value below which a value has no sign."""
 LEAST_TOP = 0.02
 """Throttle or mean motor command that every flight exceeds at least once, from 0 to 1."""
 RATE_OFF = 0.1
@@ -120,6 +123,13 @@ def check_throttle(rows: Rows) -> list[Finding]:
     return findings
 
 
+def has_both_signs(thrust: np.ndarray) -> bool:
+    """Return whether a thrust (T,) pushes and pulls, as one without gravity does."""
+    known = thrust[np.isfinite(thrust)]
+    zero = ZERO * np.max(np.abs(known), initial=0.0)
+    return bool(min(np.sum(known < -zero), np.sum(known > zero)) > BOTH_SIGNS * len(known))
+
+
 def check_thrust_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding]:
     """Return a wrong unit or sign of the commanded thrust.
 
@@ -131,6 +141,12 @@ def check_thrust_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Fin
     thrust = value[:, 0]
     known = thrust[np.isfinite(thrust)]
     sign = -1.0 if len(known) and np.median(known) < 0.0 else 1.0
+    ratio = fit_force(rows, thrust + GRAVITY)[1] if has_both_signs(thrust) else 0.0
+    if 1.0 / THRUST_FITS < ratio < THRUST_FITS:
+        text = f"it pushes and pulls, and with gravity added it is {ratio:.3g} times the force "
+        text += "per mass that the path needs: gravity was taken out of it"
+        fix = option(("cmd_thrust", "plus-gravity"))
+        return [Finding("corrected", subject, text, "thrust_command_unit", None, 0.95, fix)]
     ratio = fit_force(rows, sign * thrust)[1]
     if ratio <= 0.0:
         return []

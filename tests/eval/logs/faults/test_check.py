@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eval.logs.faults.catalogue import FAULTS
-from eval.logs.faults.check import CheckContext, check_log
+from eval.logs.faults.check import DRIVE, POSE, CheckContext, check_log, run_checks
 from eval.logs.faults.checked import check_flights, lines_of
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.position import check_jumps
@@ -15,7 +15,42 @@ from eval.logs.flight_log import columns_from_log, log_from_columns, write_fligh
 from suite.commands.check import Config, run
 from suite.common.console import Console
 from tests.support.diagnosis_flights import fly
+from tests.support.imported import flight
 from tests.support.vehicles import PLAIN
+
+
+def faults(parts):
+    """The doubts and corrections of these rows."""
+    findings, _, _ = run_checks(parts, (*POSE, *DRIVE), CheckContext(), True)
+    return [f for f in findings if f.status in ("doubt", "corrected")]
+
+
+@pytest.mark.parametrize("text", ["time=0", "time=-1", "time=nan", "rate=ms", "time=drop"])
+def test_a_time_takes_a_unit_or_a_positive_factor(text):
+    with pytest.raises(ValueError, match="is no step of"):
+        parse_readings([text])
+    np.testing.assert_allclose(
+        read_rows({"time": np.arange(3.0)}, parse_readings(["time=0.8"]))["time"], [0.0, 0.8, 1.6]
+    )
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.8, 1.25, 2.0])
+def test_a_clock_of_another_rate_is_one_fault(factor):
+    parts = flight(100.0, 10.0, 0.3)
+    parts["time"] = factor * parts["time"]
+    (doubt,) = faults(parts)
+    assert doubt.fault == "time_unit" and doubt.is_open
+    assert float(doubt.fix.split("time=")[1]) == pytest.approx(1.0 / factor, rel=0.02)
+    parts["time"] = parts["time"] / factor
+    parts["rate"] = factor * parts["rate"]
+    assert "time_unit" not in {f.fault for f in faults(parts)}
+
+
+def test_feet_are_named_and_the_fix_restores_metres():
+    parts = flight(100.0, 10.0, 1.0)
+    parts["pos"] = parts["pos"] / 0.3048
+    (found,) = faults(parts)
+    assert found.fault == "position_unit" and found.fix == "--read pos=0.3048"
 
 
 @pytest.mark.parametrize("text", ["time=ms+us", "rate=drop+2", "quat=drop+xyzw"])

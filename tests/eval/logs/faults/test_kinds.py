@@ -23,7 +23,7 @@ from eval.logs.faults.clock import check_clock
 from eval.logs.faults.drive import commands
 from eval.logs.faults.drive.commands import check_controller_rate
 from eval.logs.faults.drive.rate_following import delayed
-from eval.logs.faults.position import check_height_sign
+from eval.logs.faults.position import check_height
 from eval.logs.faults.reading import parse_readings, read_rows
 from eval.logs.flight_log import read_flight
 from suite.diagnose.example.flights import FOLDER
@@ -273,7 +273,7 @@ def test_a_force_that_is_unrelated_to_the_path_does_not_show_the_sign_of_z():
     for _ in range(200):  # both change within half a second
         pos, force = gaussian_filter1d(rng.normal(size=(2, len(time_s), 3)), 12.0, axis=1)
         rows = {"time": time_s, "pos": pos, "quat": quat, "acc": force + [0.0, 0.0, 9.81]}
-        (finding,) = check_height_sign(rows)
+        (finding,) = check_height(rows)
         count += finding.status != "not identifiable"
     assert count <= 1
 
