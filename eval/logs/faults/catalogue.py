@@ -36,7 +36,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "barometer_spin_up": ("the barometer's height falls as the motors start", GROUND),
     "time_unit": ("times are in ms, us or ns", TILT),
     "time_stamps": ("stamps are 0 or go back", "log again"),
-    "clock_offset": ("the pose is late against the gyro", ROTATE),
+    "clock_offset": ("pose or gyro is late", ROTATE),
     "clock_drift": ("the pose's clock runs faster or slower than the gyro's", ROTATE),
     "motor_order": ("motors are in another order", PULSE),
     "motor_spin": ("motors turn the other way round", PULSE),
