@@ -26,6 +26,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "position_unit": ("positions are in cm or mm", TILT),
     "velocity_frame": ("the velocity is in other axes", TILT),
     "velocity_unit": ("the velocity is in another unit", TILT),
+    "velocity_delay": ("velocity or position is late against the other", TILT),
     "gyro_axes": ("axes of the gyro are inverted, swapped or dead", ROTATE),
     "gyro_frame": ("rates are in world axes", ROTATE),
     "gyro_scale": ("the gyro is in another unit, or its scale is wrong", ROTATE),

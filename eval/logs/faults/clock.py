@@ -187,6 +187,36 @@ def check_clock(rows: Rows) -> list[Finding]:
     return [Finding("doubt", *late.figures(moved), *about), *drift]
 
 
+def late_against(
+    time_s: np.ndarray, wanted: np.ndarray, given: np.ndarray
+) -> tuple[float, float] | None:
+    """Return by how much `given` (T, C) is later than `wanted` (T, C), and its error [s].
+
+    Neither the scale nor a constant of `given` counts. None: not identifiable, or over `REACH_S`.
+    """
+    known = np.isfinite(given).all(axis=1)
+    inside = np.isfinite(wanted).all(axis=1)
+    inside &= (time_s > time_s[0] + REACH_S) & (time_s < time_s[-1] - REACH_S)
+    if min(known.sum(), inside.sum()) < 100:
+        return None
+    time_s, known_s, given = time_s[inside], time_s[known], given[known]
+    wanted = wanted[inside] - wanted[inside].mean(axis=0)
+    block = np.minimum((np.arange(len(time_s)) * BLOCKS) // len(time_s), BLOCKS - 1)
+    trials = np.arange(-REACH_S, REACH_S + 0.5 * STEP_S, STEP_S)
+    cost = np.empty((BLOCKS, len(trials)))
+    for k, late_s in enumerate(trials):
+        tried = np.stack([np.interp(time_s + late_s, known_s, column) for column in given.T], 1)
+        tried = tried - tried.mean(axis=0)
+        scale = np.sum(wanted * tried) / max(float(np.sum(tried**2)), 1e-12)
+        residual = np.sum((wanted - scale * tried) ** 2, axis=1)
+        cost[:, k] = np.bincount(block, weights=residual, minlength=BLOCKS)
+    delay_s = _lowest(trials, cost.sum(axis=0))
+    without_block = [_lowest(trials, cost.sum(axis=0) - one) for one in cost]
+    if delay_s is None or any(one is None for one in without_block):
+        return None
+    return delay_s, jackknife_error(np.array(without_block, dtype=np.float64))
+
+
 def _fits_later(
     signals: Mapping[str, tuple[np.ndarray, np.ndarray]], name: str, late_s: float
 ) -> bool:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from eval.logs.faults.drive.commands import check_thrust_command
 from eval.logs.faults.drive.motor_map import check_motor_map
@@ -324,3 +325,16 @@ def test_a_curve_needs_a_delay_that_is_known(late, expected):
     throttle = np.roll(total / (PLAIN.full_thrust * PLAIN.mass), -late) ** 0.5
     rows = {"time": rows["time"], "acc": rows["acc"], "throttle": throttle[:, None]}
     assert [f.fault for f in found(rows, PLAIN)] == expected
+
+
+@pytest.mark.parametrize("late", ["vel", "pos"])
+def test_a_velocity_that_is_late_against_the_path_is_doubted(late):
+    """A low pass of the first order with a time constant of 60 ms."""
+    truth = known_flight.fly(np.arange(0.0, 10.0, 0.01))
+    rows = {"time": truth.time, "pos": truth.pos, "vel": truth.vel, "quat": truth.quat}
+    assert "velocity_delay" not in {finding.fault for finding in check_velocity(rows)}
+    rows[late] = lfilter([1 / 7], [1.0, -6 / 7], rows[late], axis=0)
+    (found,) = (one for one in check_velocity(rows) if one.fault == "velocity_delay")
+    assert found.signal == {"vel": "velocity", "pos": "position"}[late]
+    assert found.is_open == (late == "vel")
+    assert abs(found.size) == pytest.approx(0.06, abs=0.015)
