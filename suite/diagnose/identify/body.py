@@ -202,11 +202,11 @@ def torque_unknowns(drive: str, lag_s: float, late_s: float) -> list[Unknown]:
     of the other two, and keeps this ratio if it is not identifiable. `yaw` is the yaw torque over
     the inertia about z. It is missing if torques are commanded.
     """
-    unknowns = [Unknown(f"inertia_{a}", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015) for a in "xy"]
+    unknowns = [Unknown(f"inertia_{a}", 0.0, -5.0, 5.0, 0.5, 1e-2, 0.015) for a in "xy"]
     widest_z = 0.5 if drive == "torques" else 0.25
     unknowns.append(Unknown("inertia_z", 0.0, -1.0, 1.0, widest_z, 1e-2, 0.015))
     if drive != "torques":
-        unknowns.append(Unknown("yaw", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015))
+        unknowns.append(Unknown("yaw", 0.0, -5.0, 5.0, 0.5, 1e-2, 0.015))
     return unknowns if drive == "rotors" else [*unknowns, *lag_unknowns(lag_s, late_s)]
 
 

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from eval.logs.faults.drive.commands import check_thrust_command
 from eval.logs.faults.drive.motor_map import check_motor_map
-from eval.logs.faults.drive.motors import check_lift, check_motors
+from eval.logs.faults.drive.motors import check_inertia, check_lift, check_motors
 from eval.logs.faults.reading import parse_readings, read_rows
 from eval.logs.faults.relation import match
 from eval.logs.faults.sensors import check_voltage
@@ -82,7 +82,25 @@ def test_without_a_gyro_order_and_spin_are_not_identifiable():
 
 
 @pytest.mark.parametrize(
-    ("unit", "inertia", "divisor"), [(100, 1, "100"), (1000, 1, "1000"), (1000, 10, "100 or 1000")]
+    ("factor", "named"), [(1.0, False), (2.0, False), (10.0, True), (0.1, True)]
+)
+def test_an_inertia_that_the_turns_exclude_is_doubted(factor, named):
+    parts = known_flight.fly(np.arange(0.0, 10.0, 0.01))
+    rows = {name: getattr(parts, name) for name in ("time", "pos", "quat", "rate", "motor")}
+    wrong = replace(PLAIN, inertia=tuple(factor * moment for moment in PLAIN.inertia))
+    found, named = check_inertia(rows, wrong), factor in (10.0, 0.1)
+    assert [(one.fault, one.is_open) for one in found] == [("vehicle_inertia", True)] * named
+    assert not named or found[0].size == pytest.approx(factor, rel=0.15)
+    assert check_inertia({k: v for k, v in rows.items() if k != "quat"}, wrong) == []
+    # A radius of gyration beyond the rotors is implausible without flights.
+    assert {one.fault for one in check_vehicle_numbers(wrong)} == (
+        {"vehicle_inertia"} if factor == 10.0 else {""}
+    )
+
+
+@pytest.mark.parametrize(
+    ("unit", "inertia", "divisor"),
+    [(100, 1, "100"), (1000, 1, "1000"), (1000, 0.05, "100 or 1000")],
 )
 def test_arms_in_cm_or_mm_are_converted_by_the_divisor_that_fits_the_inertia(
     unit, inertia, divisor
@@ -90,7 +108,7 @@ def test_arms_in_cm_or_mm_are_converted_by_the_divisor_that_fits_the_inertia(
     hubs = tuple((unit * x, unit * y, unit * z) for x, y, z in PLAIN.rotors.position)
     moments = tuple(inertia * moment for moment in PLAIN.inertia)
     wrong = replace(PLAIN, inertia=moments, rotors=replace(PLAIN.rotors, position=hubs))
-    (finding,) = check_vehicle_numbers(wrong)
+    finding, *_ = check_vehicle_numbers(wrong)
     assert finding.fault == "vehicle_arms"
     assert finding.fix == f"rotors.position in m: divide by {divisor}"
 
