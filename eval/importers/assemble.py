@@ -12,7 +12,6 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from eval.importers.cleaning import (
-    OF_POSE,
     airborne,
     check_delay,
     clean,
@@ -27,7 +26,7 @@ from eval.importers.rows import GAP_S, GAP_STEPS, row_times, rows_at, sampled_ro
 from eval.importers.signals import NEEDED, Recording, Signal, median_step, with_readings
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
 from eval.logs.faults.check import DRIVE, POSE, CheckContext, run_checks
-from eval.logs.faults.clock import CUT, PAUSE_S, check_time
+from eval.logs.faults.clock import CUT, OF_POSE, PAUSE_S, check_time
 from eval.logs.faults.finding import Finding, finding_lines
 from eval.logs.faults.position import check_jumps
 from eval.logs.faults.reading import BY_ATTITUDE, MOTORS, read_rows

@@ -14,7 +14,7 @@ import numpy as np
 from eval.importers.frames import rates_between
 from eval.importers.rows import continuous
 from eval.importers.signals import MAD_TO_SD, Recording, Signal, median_step
-from eval.logs.faults.clock import LATE_S, LEAST_S, SURE, delay_of
+from eval.logs.faults.clock import LATE_S, LEAST_S, OF_POSE, SURE, delay_of
 from eval.logs.faults.drive.commands import has_both_signs
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.position import MEDIAN_SAMPLES, jumps_of
@@ -35,8 +35,6 @@ TURNING = 0.05
 """Least body rate at which an interpolated attitude can be detected [rad/s]."""
 EXACT = 1e-3
 """Largest relative change of the body rate at an attitude that counts as interpolated."""
-OF_POSE = ("pos", "quat", "vel")
-"""Signals of the device that measures the pose; they share its delay."""
 RUNNING = 0.5
 """The motors carry the vehicle if their effort exceeds this share of its median in flight."""
 HOLD_S = 0.3
@@ -184,7 +182,7 @@ def _without_glitches(vel: Signal, pos: Signal) -> tuple[Signal, list[Finding]]:
 
 
 def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Finding]]:
-    """Return the recording with the pose shifted to the gyro's clock, and the findings.
+    """Return the recording with pose and gyro shifted to one clock, and the findings.
 
     The recording has times in s, rates in rad/s and a flight log's frames; it must have quat and
     rate. Without `fix` the delay is only reported.
@@ -193,29 +191,36 @@ def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Findin
     fit = delay_of(quat.time_s, quat.value, rate.time_s, rate.value)
     if fit is None:
         return recording, []
-    delay, error = fit.delay_s, fit.error_s
-    figures = f"it is {1e3 * delay:+.1f} ms (± {1e3 * error:.1f} ms) late against the gyro"
-    is_late, findings = abs(delay) > max(LEAST_S, SURE * error), fit.rotation_findings()
-    option = "leave --no-fix out: the import shifts the pose"
+    delay, findings = fit.delay_s, fit.rotation_findings()
+    is_late = abs(delay) > max(LEAST_S, SURE * fit.error_s)
+    moved = fit.moved(recording.signals) if is_late else OF_POSE
+    subject, figures = fit.figures(moved)
+    option = "leave --no-fix out: the import shifts it"
     status = "corrected" if fix else "doubt"
     if fit.drifts:
         about = ("clock_drift", fit.drift, 0.95, option)
         findings.append(Finding(status, "pose clock", fit.drift_figures(), *about))
     if is_late:
         confidence = 0.95 if abs(delay) > LATE_S else 0.8
-        text = f"{figures}: pose and velocity are shifted" if fix else f"{figures}; not corrected"
+        what = {"rate": "it is", "acc": "it and the accelerometer are"}.get(
+            moved[-1], "pose and velocity are"
+        )
+        text = f"{figures}: {what} shifted" if fix else f"{figures}; not corrected"
         about = ("clock_offset", delay, confidence, option)
-        findings.append(Finding(status, "pose delay", text, *about))
+        findings.append(Finding(status, subject, text, *about))
     else:
-        findings.append(Finding("ok", "pose delay", figures))
+        findings.append(Finding("ok", subject, figures))
     if not fix or not (is_late or fit.drifts):
         return recording, findings
     drift = fit.drift if fit.drifts else 0.0
     signals = dict(recording.signals)
-    for name in OF_POSE:
-        if name in signals:
-            time_s, value = signals[name]
-            signals[name] = Signal(time_s - (delay + drift * (time_s - fit.middle_s)), value)
+    for name in {*OF_POSE, *moved} & signals.keys():
+        time_s, value = signals[name]
+        if name in OF_POSE:
+            time_s = time_s - drift * (time_s - fit.middle_s)
+        if name in moved:
+            time_s = time_s - (delay if name in OF_POSE else -delay)
+        signals[name] = Signal(time_s, value)
     return replace(recording, signals=signals), findings
 
 

@@ -36,6 +36,9 @@ LIFT = 3.0
 outputs probably contain gravity."""
 CLEAR = 0.5
 """Smallest difference of outputs between gates on opposite sides that counts [m/s^2]."""
+DOMINANT = 1.5
+"""If one component of an output answers to an offset by this factor more than the others, it is the
+axis of this offset."""
 THRUST = (3.0, 40.0)
 """Plausible mean of the commanded thrust per mass [m/s^2]."""
 UNIT_FIX = "check the unit of its output"
@@ -192,7 +195,10 @@ def _acceleration_faults(policy: Policy) -> tuple[Note, ...]:
         return (Note("action_limited", text, UNIT_FIX + _scale_advice(policy.spec.action)),)
     notes = []
     sideways, up = left[1] - right[1], above[2] - below[2]
-    if sideways < -CLEAR and up < -CLEAR:
+    if order := _order(left - right, above - below):
+        text = f"{name}: accelerates towards gates as if its action were in the order {order}"
+        notes.append(Note("action_order", text, "an action is in the order x, y, z" + INPUTS))
+    elif sideways < -CLEAR and up < -CLEAR:
         text = (
             f"{name}: accelerates away from gates to the left and above, as if its action were FRD"
         )
@@ -203,12 +209,16 @@ def _acceleration_faults(policy: Policy) -> tuple[Note, ...]:
         notes.append(
             Note("action_frame", text, f"the suite's {axis} points {side}: negate it" + INPUTS)
         )
-    if action[:, 2].min() > LIFT:
+    if action[:, 2].min() > LIFT and not order:
         text = (
             f"{name}: commands at least {action[:, 2].min():.1f} m/s^2 up in level flight, as if "
         )
         notes.append(Note("action_gravity", text + "its action contained gravity", GRAVITY_FIX))
-    if policy.spec.action.is_plain and np.abs(output).max() <= UNIT:
+    if not output.any():
+        text = f"{name}: outputs exactly 0 for gates far to the side, with no object in its image"
+        fix = "look for a condition on its image, whose encoding is in the contract, or dead units"
+        notes.append(Note("action_zero", text, fix))
+    elif policy.spec.action.is_plain and np.abs(output).max() <= UNIT:
         text = f"{name}: outputs only -1 to 1 m/s^2 for gates far to the side, as if unscaled"
         notes.append(Note("action_scale", text, SCALE_FIX))
     if _divides_images(policy):
@@ -216,6 +226,21 @@ def _acceleration_faults(policy: Policy) -> tuple[Note, ...]:
         fix = "an image without scale contains no distances: do not divide it by its maximum"
         notes.append(Note("image_scale", text, fix))
     return tuple(notes)
+
+
+def _order(sideways: np.ndarray, up: np.ndarray) -> str:
+    """Return the order in which an action has its axes, such as "z, x, y"; "" if it has no other.
+
+    `sideways` and `up` (3,) are differences of the action between gates to the left and right, and
+    above and below.
+    """
+    axes = ["x", "x", "x"]
+    for name, change in (("y", sideways), ("z", up)):
+        *others, largest = np.sort(np.abs(change))
+        if largest < max(CLEAR, DOMINANT * others[-1]):
+            return ""
+        axes[int(np.argmax(np.abs(change)))] = name
+    return ", ".join(axes) if sorted(axes) == ["x", "y", "z"] and axes != ["x", "y", "z"] else ""
 
 
 def _divides_images(policy: Policy) -> bool:

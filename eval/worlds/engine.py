@@ -178,11 +178,16 @@ def course_notes(name: str, track: Track, vehicle: Vehicle) -> list[str]:
         ValueError: if the vehicle is in contact at the start.
     """
     refuse_start_contact(name, track, vehicle)
+    return [*track_notes(name, track), *opening_notes(name, track, vehicle)]
+
+
+def opening_notes(name: str, track: Track, vehicle: Vehicle) -> list[str]:
+    """Return a note on the first gate that is too small for the body of `vehicle`, [] for none."""
     # Width and height (N, 2) of the gates, and of the body; the vehicle may fly rolled by 90 deg.
     openings = np.ptp(track.scene.gates.opening_g, axis=1)
     body = 2 * np.sort(vehicle.body.half_size[1:])
     small = np.flatnonzero((np.sort(openings) <= body).any(axis=1))
-    return track_notes(name, track) + [
+    return [
         f"{name}: gate {gate} is {openings[gate][0]:g} x {openings[gate][1]:g} m, too small for "
         f"the body of {vehicle.name!r} ({body[1]:g} x {body[0]:g} m)"
         for gate in small[:1]

@@ -52,11 +52,15 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
     pictures = []
     if is_track_file(config.track):
+        from eval.quadrotor.vehicle_file import load_vehicle
+        from eval.worlds.engine import opening_notes
         from tracks.formats.custom import load_track
         from tracks.formats.plausibility import track_notes
 
         tracks = [load_track(Path(config.track))]
-        for note in track_notes(config.track, tracks[0]):
+        notes = track_notes(config.track, tracks[0])
+        notes += opening_notes(config.track, tracks[0], load_vehicle("racer5"))
+        for note in notes:
             console.note(note)
         if config.difficulty != Config.difficulty:
             console.note(NO_LEVELS)

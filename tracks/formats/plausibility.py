@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tracks.geometry.scene import Gates
 from tracks.track import Track
 
 if TYPE_CHECKING:
@@ -21,6 +22,9 @@ THICK_MOST_M = 30.0
 and an object of 0.3 m has it if centimetres are read as metres [m]."""
 CLEAR_M = 0.5
 """Distance before and after a gate's centre that a drone cannot fly round [m]."""
+IN_OPENING, INSIDE_M = 0.9, 0.1
+"""A frame stands in an opening where it meets this share of it, within this distance of its plane
+[m]. Frames of neighbours may touch."""
 QUARTER_DEG = np.pi / 4
 """A yaw of 45 deg, if it is written in radians [deg]."""
 ROUNDING = 0.005
@@ -92,6 +96,8 @@ def _misplaced(track: Track) -> list[str]:
 
     gates, notes = track.scene.gates, {}
     course_w = np.vstack([track.start_pos_w, gates.center_w])
+    points_w = _opening_points(gates)
+    through_w = np.broadcast_to(gates.rot_w[:, None, :, 0], points_w.shape).reshape(-1, 3)
     for name, mesh in solid_meshes(track):
         corners_w = np.asarray(mesh.vertices)
         thick_m = float(np.ptp(corners_w, axis=0).min())
@@ -103,6 +109,10 @@ def _misplaced(track: Track) -> list[str]:
                 f"{name!r} is within {CLEAR_M:g} m in front of or behind the centre of gate {gate}"
             )
             notes.setdefault("blocked", said)
+        if name.startswith("gate "):
+            meets = _on_the_way(mesh, points_w.reshape(-1, 3), through_w, INSIDE_M)
+            for gate in np.flatnonzero(meets.reshape(points_w.shape[:2]).any(axis=1)):
+                notes.setdefault("blocked", f"{name!r} stands in the opening of gate {gate}")
         if thick_m > THICK_MOST_M:
             said = f"{name!r} is {thick_m:.3g} m or more in all directions; is its file in metres?"
             notes.setdefault("large", said)
@@ -111,8 +121,19 @@ def _misplaced(track: Track) -> list[str]:
     return list(notes.values())
 
 
-def _on_the_way(mesh: trimesh.Trimesh, center_w: np.ndarray, ahead_w: np.ndarray) -> np.ndarray:
-    """Return the gates (N,) whose axis meets a convex mesh within `CLEAR_M` of the centre."""
+def _opening_points(gates: Gates) -> np.ndarray:
+    """Return points (N, M, 3) in the openings of the gates, in the world frame."""
+    share = np.linspace(0.0, 1.0, 4, endpoint=False)[:, None, None, None]
+    edge_g = (1.0 - share) * gates.opening_g + share * np.roll(gates.opening_g, -1, axis=1)
+    inward = np.linspace(0.0, IN_OPENING, 20)[:, None, None, None, None]
+    flat_g = np.moveaxis(inward * edge_g, 2, 0).reshape(len(gates.center_w), -1, 2)
+    return gates.center_w[:, None] + flat_g @ np.swapaxes(gates.rot_w[:, :, 1:], 1, 2)
+
+
+def _on_the_way(
+    mesh: trimesh.Trimesh, center_w: np.ndarray, ahead_w: np.ndarray, reach_m: float = CLEAR_M
+) -> np.ndarray:
+    """Return which axes (N,) meet a convex mesh within `reach_m` of their centre."""
     point_w, normal_w = np.asarray(mesh.triangles)[:, 0], np.asarray(mesh.face_normals)
     # The faces' normals point inwards or outwards, depending on the file.
     inside = ((np.asarray(mesh.vertices).mean(0) - point_w) * normal_w).sum(-1)
@@ -122,6 +143,6 @@ def _on_the_way(mesh: trimesh.Trimesh, center_w: np.ndarray, ahead_w: np.ndarray
     slope = ahead_w @ normal_w.T
     with np.errstate(divide="ignore", invalid="ignore"):
         crossing_m = -above / slope
-    first_m = np.where(slope < 0.0, crossing_m, -CLEAR_M).max(axis=1, initial=-CLEAR_M)
-    last_m = np.where(slope > 0.0, crossing_m, CLEAR_M).min(axis=1, initial=CLEAR_M)
+    first_m = np.where(slope < 0.0, crossing_m, -reach_m).max(axis=1, initial=-reach_m)
+    last_m = np.where(slope > 0.0, crossing_m, reach_m).min(axis=1, initial=reach_m)
     return (first_m < last_m) & ~((slope == 0.0) & (above >= 0.0)).any(axis=1)

@@ -20,7 +20,7 @@ from eval.logs.faults.drive.commands import (
     check_thrust_command,
 )
 from eval.logs.faults.drive.motor_map import check_motor_map
-from eval.logs.faults.drive.motors import check_lift, check_motors
+from eval.logs.faults.drive.motors import check_inertia, check_lift, check_motors
 from eval.logs.faults.finding import Finding, findings_of
 from eval.logs.faults.pose import Rows, check_pose
 from eval.logs.faults.position import check_clock_rate, check_height, check_jumps, jumps_of
@@ -86,6 +86,7 @@ DRIVE: tuple[Check, ...] = (
     lambda rows, against: check_gyro_scale(rows, against.vehicle),
     lambda rows, against: check_motors(rows, against.vehicle),
     lambda rows, against: check_lift(rows, against.vehicle, against.implausible),
+    lambda rows, against: check_inertia(rows, against.vehicle),
     lambda rows, _: check_throttle(rows),
     lambda rows, against: check_thrust_command(rows, against.vehicle),
     lambda rows, against: check_motor_map(rows, against.vehicle),
@@ -114,7 +115,7 @@ SIGNALS = {
 """Subject of a finding (`Finding.signal`) -> name of the signal in the rows."""
 
 
-OF_VEHICLE_FILE = ("motor_map", "thrust_scale")
+OF_VEHICLE_FILE = ("motor_map", "thrust_scale", "vehicle_inertia")
 """Faults of the vehicle file, not of the log: with a vehicle file, only its own ones count."""
 
 

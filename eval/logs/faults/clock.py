@@ -9,16 +9,18 @@ estimates that leave out one block of the flight at a time (jackknife).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from eval.importers.frames import rates_between
+from eval.effects.interface import GRAVITY
+from eval.importers.frames import rates_between, rotate
 from eval.logs.faults.finding import Finding, unseen
-from eval.logs.faults.pose import SPAN_S, Rows
+from eval.logs.faults.pose import SPAN_S, WIDTH_S, Rows
 from eval.logs.faults.reading import TIMES, option
-from eval.logs.faults.relation import jackknife_error
+from eval.logs.faults.relation import jackknife_error, smooth
+from eval.logs.velocity import velocity_from_position
 
 PAUSE_S = 5.0
 """After a longer pause there may be another flight [s]."""
@@ -38,12 +40,17 @@ GROWN_S, DRIFT, SURE_DRIFT = 0.005, 3e-4, 5.0
 """Least drift that is reported: over a flight [s], relative (two crystals differ by less than
 200 ppm), and in standard errors."""
 LIKELY = 2.5
-"""A drift above this many standard errors is removed, and its error is estimated again."""
+"""A drift above this many standard errors is removed, and its error is estimated again. A force
+that fits the path better by as many has the other time."""
 SEEN = 0.005
 """The drift is not identifiable where `SURE_DRIFT` standard errors exceed this."""
 LATE_S = 0.025
 """Least delay that is a fault [s]. A diagnosis estimates smaller ones itself (effect
 `clock_offset`)."""
+OF_POSE = ("pos", "quat", "vel")
+"""Signals of the device that measures the pose; they share its delay."""
+COARSE = 2.0
+"""Shifts below this many rows of the path are too small to be seen in its acceleration."""
 
 ROTATED_DEG = (5.0, 15.0, 120.0)
 """Rotation between the body axes of pose and gyro above which it is reported, above which it is a
@@ -71,6 +78,25 @@ class Late(NamedTuple):
     """Duration of the flight [s]."""
     rotation: np.ndarray
     """(3,) rotation vector from the attitude's body axes to the gyro's [deg]; 0 if too small."""
+
+    def moved(self, signals: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> tuple[str, ...]:
+        """Return the signals whose delay this is; `signals` are (times, values) by name.
+
+        No pose is measured early, so an early one is a late gyro. But if the path fits the rotor
+        speeds better at the gyro's time, the clock of the pose is wrong. The accelerometer is as
+        late as the gyro if the path fits it better then.
+        """
+        if self.delay_s > 0.0 or _fits_later(signals, "motor", self.delay_s):
+            return OF_POSE
+        return ("rate", "acc") if _fits_later(signals, "acc", self.delay_s) else ("rate",)
+
+    def figures(self, moved: Sequence[str]) -> tuple[str, str]:
+        """Return the subject of a finding on the delay of the signals `moved`, and its text."""
+        size = f"{1e3 * abs(self.delay_s):.1f} ms (± {1e3 * self.error_s:.1f} ms) late"
+        if "rate" in moved:
+            return "gyro delay", f"it is {size} against the attitude (a filter, or its time stamp)"
+        sign = "-" if self.delay_s < 0.0 else "+"
+        return "pose delay", f"it is {sign}{size} against the gyro"
 
     @property
     def drifts(self) -> bool:
@@ -151,12 +177,78 @@ def check_clock(rows: Rows) -> list[Finding]:
         fix = "suite import of the log that it was made of: the pose is moved"
         about = ("clock_drift", late.drift, 0.95, fix)
         drift += [Finding("doubt", "pose clock", late.drift_figures(), *about)]
-    figures = f"it is {1e3 * late.delay_s:+.1f} ms (± {1e3 * late.error_s:.1f} ms) late"
     if abs(late.delay_s) < max(LATE_S, SURE * late.error_s):
-        return [Finding("ok", "pose delay", figures + " against the gyro"), *drift]
-    fix = "suite import moves it; or [effects.clock_offset] of the vehicle file"
+        return [Finding("ok", *late.figures(OF_POSE)), *drift]
+    moved = late.moved({name: (rows["time"], value) for name, value in rows.items()})
+    fix = "suite import of the log that it was made of moves it"
+    if "rate" not in moved:
+        fix = "suite import moves it; or [effects.clock_offset] of the vehicle file"
     about = ("clock_offset", late.delay_s, 0.95, fix)
-    return [Finding("doubt", "pose delay", figures + " against the gyro", *about), *drift]
+    return [Finding("doubt", *late.figures(moved), *about), *drift]
+
+
+def late_against(
+    time_s: np.ndarray, wanted: np.ndarray, given: np.ndarray
+) -> tuple[float, float] | None:
+    """Return by how much `given` (T, C) is later than `wanted` (T, C), and its error [s].
+
+    Neither the scale nor a constant of `given` counts. None: not identifiable, or over `REACH_S`.
+    """
+    known = np.isfinite(given).all(axis=1)
+    inside = np.isfinite(wanted).all(axis=1)
+    inside &= (time_s > time_s[0] + REACH_S) & (time_s < time_s[-1] - REACH_S)
+    if min(known.sum(), inside.sum()) < 100:
+        return None
+    time_s, known_s, given = time_s[inside], time_s[known], given[known]
+    wanted = wanted[inside] - wanted[inside].mean(axis=0)
+    block = np.minimum((np.arange(len(time_s)) * BLOCKS) // len(time_s), BLOCKS - 1)
+    trials = np.arange(-REACH_S, REACH_S + 0.5 * STEP_S, STEP_S)
+    cost = np.empty((BLOCKS, len(trials)))
+    for k, late_s in enumerate(trials):
+        tried = np.stack([np.interp(time_s + late_s, known_s, column) for column in given.T], 1)
+        tried = tried - tried.mean(axis=0)
+        scale = np.sum(wanted * tried) / max(float(np.sum(tried**2)), 1e-12)
+        residual = np.sum((wanted - scale * tried) ** 2, axis=1)
+        cost[:, k] = np.bincount(block, weights=residual, minlength=BLOCKS)
+    delay_s = _lowest(trials, cost.sum(axis=0))
+    without_block = [_lowest(trials, cost.sum(axis=0) - one) for one in cost]
+    if delay_s is None or any(one is None for one in without_block):
+        return None
+    return delay_s, jackknife_error(np.array(without_block, dtype=np.float64))
+
+
+def _fits_later(
+    signals: Mapping[str, tuple[np.ndarray, np.ndarray]], name: str, late_s: float
+) -> bool:
+    """Return whether the path fits the force by signal `name` better if it is `late_s` late.
+
+    The force is that along body z, by the accelerometer or the squares of the rotor speeds.
+    """
+    if not {"pos", "quat", name} <= signals.keys():
+        return False
+    time_s, pos = signals["pos"]
+    source_s, value = signals[name]
+    if abs(late_s) < COARSE * float(np.median(np.diff(time_s))):
+        return False
+    quat_s, quat = signals["quat"]
+    unit = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+    z_w = rotate(unit, np.array([0.0, 0.0, 1.0]))
+    z_w = np.stack([np.interp(time_s, quat_s, column) for column in z_w.T], axis=1)
+    acc_w = velocity_from_position(time_s, velocity_from_position(time_s, pos))
+    force = np.sum(z_w * (acc_w + [0.0, 0.0, GRAVITY]), axis=1, keepdims=True)
+    path = smooth(time_s, force, WIDTH_S)[:, 0]
+    push = value[:, 2:] if name == "acc" else np.sum(value**2, axis=1, keepdims=True)
+    push = smooth(source_s, push, WIDTH_S)[:, 0]
+    trials = [np.interp(time_s - shift, source_s, push) for shift in (0.0, late_s)]
+    inside = (time_s > source_s[0] + REACH_S) & (time_s < source_s[-1] - REACH_S)
+    good = inside & np.isfinite(np.sum([path, *trials], axis=0))
+    if good.sum() < 100 or not all(np.ptp(one[good]) for one in (path, *trials)):
+        return False
+    path, *trials = (one[good] - one[good].mean() for one in (path, *trials))
+    now, then = (trial / np.linalg.norm(trial) * np.linalg.norm(path) for trial in trials)
+    better = (path - now) ** 2 - (path - then) ** 2
+    parts = np.array([part.sum() for part in np.array_split(better, BLOCKS)])
+    return bool(parts.sum() > LIKELY * jackknife_error(parts.sum() - parts))
 
 
 def delay_of(

@@ -17,9 +17,9 @@ ARM_M = (0.012, 1.5)
 """Usual distance from the centre to a rotor [m]."""
 LIFT = (1.15, 20.0)
 """Usual ratio of full thrust to weight."""
-ROUND = (0.015, 2.5)
+ROUND = (0.015, 1.0)
 """Usual inertia about x and y over mass times arm squared: small where the mass is near the centre,
-large where it is at the rotors or beyond."""
+1 at most where no mass is beyond the rotors."""
 TORQUE_M = (0.001, 0.2)
 """Plausible ratio of a rotor's torque to its thrust [m]; usual are 0.005 to 0.05."""
 GAIN = 1.0

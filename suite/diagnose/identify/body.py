@@ -205,11 +205,11 @@ def torque_unknowns(drive: str, lag_s: float, late_s: float) -> list[Unknown]:
     of the other two, and keeps this ratio if it is not identifiable. `yaw` is the yaw torque over
     the inertia about z. It is missing if torques are commanded.
     """
-    unknowns = [Unknown(f"inertia_{a}", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015) for a in "xy"]
+    unknowns = [Unknown(f"inertia_{a}", 0.0, -5.0, 5.0, 0.5, 1e-2, 0.015) for a in "xy"]
     widest_z = 0.5 if drive == "torques" else 0.25
     unknowns.append(Unknown("inertia_z", 0.0, -1.0, 1.0, widest_z, 1e-2, 0.015))
     if drive != "torques":
-        unknowns.append(Unknown("yaw", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015))
+        unknowns.append(Unknown("yaw", 0.0, -5.0, 5.0, 0.5, 1e-2, 0.015))
     return unknowns if drive == "rotors" else [*unknowns, *lag_unknowns(lag_s, late_s)]
 
 
@@ -242,8 +242,9 @@ def fit_torque(
         NoWholeWindow: if no window has all signals.
     """
     fitted = _fit_torque(unknowns, flights, driven, fixed, known, held, lag_known)
-    fewer = [flight.with_fewer_speeds() for flight in flights if driven.drive == "rotors"]
-    if not fewer or None in fewer:
+    of_rotors = flights if driven.drive == "rotors" else ()
+    fewer = [coarse for flight in of_rotors if (coarse := flight.with_fewer_speeds())]
+    if len(fewer) < len(flights):
         return fitted
     try:
         coarse = _fit_torque(unknowns, fewer, driven, fixed, known, held, lag_known)

@@ -66,13 +66,15 @@ def number_lines(numbers: Sequence[Number]) -> list[str]:
     ]
 
 
+OTHER_INERTIA = "the rotors' lag may be another, or the file is over 100 times wrong"
+"""Other reasons for which an inertia is not identifiable."""
 WHY = {
     "thrust": "thrust: too little of the force along body z is explained",
     "curve": "curvature of the thrust curve: the motor commands hardly change",
     "battery": "voltage_exponent: the voltage hardly changes",
     **{f"drag_{a}": f"drag along body {a}: too slow, or too little of it" for a in "xyz"},
-    "inertia_x": "inertia about x: the body hardly rolls, or the rotors' lag may be another",
-    "inertia_y": "inertia about y: the body hardly pitches, or the rotors' lag may be another",
+    "inertia_x": f"inertia about x: the body hardly rolls, {OTHER_INERTIA}",
+    "inertia_y": f"inertia about y: the body hardly pitches, {OTHER_INERTIA}",
     "inertia_z": "inertia about z: the body hardly yaws, or not while it rolls and pitches",
     "yaw": "torque_coefficient: the body hardly yaws",
     "lag": "time_constant of the rotors: nothing fast enough is commanded",

@@ -50,7 +50,9 @@ def identify_files(
     # Read the files, and check the logs for faults of interfaces.
     start = load_vehicle(vehicle)
     refuse_own_motion(start)
-    checked = read_checked(flights, CheckContext(start), [*accept, *COMPENSATED], partial=True)
+    estimated = [] if "inertia" in leave else ["vehicle_inertia"]
+    accepted = [*accept, *COMPENSATED, *estimated]
+    checked = read_checked(flights, CheckContext(start), accepted, partial=True)
     logs, slow = without_slow_rotors(checked.logs)
     warnings = [*checked.warnings, *slow]
     console.say(f"{_counted(len(logs))}, {sum(log.duration_s for log in logs):.0f} s in all")

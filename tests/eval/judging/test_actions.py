@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -189,6 +190,8 @@ def test_gravity_and_frames_show_in_flight_or_in_made_up_observations():
     changes = {
         "action_gravity": lambda a: a + np.array([0, 0, 9.81], np.float32),
         "action_frame": lambda a: a * np.array([1, -1, -1], np.float32),
+        "action_order": lambda a: a[:, [2, 0, 1]],
+        "action_zero": lambda a: 0 * a,
         "action_scale": lambda a: a / 20,
         "action_limited": lambda a: a * 20,
         "action_not_finite": lambda a: a * np.float32("nan"),
@@ -205,8 +208,23 @@ def test_gravity_and_frames_show_in_flight_or_in_made_up_observations():
 
         (doubt,) = notes_of(replace(policy, model=model))
         assert doubt.fault == fault
-        ambiguous = fault in ("action_gravity", "action_frame")
+        ambiguous = fault in ("action_gravity", "action_frame", "action_order")
         assert ("or its state or image has other units" in doubt.fix) == ambiguous
+
+
+@pytest.mark.parametrize("order", list(permutations(range(3))))
+def test_any_order_of_the_actions_axes_is_named_and_shipped_policies_have_none(order):
+    expected = [] if order == (0, 1, 2) else ["action_order"]
+    for name in ("race", "race-small", "race-paper"):
+        policy = load_policy(name)
+
+        def model(state, image, hidden, model=policy.model):
+            action, hidden = model(state, image, hidden)
+            return action[:, list(order)], hidden
+
+        found = probable_faults(replace(policy, model=model))
+        assert [doubt.fault for doubt in found] == expected
+        assert not found or f"order {', '.join('xyz'[k] for k in order)}" in found[0].evidence
 
 
 def test_a_thrust_that_is_a_share_and_a_camera_in_radians_are_doubted():

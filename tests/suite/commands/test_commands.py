@@ -30,11 +30,13 @@ def test_tracks_command_lists_and_draws(tmp_path, capfd):
     assert names == ["zigzag-0-4.png", "zigzag-4.png", "zigzag-9-4.png"]
     assert (tmp_path / names[0]).read_bytes().startswith(b"\x89PNG")
     mine, out = tmp_path / "mine.toml", tmp_path / "out"
-    mine.write_text('name = "a/b c"\n[[gates]]\ncenter = [3, 0, 2]\nwidth = 25\nheight = 2\n')
+    gates = "[[gates]]\ncenter = [{}, 0, 2]\nwidth = {}\nheight = 0.12\n"
+    mine.write_text(f'name = "a/b c"\n{gates.format(3, 25)}{gates.format(6, 0.1)}')
     assert run("tracks --difficulty 5 --out", out, mine) == 0
     assert [path.name for path in out.iterdir()] == ["mine-0-0.png"]
     said = " ".join(capfd.readouterr().err.split())
     assert "has no levels, so --difficulty" in said and "its largest gate is 25 m wide" in said
+    assert "gate 1 is 0.1 x 0.12 m, too small for the body of 'racer5'" in said
     for command in ("eval", "tracks zigzag", "export"):
         said = refused(capfd, f"{command} --out", mine)
         assert f"a file exists: {mine}; give another --out" in said

@@ -36,13 +36,15 @@ def write(folder, text):
         (GATE + GATE, "gates 0 and 1 have the same place and direction"),
         (GATE + GATE.replace("0, 1.5]", "5, 1.5]\nyaw_deg = 1.5708"), "gate 1 has a yaw of 1.571"),
         (GATE.replace("1.5]", "150]") + GATE.replace("0, 1.5]", "400, 150]"), "centimetres"),
-        (GATE + GATE.replace("0, 1.5]", "0.1, 1.5]"), "gates 0 and 1 are only 0.1 m apart"),
+        (GATE + GATE.replace("[0, 0,", "[0.1, 0,"), "gates 0 and 1 are only 0.1 m apart"),
         (GATE.replace("1.5]", "1.5]\nyaw_deg = 90.0")
          + "[start]\nposition = [0, -3, 1.5]\nyaw_deg = 1.5708\n", "is start.yaw_deg in radians?"),
         (GATE.replace("1.5]", "1.5]\nyaw_deg = 180") + GATE.replace("[0, 0, 1.5]", "[5, 0, 1.5]")
          + "[start]\nposition = [-3, 0, 1.5]\n", "gate 0 faces against the path"),
         (GATE + '[[spheres]]\nname = "tree"\ncenter = [0, 0, 1.5]\nradius = 0.3\n',
          "'tree' is within 0.5 m in front of or behind the centre of gate 0"),
+        (GATE + GATE.replace("0, 1.5]", "5, 1.5]") + GATE.replace("0, 1.5]", "5.9, 1.5]"),
+         "'gate 1 frame' stands in the opening of gate 2"),
         (GATE + '[[boxes]]\ncenter = [-0.4, 0, 1.5]\nsize = [0.002, 1, 1]\n', "'box 0' is within"),
         (GATE + '[[boxes]]\ncenter = [2500, 0, 1]\nsize = [1, 1, 1]\n', "2.5e+03 m away from all"),
         (GATE + '[[boxes]]\ncenter = [50, 0, 0]\nsize = [60, 60, 60]\n', "is its file in metres?"),

@@ -330,7 +330,7 @@ def check_gyro_scale(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding
         return [Finding("corrected", "gyro", text, "gyro_scale", RATES[unit], 0.95, fix)]
     if between_axes > EQUAL:
         return []
-    scale = turn_scale(rows, vehicle)
+    scale, _ = turn_scale(rows, vehicle) or (None, None)
     if scale is not None:
         text += f", and {scale:.3g} times what the motors' torques give by the vehicle file"
     if scale is not None and abs(np.log(scale / gain)) < abs(np.log(scale)):

@@ -36,6 +36,9 @@ TURNING = 0.05
 """A motor that never reaches this share of the fastest one counts as stopped."""
 FITS = 1.35
 """A lift within this factor of 1 may be a physical effect, which a diagnosis names."""
+INERTIA = 2.5
+"""Least factor of an inertia that is a fault; a diagnosis estimates smaller ones itself (effect
+`inertia_scale`)."""
 UNITS = {
     "rpm in place of rad/s": 60.0 / (2.0 * np.pi),
     "revolutions a second in place of rad/s": 1.0 / (2.0 * np.pi),
@@ -112,11 +115,37 @@ def torque_correlations(rows: Rows, vehicle: Vehicle | None) -> np.ndarray | Non
     return None if isinstance(torques, str) else _scores(*torques)[AS_GIVEN]
 
 
-def turn_scale(rows: Rows, vehicle: Vehicle | None) -> float | None:
-    """Return the gyro's angular acceleration over the one that the motors' torques give.
+def check_inertia(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
+    """Return the finding on an inertia that is far from what the turns need, [] for none.
 
-    The vehicle file gives these torques. The ratio is 1 for a correct gyro and vehicle file. It is
-    None where the log or the file lacks a value, or the torques hardly explain the turns.
+    The attitude must confirm the gyro, and the motors lift the weight by the file: otherwise these
+    may be the cause, and other checks name them.
+    """
+    range_ = turn_scale(rows, vehicle) if "quat" in rows else None
+    if vehicle is None or range_ is None or 1.0 / INERTIA < range_[1] and range_[0] < INERTIA:
+        return []
+    name = _drive(rows)
+    lift = 1.0
+    if name == "motor":
+        thrust = vehicle.rotors.thrust_coefficient * np.sum(rows["motor"] ** 2, axis=1)
+        lift = fit_force(rows, thrust)[1] / vehicle.mass
+    if not 1.0 / FITS < lift < FITS:
+        return []
+    ratio = float(np.sqrt(range_[0] * range_[1]))
+    text = (
+        f"by {vehicle.name!r} the body needs {ratio:.3g} times the torques that the motors give: "
+        "its inertia over its arms is wrong by this factor"
+    )
+    fix = "inertia in kg m^2 and rotors.position in m of this vehicle, or suite identify"
+    return [Finding("doubt", "motors", text, "vehicle_inertia", ratio, 0.93, fix)]
+
+
+def turn_scale(rows: Rows, vehicle: Vehicle | None) -> tuple[float, float] | None:
+    """Return the torques by the gyro over those of the motors, by the vehicle file.
+
+    The result is the least and the largest ratio: noise of the motors lowers the first, and noise
+    of the gyro raises the second. It is 1 for a correct gyro and vehicle file. It is None where the
+    log or the file lacks a value, or the torques hardly explain the turns.
     """
     name = _drive(rows)
     if vehicle is None or name is None or "rate" not in rows:
@@ -133,7 +162,8 @@ def turn_scale(rows: Rows, vehicle: Vehicle | None) -> float | None:
     correlations = _correlations(mean @ mixer[:2].T, turning[:, :2]).diagonal()
     if not (slope > 0.0).all() or correlations.min() < SURELY:
         return None
-    return float(np.sqrt(slope.prod()))
+    least = float(np.sqrt(slope.prod()))
+    return least, least / float(correlations.prod())
 
 
 def _drive(rows: Rows) -> str | None:

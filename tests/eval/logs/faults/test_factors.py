@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from eval.logs.faults.drive.commands import check_thrust_command
 from eval.logs.faults.drive.motor_map import check_motor_map
-from eval.logs.faults.drive.motors import check_lift, check_motors
+from eval.logs.faults.drive.motors import check_inertia, check_lift, check_motors
 from eval.logs.faults.reading import parse_readings, read_rows
 from eval.logs.faults.relation import match
 from eval.logs.faults.sensors import check_voltage
@@ -81,7 +82,25 @@ def test_without_a_gyro_order_and_spin_are_not_identifiable():
 
 
 @pytest.mark.parametrize(
-    ("unit", "inertia", "divisor"), [(100, 1, "100"), (1000, 1, "1000"), (1000, 10, "100 or 1000")]
+    ("factor", "named"), [(1.0, False), (2.0, False), (10.0, True), (0.1, True)]
+)
+def test_an_inertia_that_the_turns_exclude_is_doubted(factor, named):
+    parts = known_flight.fly(np.arange(0.0, 10.0, 0.01))
+    rows = {name: getattr(parts, name) for name in ("time", "pos", "quat", "rate", "motor")}
+    wrong = replace(PLAIN, inertia=tuple(factor * moment for moment in PLAIN.inertia))
+    found, named = check_inertia(rows, wrong), factor in (10.0, 0.1)
+    assert [(one.fault, one.is_open) for one in found] == [("vehicle_inertia", True)] * named
+    assert not named or found[0].size == pytest.approx(factor, rel=0.15)
+    assert check_inertia({k: v for k, v in rows.items() if k != "quat"}, wrong) == []
+    # A radius of gyration beyond the rotors is implausible without flights.
+    assert {one.fault for one in check_vehicle_numbers(wrong)} == (
+        {"vehicle_inertia"} if factor == 10.0 else {""}
+    )
+
+
+@pytest.mark.parametrize(
+    ("unit", "inertia", "divisor"),
+    [(100, 1, "100"), (1000, 1, "1000"), (1000, 0.05, "100 or 1000")],
 )
 def test_arms_in_cm_or_mm_are_converted_by_the_divisor_that_fits_the_inertia(
     unit, inertia, divisor
@@ -89,7 +108,7 @@ def test_arms_in_cm_or_mm_are_converted_by_the_divisor_that_fits_the_inertia(
     hubs = tuple((unit * x, unit * y, unit * z) for x, y, z in PLAIN.rotors.position)
     moments = tuple(inertia * moment for moment in PLAIN.inertia)
     wrong = replace(PLAIN, inertia=moments, rotors=replace(PLAIN.rotors, position=hubs))
-    (finding,) = check_vehicle_numbers(wrong)
+    finding, *_ = check_vehicle_numbers(wrong)
     assert finding.fault == "vehicle_arms"
     assert finding.fix == f"rotors.position in m: divide by {divisor}"
 
@@ -324,3 +343,16 @@ def test_a_curve_needs_a_delay_that_is_known(late, expected):
     throttle = np.roll(total / (PLAIN.full_thrust * PLAIN.mass), -late) ** 0.5
     rows = {"time": rows["time"], "acc": rows["acc"], "throttle": throttle[:, None]}
     assert [f.fault for f in found(rows, PLAIN)] == expected
+
+
+@pytest.mark.parametrize("late", ["vel", "pos"])
+def test_a_velocity_that_is_late_against_the_path_is_doubted(late):
+    """A low pass of the first order with a time constant of 60 ms."""
+    truth = known_flight.fly(np.arange(0.0, 10.0, 0.01))
+    rows = {"time": truth.time, "pos": truth.pos, "vel": truth.vel, "quat": truth.quat}
+    assert "velocity_delay" not in {finding.fault for finding in check_velocity(rows)}
+    rows[late] = lfilter([1 / 7], [1.0, -6 / 7], rows[late], axis=0)
+    (found,) = (one for one in check_velocity(rows) if one.fault == "velocity_delay")
+    assert found.signal == {"vel": "velocity", "pos": "position"}[late]
+    assert found.is_open == (late == "vel")
+    assert abs(found.size) == pytest.approx(0.06, abs=0.015)

@@ -8,6 +8,8 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from eval.importers.cleaning import check_delay
+from eval.importers.signals import Recording, Signal
 from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.check import (
     CLOCK,
@@ -19,7 +21,7 @@ from eval.logs.faults.check import (
     run_checks,
     with_fixes,
 )
-from eval.logs.faults.clock import check_clock
+from eval.logs.faults.clock import OF_POSE, check_clock, delay_of
 from eval.logs.faults.drive import commands
 from eval.logs.faults.drive.commands import check_controller_rate
 from eval.logs.faults.drive.rate_following import delayed
@@ -338,3 +340,25 @@ def test_a_rates_curve_gives_more_of_large_commands_and_motors_limits_give_less(
     assert commands.bend(time_s, command, curved) > commands.BENT
     assert commands.bend(time_s, command, np.clip(command, -0.8, 0.8)) == 0.0
     assert abs(commands.bend(time_s, command, 0.9 * command)) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("late", "moved"),
+    [
+        (("rate",), ("rate",)),
+        (("rate", "acc"), ("rate", "acc")),
+        (("acc", "cmd_rate", "motor", "rate"), OF_POSE),
+    ],
+)
+def test_a_late_gyro_shifts_no_pose_and_the_motors_show_a_pose_that_is_early(late, moved):
+    right = good(end=10.0)
+    rows = right | {name: np.roll(right[name], 4, axis=0) for name in late}
+    signals = {name: Signal(rows["time"], rows[name]) for name in rows if name != "time"}
+    fixed, (finding,) = check_delay(Recording("test", signals), fix=True)
+    shifted = {name for name in signals if fixed.signals[name].time_s[0] != rows["time"][0]}
+    assert shifted == set(moved) and finding.size == pytest.approx(-0.04, abs=0.006)
+    after = delay_of(*fixed.signals["quat"], *fixed.signals["rate"])
+    assert abs(after.delay_s) < 0.002
+    assert ("gyro delay" == finding.signal) == ("rate" in moved)
+    (delay,) = (f for f in check_clock(rows) if f.fault == "clock_offset")
+    assert (delay.signal, delay.is_open) == (finding.signal, True)

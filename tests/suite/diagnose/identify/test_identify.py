@@ -95,6 +95,14 @@ def test_parts_that_are_left_stay():
     assert found.vehicle.controller == begun.controller
 
 
+def test_an_inertia_that_is_ten_times_too_large_is_identified():
+    begun = known.start()
+    begun = replace(begun, inertia=tuple(10.0 * moment for moment in begun.inertia))
+    found = identify(known.logs("rotors", 0)[3:], begun, leave=("drag", "motors", "lag", "loop"))
+    for moment, true in list(zip(found.vehicle.inertia, TRUE["inertia"], strict=True))[:2]:
+        assert moment == pytest.approx(true, rel=0.1)
+
+
 def without(logs, *fields):
     """Return the logs without these columns, as partial logs have them."""
     lost = dict.fromkeys(fields, lambda values: np.full_like(values, np.nan))
