@@ -19,6 +19,7 @@ from eval.quadrotor.mixer import mixer_matrix
 from eval.quadrotor.plant import Command, make_plant
 from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.data.sampling import own_spacing_s
 
 LONGEST_S = 0.002
 """Approximate length of the longest step [s]. With it the integrator's error over a second is far
@@ -138,8 +139,12 @@ def rotors_at(
     """Return rotor speeds (S, 4) at `at_s` (S,), measured as `speed` (T, 4) at `time_s` (T,).
 
     Of each rotor every `stride`-th measured row is used. Between two rows the speeds follow the
-    first-order response to a constant command. A firmware's rate loop changes its commands all the
-    time, by filtered derivatives of rates. There a spline is more accurate.
+    first-order response to a constant command, and the torque that the rows do not show is added.
+    Rows further apart than the lag determine this torque only to a factor of two. Then it is added
+    only with a stride above 1, whose difference from other results shows this error.
+
+    A firmware's rate loop changes its commands all the time, by filtered derivatives of rates.
+    There a spline is more accurate.
     """
     columns = []
     for column in speed.T:
@@ -155,7 +160,10 @@ def rotors_at(
         lag_s = max(vehicle.rotors.time_constant, 1e-4)
         share = (1.0 - np.exp(-since_s / lag_s)) / (1.0 - np.exp(-span_s / lag_s))
         columns.append(column[before] + share * (column[after] - column[before]))
-    return np.stack(columns, axis=1)
+    speed_at, spacing_s = np.stack(columns, axis=1), own_spacing_s(time_s, speed)
+    if rows_show_torque(vehicle, spacing_s):
+        return with_hidden_torque(speed_at, vehicle, stride * spacing_s)
+    return with_hidden_torque(speed_at, vehicle, spacing_s) if stride > 1 else speed_at
 
 
 def torque_between_rows(vehicle: Vehicle, step_s: float) -> np.ndarray:
@@ -185,8 +193,8 @@ def rows_show_torque(vehicle: Vehicle, step_s: float) -> bool:
 
 
 def with_hidden_torque(speed: np.ndarray, vehicle: Vehicle, step_s: float) -> np.ndarray:
-    """Return rotor speeds (S, 4) with the torque that sparse rows, `step_s` apart, do not show."""
-    if rows_show_torque(vehicle, step_s):
+    """Return rotor speeds (S, 4) with the torque that rows `step_s` [s] apart do not show."""
+    if has_firmware_loop(vehicle):
         return speed
     mixer, share = rotor_mixer(vehicle), torque_between_rows(vehicle, step_s)
     added = np.linalg.inv(mixer) @ (np.append(0.0, share)[:, None] * mixer)

@@ -20,7 +20,6 @@ from suite.diagnose.data.sampling import (
     interpolate,
     longest_gap_s,
     on_every_row,
-    own_spacing_s,
     thinned,
     voltage_drop,
 )
@@ -31,7 +30,6 @@ from suite.diagnose.data.steps import (
     rotors_at,
     start_rotor_error,
     step_grid,
-    with_hidden_torque,
     with_lost_rows,
 )
 from suite.diagnose.data.view import near_ground
@@ -161,7 +159,7 @@ def cut(
         limits: longest hole in a window, and largest numbers of windows.
         integrator: integrator of the model; with "euler" its steps are the rate loop's periods.
         coarser: the windows that an earlier call returned. If given, the same ones are cut with
-            steps of twice the length, from every second rotor speed and `with_hidden_torque`.
+            steps of twice the length, and from every second rotor speed.
         only: numbers of the flights that are cut; all if not given.
         since_s: earliest start of a window after its log's start [s].
         fewer_commands: as `coarser`, but with usual steps, and from every second command.
@@ -336,8 +334,6 @@ def _window(
     speed = np.zeros((len(middle_s), 4))
     if log.rotor_speed is not None and rotor_input:
         speed = rotors_at(middle_s, time_s, log.rotor_speed, vehicle, stride)
-        if stride > 1:
-            speed = with_hidden_torque(speed, vehicle, own_spacing_s(time_s, log.rotor_speed))
     none = np.full((len(time_s), 4), np.nan)
     acc_b = none[:, :3] if log.acc_b is None else log.acc_b
     rotors = none if log.rotor_speed is None else log.rotor_speed

@@ -25,7 +25,6 @@ from suite.diagnose.identify.fit import (
     Z95,
     Fitted,
     KnownNumbers,
-    NoWholeWindow,
     Residuals,
     Rows,
     Unknown,
@@ -231,8 +230,7 @@ def fit_torque(
     and the yaw torque smaller. The modelled torque is therefore multiplied by the share of its
     variance that is not noise (the reliability ratio). Half of this correction counts as its
     uncertainty. The same holds for the torque between the rows of the log (`torque_between_rows`),
-    but without an identified lag (`lag_known`) it counts as uncertainty only. `_beyond_rows`
-    corrects the rest of this error.
+    but without an identified lag (`lag_known`) it counts as uncertainty only.
 
     A number that reaches its limit is reset to its start and held. So are the numbers `held`, with
     their uncertainty. `fixed` has the other numbers, `lag` and `late` among them; `known` are those
@@ -241,45 +239,6 @@ def fit_torque(
     Raises:
         NoWholeWindow: if no window has all signals.
     """
-    fitted = _fit_torque(unknowns, flights, driven, fixed, known, held, lag_known)
-    of_rotors = flights if driven.drive == "rotors" else ()
-    fewer = [coarse for flight in of_rotors if (coarse := flight.with_fewer_speeds())]
-    if len(fewer) < len(flights):
-        return fitted
-    try:
-        coarse = _fit_torque(unknowns, fewer, driven, fixed, known, held, lag_known)
-    except NoWholeWindow:
-        return fitted
-    return _beyond_rows(fitted, coarse)
-
-
-def _beyond_rows(fitted: Fitted, coarse: Fitted) -> Fitted:
-    """Return `fitted` as if the log had many more rows of rotor speeds.
-
-    The `coarse` fit has every second one. If the error is of second order in the spacing of the
-    rows, it is a third of the difference of both fits (extrapolation by Richardson 1911, Phil.
-    Trans. R. Soc. A 210). This is added. Half of the difference counts as uncertainty.
-    """
-    shift = np.array(
-        [
-            value - other if fitted.identifies(name) and coarse.identifies(name) else 0.0
-            for name, value, other in zip(fitted.names, fitted.value, coarse.value, strict=True)
-        ]
-    )
-    covariance = fitted.covariance + np.diag((0.5 * shift / Z95) ** 2)
-    return replace(fitted, value=fitted.value + shift / 3.0, covariance=covariance)
-
-
-def _fit_torque(
-    unknowns: Sequence[Unknown],
-    flights: Sequence[FlightGrid],
-    driven: DrivenVehicle,
-    fixed: Mapping[str, float],
-    known: KnownNumbers,
-    held: Sequence[str],
-    lag_known: bool,
-) -> Fitted:
-    """Return the fit of `fit_torque`, to rotor speeds that are interpolated between their rows."""
     # The known numbers join the unknowns, so that their uncertainty widens the intervals.
     steps = {"thrust": 1e-3, "curve": 1e-2, "battery": 1e-2}
     known_unknowns = (Unknown(n, fixed[n], -9.0, 9.0, 1.0, steps[n]) for n in known.names)

@@ -38,8 +38,6 @@ MEMORY_S = 0.4
 ROTOR_NOISE = "rotor_noise"
 """Name of a signal: random noise as large as that of the measured rotor speeds. It is added to
 them, to see how such noise changes the model."""
-FEWER = "fewer_"
-"""Prefix of the names of signals: rotor speeds and their noise from every second measured row."""
 LEANING = "leaning"
 """Name of a signal: the attitude that the path's acceleration requires, if none was measured."""
 IMU_ACC = "imu_acc_w"
@@ -69,15 +67,6 @@ class FlightGrid(NamedTuple):
     def has(self, *names: str) -> bool:
         """Return whether the flight has all of these signals."""
         return all(name in self.signals for name in names)
-
-    def with_fewer_speeds(self) -> FlightGrid | None:
-        """Return the flight with every second measured rotor speed; None if too few are left."""
-        names = ("rotor_speed", ROTOR_NOISE)
-        if not self.has(*(f"{FEWER}{name}" for name in names)):
-            return None
-        fewer = {name: self.signals[f"{FEWER}{name}"] for name in names}
-        signals, spacing_s = {**self.signals, **fewer}, 2.0 * self.rotor_spacing_s
-        return self._replace(signals=signals, rotor_spacing_s=spacing_s)
 
     def form(self, width_s: float, needs: Sequence[str], slope: bool = False) -> WeakForm:
         """Return the weights of the windows of `width_s` with all signals of `needs`.
@@ -136,12 +125,7 @@ def grid_of(log: FlightLog) -> FlightGrid:
             add_measured(name, of_pose.reshape(len(time_s), -1))
             signals[name] = np.nan_to_num(signals[name])
     if "rotor_speed" in logged:
-        speed, noise = logged["rotor_speed"], noise_like(logged["rotor_speed"])
-        add_measured(ROTOR_NOISE, noise)
-        fewer = every_second(speed)
-        if _enough(fewer):
-            add_measured(f"{FEWER}rotor_speed", fewer)
-            add_measured(f"{FEWER}{ROTOR_NOISE}", np.where(np.isfinite(fewer), noise, np.nan))
+        add_measured(ROTOR_NOISE, noise_like(logged["rotor_speed"]))
     if _complete_rows(quat_wxyz) > 1:
         signals["rot_w"] = attitude_at(grid_s, time_s, quat_wxyz)
         rate_b = turning_of(time_s, quat_wxyz)
@@ -155,12 +139,6 @@ def grid_of(log: FlightLog) -> FlightGrid:
         signals["voltage"] = uniform_filter1d(volts, VOLTAGE_STEPS, mode="nearest")
     spacing_s = own_spacing_s(time_s, logged["rotor_speed"]) if "rotor_speed" in logged else 0.0
     return FlightGrid(log.name, grid_s, signals, in_turn, spacing_s)
-
-
-def every_second(values: np.ndarray) -> np.ndarray:
-    """Return `values` (T, C) with every second of each column's measured rows, NaN elsewhere."""
-    number = np.cumsum(np.isfinite(values), axis=0)
-    return np.where(number % 2 == 1, values, np.nan)
 
 
 def _enough(values: np.ndarray) -> bool:

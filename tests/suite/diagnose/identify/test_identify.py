@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
-from eval.judging.statistics import wilson
 from suite.diagnose.identify.identify import identify
 from suite.diagnose.identify.numbers import numbers_json
 from tests.support import identified as known
@@ -59,6 +59,7 @@ def test_identified_numbers_are_near_the_truth(drive, least):
     assert found.drive == drive and len(near_truth(found)) >= least
 
 
+@pytest.mark.slow
 def test_rotors_that_are_faster_than_the_rows_of_the_log_do_not_look_like_less_inertia():
     """Without a lag the torque falls between two rows, by a tenth here; the loop shows the lag."""
     logs = fly_all([PLAIN] * 3, range(3), duration_s=6.0, noise=0.2, motors=True)
@@ -78,10 +79,11 @@ def test_intervals_of_every_number_hold_the_truth_as_often_as_they_say(root):
     coverage = program(root / "tools" / "coverage.py")
     found = coverage.measure(40, 0, list(coverage.CASES), "")
     assert len(found) > 40
-    for (case, key), rows in found.items():
-        held = sum(abs(pull) < 1.0 for _, pull, _ in rows)
-        _, low, high = wilson(held, len(rows))
-        assert low <= 0.98 and high >= 0.90, (case, key, held, len(rows))
+    held = {key: sum(abs(pull) < 1.0 for _, pull, _ in rows) for key, rows in found.items()}
+    for key, rows in found.items():
+        # No count is unlikely with a coverage of 90 %, over all counts (Bonferroni).
+        assert binom.cdf(held[key], len(rows), 0.90) > 0.05 / len(found), (key, held[key])
+    assert 0.93 <= sum(held.values()) / sum(map(len, found.values())) <= 0.98
 
 
 TURNING = ("inertia", "lag")
