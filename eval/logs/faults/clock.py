@@ -36,6 +36,8 @@ CALM = 0.2
 """Smallest usable body rate, root mean square [rad/s]."""
 LEAST_S, SURE = 0.002, 4.0
 """Least delay that is corrected: in seconds, and in standard errors."""
+CLEARLY = 15.0
+"""The same for a velocity: in real logs an estimator's may be 60 ms late, by 10 standard errors."""
 GROWN_S, DRIFT, SURE_DRIFT = 0.005, 3e-4, 5.0
 """Least drift that is reported: over a flight [s], relative (two crystals differ by less than
 200 ppm), and in standard errors."""

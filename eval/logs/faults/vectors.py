@@ -12,7 +12,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import conjugate, rotate
-from eval.logs.faults.clock import LATE_S, SURE, late_against
+from eval.logs.faults.clock import CLEARLY, LATE_S, late_against
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows, turns_of
 from eval.logs.faults.reading import axes_matrix, option, read_as
@@ -244,12 +244,12 @@ def check_velocity(rows: Rows) -> list[Finding]:
 
 
 def _velocity_delay(time_s: np.ndarray, path: np.ndarray, vel: np.ndarray) -> list[Finding]:
-    """Return the finding on the delay of the velocity against the path's derivative, [] if small.
+    """Return the finding on the delay of the velocity against the path's derivative, [] if unclear.
 
     If the velocity is early, the position is late, which the velocity alone does not prove.
     """
     found = late_against(time_s, path, vel)
-    if found is None or abs(found[0]) < max(LATE_S, SURE * found[1]):
+    if found is None or abs(found[0]) < max(LATE_S, CLEARLY * found[1]):
         return []
     late_s, error_s = found
     figures = f"it is {1e3 * abs(late_s):.0f} ms (± {1e3 * error_s:.1f} ms) late against the "
