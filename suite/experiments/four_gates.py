@@ -16,6 +16,7 @@ from eval.judging.statistics import Interval, wilson
 from eval.judging.tables import percent
 from policies import shipped
 from suite.common.console import Console
+from suite.experiments.ablation import RATES
 from suite.experiments.pages import paper
 from suite.experiments.pages.document import PageContents
 from suite.experiments.study import judging, options
@@ -23,12 +24,10 @@ from suite.experiments.study.cache import Workspace
 from suite.train.config import TrainConfig
 from tracks.common.grid import Grid, table
 from tracks.common.names import unknown_name
-from tracks.input.ranges import Range, Seed, Trials, check_ranges
+from tracks.input.ranges import Range, Seed, Trials
 
 PAPER = "field 0.4"
 """The setting of the paper's ablation with the vector field, see `paper.ablation`."""
-RATES = ("success_cross", "collision_free")
-"""Measures of `validation.mean_scores` that are shares of the trials."""
 
 
 @dataclass(frozen=True)
@@ -51,17 +50,15 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     from suite.experiments.study.validation import make_validation
     from suite.train.run import start_params
 
-    check_ranges(config, options=True)
-    names = config.policy or tuple(shipped.names())
+    recipes = {name: flown_recipe(name) for name in config.policy or shipped.names()}
     measured = {}
-    for name in names:
-        recipe = flown_recipe(name)
+    for name, recipe in recipes.items():
         params = start_params(load_policy_checkpoint(shipped.locate(name)), recipe.spec)
         measure = make_validation(recipe, config.trials, config.seed, config.seconds)
         measured[name] = measure(params)
         console.note(f"{name}: success cross {measured[name]['success_cross']:.1%}")
     facts = {
-        **judging.policy_facts(judging.named_policies(names)),
+        **judging.policy_facts(judging.named_policies(tuple(recipes))),
         "tracks": f"those of the recipe `quick`, with {options.GATES} gates",
         "unseen worlds": f"{config.trials}, seed {config.seed}, {config.seconds:g} s each",
     }

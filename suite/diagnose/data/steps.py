@@ -19,7 +19,6 @@ from eval.quadrotor.mixer import mixer_matrix
 from eval.quadrotor.plant import Command, make_plant
 from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.sampling import own_spacing_s
 
 LONGEST_S = 0.002
 """Approximate length of the longest step [s]. With it the integrator's error over a second is far
@@ -134,9 +133,16 @@ def _step_rows(row_s: np.ndarray, shortest_s: float) -> np.ndarray:
 
 
 def rotors_at(
-    at_s: np.ndarray, time_s: np.ndarray, speed: np.ndarray, vehicle: Vehicle, stride: int = 1
+    at_s: np.ndarray,
+    time_s: np.ndarray,
+    speed: np.ndarray,
+    vehicle: Vehicle,
+    spacing_s: float,
+    stride: int = 1,
 ) -> np.ndarray:
     """Return rotor speeds (S, 4) at `at_s` (S,), measured as `speed` (T, 4) at `time_s` (T,).
+
+    The measured rows are `spacing_s` [s] apart, as by `own_spacing_s`.
 
     Of each rotor every `stride`-th measured row is used. Between two rows the speeds follow the
     first-order response to a constant command, and the torque that the rows do not show is added.
@@ -160,7 +166,7 @@ def rotors_at(
         lag_s = max(vehicle.rotors.time_constant, 1e-4)
         share = (1.0 - np.exp(-since_s / lag_s)) / (1.0 - np.exp(-span_s / lag_s))
         columns.append(column[before] + share * (column[after] - column[before]))
-    speed_at, spacing_s = np.stack(columns, axis=1), own_spacing_s(time_s, speed)
+    speed_at = np.stack(columns, axis=1)
     if rows_show_torque(vehicle, spacing_s):
         return with_hidden_torque(speed_at, vehicle, stride * spacing_s)
     return with_hidden_torque(speed_at, vehicle, spacing_s) if stride > 1 else speed_at

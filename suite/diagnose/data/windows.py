@@ -20,6 +20,7 @@ from suite.diagnose.data.sampling import (
     interpolate,
     longest_gap_s,
     on_every_row,
+    own_spacing_s,
     thinned,
     voltage_drop,
 )
@@ -193,8 +194,14 @@ def cut(
     held = 1 if fewer_commands is None else 2
     inputs = [_input_of(logs[number], row, vehicle, longest_s, held) for number, row in starts]
     like, stride = coarser or fewer_commands, 1 if coarser is None else 2
+    spacings_s = [
+        own_spacing_s(log.time_s, log.rotor_speed)
+        if rotor_input and log.rotor_speed is not None
+        else None
+        for log in logs
+    ]
     windows = [
-        _window(logs[number], states[number], number, row, vehicle, rotor_input, one, stride)
+        _window(logs[number], states[number], number, row, vehicle, spacings_s[number], one, stride)
         for (number, row), one in zip(starts, _of_one_shape(inputs, like), strict=True)
     ]
     return FlightWindows(*(np.stack(field) for field in zip(*windows, strict=True))), warnings
@@ -319,21 +326,22 @@ def _window(
     number: int,
     row: int,
     vehicle: Vehicle,
-    rotor_input: bool,
+    rotor_spacing_s: float | None,
     inputs: _Input,
     stride: int,
 ) -> FlightWindows:
     """Return the window (without the axis W) that starts at `row` of `log`.
 
-    `state` is the log with a state in every row; every `stride`-th rotor speed is used.
+    `state` is the log with a state in every row. If measured rotor speeds are the input, they are
+    `rotor_spacing_s` [s] apart, and every `stride`-th is used; else it is None.
     """
     time_s, begin_s = log.time_s, log.time_s[row]
     rows, before, window = inputs.rows, inputs.burn_in, inputs.window
     sample_s = begin_s + before.edge_s[:-1] + before.lead_s
     middle_s = begin_s + 0.5 * (window.edge_s[:-1] + window.edge_s[1:])
     speed = np.zeros((len(middle_s), 4))
-    if log.rotor_speed is not None and rotor_input:
-        speed = rotors_at(middle_s, time_s, log.rotor_speed, vehicle, stride)
+    if log.rotor_speed is not None and rotor_spacing_s is not None:
+        speed = rotors_at(middle_s, time_s, log.rotor_speed, vehicle, rotor_spacing_s, stride)
     none = np.full((len(time_s), 4), np.nan)
     acc_b = none[:, :3] if log.acc_b is None else log.acc_b
     rotors = none if log.rotor_speed is None else log.rotor_speed
@@ -346,7 +354,7 @@ def _window(
         for values in measured
     ]
     rotor_valid = valid[5]
-    if rotor_input:
+    if rotor_spacing_s is not None:
         valid[5] = np.zeros_like(rotor_valid)  # the model's input is not compared
     # Not simulated: the time before the start, of the accelerometer's first row and of late poses.
     valid[4][0] = False
@@ -362,7 +370,7 @@ def _window(
     added = np.diff(command_s)[:, None] * inputs.command[:-1]
     command_sum = np.concatenate([np.zeros((1, 4)), np.cumsum(added, axis=0)])
     rotor_error = 0.0
-    if not rotor_input:
+    if rotor_spacing_s is None:
         burn_in = (time_s > begin_s - BURN_IN_S - 1e-9) & (time_s <= begin_s + 1e-9)
         burn_in &= np.isfinite(log.rate_b).all(axis=1)  # not where rates are interpolated
         rotor_error = start_rotor_error(time_s[burn_in], log.rate_b[burn_in], vehicle)
