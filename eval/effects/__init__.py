@@ -73,6 +73,7 @@ _BUILT_IN = (
     drag.ANGULAR_DAMPING,
     weak_motor.WEAK_MOTOR,
     thrust.THRUST_TILT,
+    measurement.LEVER_ARM,
     measurement.GYRO_BIAS,
     measurement.ACCELEROMETER_BIAS,
     measurement.FRAME_TILT,

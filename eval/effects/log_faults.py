@@ -5,11 +5,16 @@ Faults of a log are effects with the hooks `measure` or `late`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from typing import Any, cast
 
+import numpy as np
+
 from eval.effects import EFFECTS
-from eval.effects.interface import Array, Sample, Values
+from eval.effects.interface import Array, Sample, Values, as_arrays
+from eval.logs.flight_log import FlightLog
 from tracks.geometry.rotation import quat_to_rot, rot_to_quat
 
 
@@ -22,7 +27,7 @@ def pose_delay(effects: Mapping[str, Values]) -> Any:
 def to_logged(effects: Mapping[str, Values], sample: Sample) -> Sample:
     """Return the logged sample for the true `sample`, whose pose is already delayed."""
     for name, measure in _hooks(effects, "measure"):
-        sample = measure(effects[name], sample)
+        sample = measure(as_arrays(effects[name]), sample)
     return sample
 
 
@@ -31,8 +36,9 @@ def to_true(effects: Mapping[str, Values], sample: Sample) -> Sample:
     for name, measure in reversed(_hooks(effects, "measure")):
         # Values mirrored about neutral undo a fault; neutral is a number for every fault of a log.
         neutral = (cast(float, parameter.neutral) for parameter in EFFECTS[name].parameters)
-        pairs = zip(neutral, effects[name], strict=True)
-        sample = measure(type(effects[name])(*(2.0 * n - value for n, value in pairs)), sample)
+        values = as_arrays(effects[name])
+        mirrored = (2.0 * n - value for n, value in zip(neutral, values, strict=True))
+        sample = measure(type(values)(*mirrored), sample)
     return sample
 
 
@@ -47,24 +53,41 @@ def apply_log_faults(effects: Mapping[str, Values], log: Mapping[str, Array]) ->
     log = dict(log)
     if _hooks(effects, "late"):
         log |= _delayed_poses(log, pose_delay(effects))
+    return log | _changed(log, partial(to_logged, effects)) if _hooks(effects, "measure") else log
+
+
+def true_log(log: FlightLog, effects: Mapping[str, Values]) -> FlightLog:
+    """Return `log` without the faults among `effects` but a delay, to first order.
+
+    A value that needs a missing signal (a position on a lever arm needs the attitude) is kept.
+    """
     if not _hooks(effects, "measure"):
         return log
+    logged = {name: value for name, value in vars(log).items() if value is not None}
+    true = {
+        name: np.where(np.isfinite(value), value, logged[name])
+        for name, value in _changed(logged, partial(to_true, effects)).items()
+    }
+    return replace(log, **true)
+
+
+def _changed(log: Mapping[str, Array], change: Callable[[Sample], Sample]) -> dict[str, Array]:
+    """Return those arrays of `log` that `change` changes, with their new values."""
     # Signals that the log lacks are zeros in the sample, and are left out of the result.
     zeros = 0.0 * log["time_s"][:, None] + log["time_s"].__array_namespace__().zeros(3)
     signals = {name: zeros if log.get(name) is None else log[name] for name in Sample._fields[2:]}
     pos_w, quat = log.get("pos_w", zeros), log.get("quat_wxyz")
     rot_w = zeros[:, None] if quat is None else quat_to_rot(quat)
-    true = Sample(pos_w, rot_w, **signals)
-    logged = to_logged(effects, true)
+    given = Sample(pos_w, rot_w, **signals)
     changed = {
         name: new
-        for name, new, old in zip(Sample._fields, logged, true, strict=True)
+        for name, new, old in zip(Sample._fields, change(given), given, strict=True)
         if new is not old and (name == "rot_w" or log.get(name) is not None)
     }
     if "rot_w" in changed:
-        logged_rot_w = changed.pop("rot_w")
-        changed |= {} if quat is None else {"quat_wxyz": rot_to_quat(logged_rot_w)}
-    return log | changed
+        new_rot_w = changed.pop("rot_w")
+        changed |= {} if quat is None else {"quat_wxyz": rot_to_quat(new_rot_w)}
+    return changed
 
 
 def time_shifted(time_s: Array, series: Array, offset: Array) -> Array:

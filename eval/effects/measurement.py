@@ -1,10 +1,18 @@
-"""Effects that are faults of the log: biased sensors, a tilted frame, clocks that differ."""
+"""Effects that are faults of the log: biased sensors, a lever arm, a tilted frame, clocks."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from eval.effects.interface import GRAVITY, Array, Effect, Parameter, tilted_e3
+from eval.effects.interface import (
+    GRAVITY,
+    Array,
+    Effect,
+    Parameter,
+    Sample,
+    tilted_e3,
+)
+from tracks.geometry.rotation import cross, to_world
 
 
 class GyroBias(NamedTuple):
@@ -47,6 +55,35 @@ ACCELEROMETER_BIAS = Effect(
     measure=lambda values, sample: sample._replace(acc_b=sample.acc_b + values.bias),
     of_log=True,
     needs=("acc_b",),
+)
+
+
+class LeverArm(NamedTuple):
+    """Values of `lever_arm`."""
+
+    offset: Array
+    """(..., 3) r: the point whose position is logged, from the centre of mass, body axes [m]."""
+
+
+def _on_lever_arm(values: LeverArm, sample: Sample) -> Sample:
+    """Return the sample with position and velocity of the point at the end of the lever arm."""
+    return sample._replace(
+        pos_w=sample.pos_w + to_world(sample.rot_w, values.offset),
+        vel_w=sample.vel_w + to_world(sample.rot_w, cross(sample.rate_b, values.offset)),
+    )
+
+
+LEVER_ARM = Effect(
+    name="lever_arm",
+    summary="Position and velocity are those of another point than the centre of mass",
+    equation="pos_w in the log = true + R r, vel_w in the log = true + R (w x r)",
+    source="rigid-body kinematics; Titterton and Weston 2004",
+    values=LeverArm,
+    parameters=(
+        Parameter("offset", "m", neutral=0.0, low=-0.5, high=0.5, typical=(0.01, 0.06), size=3),
+    ),
+    measure=_on_lever_arm,
+    of_log=True,
 )
 
 

@@ -57,6 +57,10 @@ def log_of_flight(
     state = flown.state[step, index]
     pose = state if offset_s == 0.0 else state_at(flown, index, time_s - offset_s)
     pos_w, vel_w, quat = pose[:, POS], pose[:, VEL], pose[:, QUAT]
+    if "lever_arm" in faults:
+        to_world, arm_b = Rotation.from_quat(quat, scalar_first=True), faults["lever_arm"].offset
+        pos_w = pos_w + to_world.apply(arm_b)
+        vel_w = vel_w + to_world.apply(np.cross(pose[:, RATE], arm_b))
     rate_b = state[:, RATE] + _bias(faults, "gyro_bias")
     acc_b = flown.acc_b[rows, index] + _bias(faults, "accelerometer_bias")
     speed, voltage = flown.speed[step, index], flown.voltage[rows, index]

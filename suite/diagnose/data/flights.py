@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from eval.effects.interface import GRAVITY
+from eval.effects.log_faults import true_log
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.mixer import mix
 from eval.quadrotor.plant import make_plant, nominal_quadrotor
@@ -87,7 +88,8 @@ def ready(
     """
     logs, notes = with_fewer_rows(logs, limits)
     rotors = [acting_rotors(log, vehicle, limits) for log in logs]
-    complete = [completed(log) for log in posed(logs)]
+    true_logs = [true_log(log, vehicle.effects) for log in logs]
+    complete = [completed(log) for log in posed(true_logs)]
     rows = [
         rows_of(on_every_row(log, limits), vehicle, one.speed, limits)
         for log, one in zip(complete, rotors, strict=True)

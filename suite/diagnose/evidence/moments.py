@@ -19,8 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from eval.effects.interface import Array, Sample
-from eval.effects.log_faults import to_true
+from eval.effects.interface import Array
 from eval.quadrotor.forces import wind_and_flow, wrench_on
 from eval.quadrotor.plant import Motion, Plant, accelerations, assemble
 from eval.quadrotor.rotors import steady
@@ -83,16 +82,15 @@ def accelerations_on(plant: Plant, rows: FlightRows, voltage: bool) -> tuple[Arr
     The first is in world axes [m/s^2], the second in body axes [rad/s^2]. `voltage` says whether
     the rows have a battery voltage. For numpy and JAX.
     """
-    motion, rotors = motion_of(plant, rows), steady(rows.rotor_speed)
+    motion, rotors = motion_of(rows), steady(rows.rotor_speed)
     voltage_drop = rows.voltage_drop if voltage else None
     _, flow = wind_and_flow(plant, {}, motion, rotors, rows.time_s, voltage_drop=voltage_drop)
     return accelerations(plant, motion, wrench_on(plant, rotors, flow))
 
 
-def motion_of(plant: Plant, rows: FlightRows) -> Motion:
-    """Return the motion (N, ...) on `rows`, without the faults of the log among plant.effects."""
-    logged = Sample(rows.pos_w, rows.rot_w, rows.vel_w, rows.rate_b, 0.0 * rows.rate_b)
-    return Motion(*to_true(plant.effects, logged)[:4])
+def motion_of(rows: FlightRows) -> Motion:
+    """Return the motion (N, ...) on `rows`."""
+    return Motion(rows.pos_w, rows.rot_w, rows.vel_w, rows.rate_b)
 
 
 class ViewData(NamedTuple):

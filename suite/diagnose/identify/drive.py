@@ -154,7 +154,7 @@ class DrivenVehicle:
                 commanded = after_delay_and_lag(flight.signals["torque_cmd_b"], numbers)
                 torque_b = np.nan_to_num(commanded)
                 wrench = Wrench(np.zeros_like(torque_b), torque_b)
-                _, turn_b = accelerations(plant, motion_of(plant, rows), wrench)
+                _, turn_b = accelerations(plant, motion_of(rows), wrench)
             return acc_w, turn_b
 
         return accelerations_of

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from eval.effects import all_values
+from eval.effects.log_faults import true_log
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.inertial import posed
@@ -92,7 +93,8 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
     """
     # Run the fits. With motor commands the loop comes last and may use the lag of the torque fit,
     # which is better than its own. Otherwise it comes first: the others use its lag.
-    flights = [grid_of(log) for log in posed(logs)]
+    true_logs = [true_log(log, vehicle.effects) for log in logs]
+    flights = [grid_of(log) for log in posed(true_logs)]
     drive = common_drive(flights)
     fits = _Fits(flights, with_merged_effects(vehicle, drive in KNOWN_MOTORS), drive, tuple(leave))
     if drive != "pwm":

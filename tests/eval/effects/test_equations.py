@@ -253,6 +253,17 @@ def test_sensor_biases():
     assert "acc_b" not in apply_log_faults(vehicle.effects, {"time_s": log["time_s"]})
 
 
+def test_lever_arm_logs_another_point():
+    # Heading along world y: body x is along world y, and body y along -x. It yaws by 2 rad/s.
+    log = small_log() | {"quat_wxyz": np.tile([0.5**0.5, 0.0, 0.0, 0.5**0.5], (5, 1))}
+    log["rate_b"] = np.tile([0.0, 0.0, 2.0], (5, 1))
+    faulty = apply_log_faults(with_effects(lever_arm=((0.1, 0.0, 0.05),)).effects, log)
+    near(faulty["pos_w"] - log["pos_w"], np.tile([0.0, 0.1, 0.05], (5, 1)))
+    near(faulty["vel_w"] - log["vel_w"], np.tile([-0.2, 0.0, 0.0], (5, 1)))
+    for name in ("quat_wxyz", "rate_b", "acc_b"):
+        assert faulty[name] is log[name]
+
+
 @pytest.mark.parametrize("xp", [np, jnp])
 def test_clock_offset_logs_an_older_pose(xp):
     log = {name: xp.asarray(values) for name, values in small_log().items()}

@@ -198,6 +198,21 @@ def test_biases_are_added_and_the_flight_is_the_same(flown):
     np.testing.assert_array_equal(off.pos_w, plain.pos_w)
 
 
+def test_a_lever_arm_logs_another_point_of_the_same_flight(flown):
+    arm_b = np.array([0.06, -0.03, 0.04])
+    plain, off = logged(flown), logged(flown, lever_arm=(arm_b,))
+    to_point_w = off.pos_w - plain.pos_w
+    np.testing.assert_allclose(
+        np.swapaxes(plain.rot_w, 1, 2) @ to_point_w[..., None],
+        np.broadcast_to(arm_b[:, None], (len(plain.time_s), 3, 1)),
+        atol=1e-12,
+    )
+    # The velocity of the point is the change of its position over time.
+    change = np.gradient(to_point_w, plain.time_s, axis=0)[1:-1]
+    np.testing.assert_allclose((off.vel_w - plain.vel_w)[1:-1], change, atol=2e-3)
+    np.testing.assert_array_equal(off.rate_b, plain.rate_b)
+
+
 @pytest.mark.parametrize("offset", [0.0173, -0.008])
 def test_a_clock_offset_logs_poses_of_another_moment_and_the_rest_of_now(flown, offset):
     plain, late = logged(flown), logged(flown, clock_offset=(offset,))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from eval.effects.log_faults import apply_log_faults, true_log
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import MotorMap
@@ -32,6 +33,27 @@ TWO_S, TEN_S = np.arange(0.0, 2.0, 0.01), np.arange(0.0, 10.0, 0.01)
 
 def form_of(time_s, width_s=0.2):
     return weak_form(time_s, np.ones(len(time_s), bool), width_s, 0.1)
+
+
+def test_views_and_identification_use_the_log_without_the_faults_of_the_vehicle_file():
+    (log,) = flights(1, 0, 6.0)
+    vehicle = with_effects(
+        VEHICLE, lever_arm=((0.05, -0.02, 0.04),), gyro_bias=((0.1, 0.0, -0.05),)
+    )
+    faulty = replace(log, **apply_log_faults(vehicle.effects, vars(log)))
+    assert np.nanstd(faulty.vel_w - log.vel_w) > 0.01
+    wanted, found = ready([log], VEHICLE), ready([faulty], vehicle)
+    for view in ("force", "torque"):
+        pairs = zip(wanted.smoothed[view][0].rows, found.smoothed[view][0].rows, strict=True)
+        for expected, series in pairs:
+            assert expected is series is None or np.allclose(series, expected, atol=1e-9)
+    numbers, others = (identify([one], v).numbers for one, v in ((log, VEHICLE), (faulty, vehicle)))
+    assert len(numbers) > 3
+    for number, other in zip(numbers, others, strict=True):
+        assert number.key == other.key and np.allclose(number.value, other.value, rtol=1e-6)
+    # Without an attitude a position on the lever arm is kept.
+    lost = replace(faulty, quat_wxyz=np.full_like(log.quat_wxyz, np.nan))
+    np.testing.assert_array_equal(true_log(lost, vehicle.effects).pos_w, faulty.pos_w)
 
 
 def test_a_bump_has_the_mean_acceleration_and_reaches_across_no_hole_or_bad_row():
