@@ -74,6 +74,7 @@ _BUILT_IN = (
     weak_motor.WEAK_MOTOR,
     thrust.THRUST_TILT,
     measurement.LEVER_ARM,
+    measurement.ATTITUDE_OFFSET,
     measurement.GYRO_BIAS,
     measurement.ACCELEROMETER_BIAS,
     measurement.FRAME_TILT,

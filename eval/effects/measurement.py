@@ -1,4 +1,4 @@
-"""Effects that are faults of the log: biased sensors, a lever arm, a tilted frame, clocks."""
+"""Effects that are faults of the log: biased sensors, offsets of the pose, clocks that differ."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from eval.effects.interface import (
     Sample,
     tilted_e3,
 )
-from tracks.geometry.rotation import cross, to_world
+from tracks.geometry.rotation import cross, exp_rot, to_world
 
 
 class GyroBias(NamedTuple):
@@ -83,6 +83,27 @@ LEVER_ARM = Effect(
         Parameter("offset", "m", neutral=0.0, low=-0.5, high=0.5, typical=(0.01, 0.06), size=3),
     ),
     measure=_on_lever_arm,
+    of_log=True,
+)
+
+
+class AttitudeOffset(NamedTuple):
+    """Values of `attitude_offset`."""
+
+    angle: Array
+    """(..., 3) rotation vector of the logged body axes from those of the gyro [rad]."""
+
+
+ATTITUDE_OFFSET = Effect(
+    name="attitude_offset",
+    summary="The logged attitude has other body axes than gyro and rotors",
+    equation="R in the log = true R exp([angle]x)",
+    source="rigid-body kinematics; Titterton and Weston 2004",
+    values=AttitudeOffset,
+    parameters=(
+        Parameter("angle", "rad", neutral=0.0, low=-0.5, high=0.5, typical=(0.02, 0.1), size=3),
+    ),
+    measure=lambda values, sample: sample._replace(rot_w=sample.rot_w @ exp_rot(values.angle)),
     of_log=True,
 )
 

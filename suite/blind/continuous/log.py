@@ -61,6 +61,8 @@ def log_of_flight(
         to_world, arm_b = Rotation.from_quat(quat, scalar_first=True), faults["lever_arm"].offset
         pos_w = pos_w + to_world.apply(arm_b)
         vel_w = vel_w + to_world.apply(np.cross(pose[:, RATE], arm_b))
+    if "attitude_offset" in faults:
+        quat = rotate_attitude(quat, np.tile(faults["attitude_offset"].angle, (len(rows), 1)))
     rate_b = state[:, RATE] + _bias(faults, "gyro_bias")
     acc_b = flown.acc_b[rows, index] + _bias(faults, "accelerometer_bias")
     speed, voltage = flown.speed[step, index], flown.voltage[rows, index]

@@ -21,7 +21,7 @@ CONSTANTS = (
     "rate_gain", "weak_motor", "thrust_tilt", "frame_tilt",
 )  # fmt: skip
 """Effects that change a constant of the vehicle or its environment."""
-LOG_FAULTS = ("lever_arm", "gyro_bias", "accelerometer_bias", "clock_offset")
+LOG_FAULTS = ("lever_arm", "attitude_offset", "gyro_bias", "accelerometer_bias", "clock_offset")
 """Effects that change only the log."""
 
 

@@ -13,6 +13,7 @@ from eval.quadrotor.plant import Command, Motion, accelerations, make_plant, use
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from tests.support.flights import small_log
 from tests.support.vehicles import PLAIN, at_rest, with_effects
+from tracks.geometry.rotation import quat_to_rot
 
 # All four rotors at 1000 rad/s push 1.6 N each; their torques about z cancel.
 SPEED = np.full(4, 1000.0)
@@ -261,6 +262,15 @@ def test_lever_arm_logs_another_point():
     near(faulty["pos_w"] - log["pos_w"], np.tile([0.0, 0.1, 0.05], (5, 1)))
     near(faulty["vel_w"] - log["vel_w"], np.tile([-0.2, 0.0, 0.0], (5, 1)))
     for name in ("quat_wxyz", "rate_b", "acc_b"):
+        assert faulty[name] is log[name]
+
+
+def test_attitude_offset_logs_other_body_axes():
+    # The tracker's x axis points to the left of the vehicle's.
+    log, quarter = small_log(), (0.0, 0.0, 0.5 * np.pi)
+    faulty = apply_log_faults(with_effects(attitude_offset=(quarter,)).effects, log)
+    near(quat_to_rot(faulty["quat_wxyz"])[0], [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    for name in ("pos_w", "vel_w", "rate_b", "acc_b"):
         assert faulty[name] is log[name]
 
 

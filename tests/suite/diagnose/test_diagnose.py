@@ -196,6 +196,7 @@ HIDDEN = {
     "weak_motor": ((1.0, 0.94, 1.0, 1.0),),
     "thrust_tilt": ((0.01, -0.008),),
     "lever_arm": ((0.02, -0.01, 0.015),),
+    "attitude_offset": ((0.02, -0.03, 0.05),),
     "gyro_bias": ((0.02, -0.01, 0.015),),
     "accelerometer_bias": ((0.15, -0.1, 0.1),),
     "frame_tilt": ((0.01, 0.008),),

@@ -213,6 +213,14 @@ def test_a_lever_arm_logs_another_point_of_the_same_flight(flown):
     np.testing.assert_array_equal(off.rate_b, plain.rate_b)
 
 
+def test_an_attitude_offset_turns_the_logged_axes_about_body_axes(flown):
+    plain, off = logged(flown), logged(flown, attitude_offset=((0.0, 0.0, 0.1),))
+    turn = np.swapaxes(plain.rot_w, 1, 2) @ off.rot_w
+    np.testing.assert_allclose(turn[:, 1, 0], np.sin(0.1), atol=1e-12)
+    np.testing.assert_allclose(turn[:, 2, 2], 1.0, atol=1e-12)
+    np.testing.assert_array_equal(off.vel_w, plain.vel_w)
+
+
 @pytest.mark.parametrize("offset", [0.0173, -0.008])
 def test_a_clock_offset_logs_poses_of_another_moment_and_the_rest_of_now(flown, offset):
     plain, late = logged(flown), logged(flown, clock_offset=(offset,))
