@@ -44,6 +44,16 @@ USE = (
     "Use the corrected vehicle: give the new vehicle.toml, in --out, to suite eval, train and loop "
     "(--vehicle)."
 )
+USE_FOR_LOGS = (
+    "Give the new vehicle.toml, in --out, to suite diagnose and identify (--vehicle) with these "
+    "logs: they then allow for this error. The vehicle is right as far as these flights show."
+)
+HEADINGS = {
+    False: {False: "Wrong or missing in the vehicle file:", True: "Wrong in the logs:"},
+    True: {False: "Changed in the vehicle:", True: "Changed in the logs:"},
+}
+"""Headings of named effects, by whether a change was searched for, and whether they are of the
+log."""
 UNTESTED = "Whether the file itself is right was not tested: for that, leave out --reference."
 CHECK = "Run suite check on these logs: a wrong unit, sign, order or clock resembles physics."
 
@@ -88,14 +98,16 @@ def figure(value: float) -> str:
 def answer(result: Mapping[str, Any]) -> str:
     """Return the named effects, their sizes, the verdict, and the errors that it excludes."""
     verdict, is_change = result["verdict"], bool(result["reference"])
-    effects = [_effect_words(effect) for effect in result["effects"]]
-    heading = "Changed in the vehicle:" if is_change else "Wrong or missing in the vehicle file:"
+    words = list[str]()
+    for in_log, heading in HEADINGS[is_change].items():
+        effects = [one for one in result["effects"] if is_of_log(one) == in_log]
+        words += [heading, *map(_effect_words, effects)] if effects else []
     sentence, rest = (CHANGES if is_change else VERDICTS)[verdict], remaining_words(result)
     sentence = ONLY_VIEWS if _is_far(result) else sentence
     if rest and (verdict == "named" or (verdict == "no_gap" and not is_change)):
         agreed = sentence.removesuffix(".").removesuffix(" within the measurement noise")
         sentence = f"{agreed}, except for {rest}."
-    words = [heading, *effects, sentence] if effects else [sentence]
+    words.append(sentence)
     for is_large, reason in NEGLIGIBLE.items() if verdict == "no_gap" else ():
         names = [one["name"] for one in result["negligible"] if one["relevant"] == is_large]
         words += [f"{reason}: {', '.join(names)}."] * bool(names)
@@ -111,6 +123,11 @@ def remaining_words(result: Mapping[str, Any]) -> str:
     """Return words for the errors that remain clearly above the noise floor; empty without any."""
     reasons = [entry["reason"] for entry in result["unexplained"]["above_noise"]]
     return " and ".join(f"an error {reason}" for reason in dict.fromkeys(reasons))
+
+
+def is_of_log(effect: Mapping[str, Any]) -> bool:
+    """Return whether a named effect is an error of the logs, not of the vehicle file."""
+    return effect["name"] in EFFECTS and EFFECTS[effect["name"]].of_log
 
 
 def _effect_words(effect: Mapping[str, Any]) -> str:
@@ -153,7 +170,8 @@ def next_steps(result: Mapping[str, Any]) -> list[str]:
             *search_for,
             "Otherwise add an effect to the catalogue, or fit a correction with suite delta.",
         ]
-    steps = [f"{USE} It is your file with this change. {UNTESTED}" if is_change else USE]
+    use = USE_FOR_LOGS if all(map(is_of_log, result["effects"])) else USE
+    steps = [f"{use} It is your file with this change. {UNTESTED}" if is_change else use]
     for effect in result["effects"]:
         if effect["alternatives"]:
             names = ", ".join([effect["name"], *effect["alternatives"]])
@@ -165,7 +183,7 @@ def next_steps(result: Mapping[str, Any]) -> list[str]:
                 "flights."
             )
     if verdict == "named":
-        last = "Or remove the cause on the vehicle, fly again and repeat this: expect no_gap."
+        last = "Or remove the cause, fly again and repeat this: expect no_gap."
         return [*steps, last]
     steps[0] += " Its values are approximate; on held-out flights it is closer than your file."
     return [*steps, CHECK, *search_for]

@@ -217,6 +217,9 @@ def test_an_answer_has_the_effect_its_values_and_its_size_or_what_is_too_small()
         "0.8 m/s² and 0.4 m after one second (RMS). This explains the gap between simulation and "
         "flights."
     )
+    arm = {"name": "lever_arm", "alternatives": [], "parameters": {}, "size": None}
+    both = summary.answer(entries("named", [arm, DRAG]))
+    assert both.index("in the vehicle file: Drag") < both.index(". Wrong in the logs: Position")
     by_force = {**DRAG, "size": {**DRAG["size"], "drift": None}}
     partly = summary.answer(entries("partly", [by_force]))
     assert "causes 0.8 m/s² (RMS). This explains a part" in partly
@@ -292,6 +295,13 @@ def test_flights_that_no_rollout_comes_near_do_not_agree():
     assert found["verdict"] == "no_gap" and FAR in found["warnings"]
     assert "stay far from the measured ones" in found["headline"]
     assert "as it is" not in " ".join(summary.next_steps(found))
+
+
+def test_errors_of_the_logs_alone_send_nobody_to_the_trainer():
+    arm = {**DRAG, "name": "lever_arm", "alternatives": []}
+    (first, last) = summary.next_steps(entries("named", [arm]))
+    assert "diagnose and identify" in first and "train" not in first and "no_gap" in last
+    assert "eval, train" in summary.next_steps(entries("named", [arm, DRAG]))[0]
 
 
 @pytest.mark.parametrize("verdict", ["no_gap", "named", "partly"])
