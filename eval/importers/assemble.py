@@ -14,6 +14,7 @@ import numpy as np
 from eval.importers.cleaning import (
     airborne,
     check_delay,
+    check_evenness,
     clean,
     without_far,
     without_lost,
@@ -26,7 +27,8 @@ from eval.importers.rows import GAP_S, GAP_STEPS, row_times, rows_at, sampled_ro
 from eval.importers.signals import NEEDED, Recording, Signal, median_step, with_readings
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
 from eval.logs.faults.check import DRIVE, POSE, CheckContext, run_checks
-from eval.logs.faults.clock import CUT, OF_POSE, PAUSE_S, check_time
+from eval.logs.faults.clocks.delay import OF_POSE
+from eval.logs.faults.clocks.stamps import CUT, PAUSE_S, check_time
 from eval.logs.faults.finding import Finding, finding_lines
 from eval.logs.faults.position import check_jumps
 from eval.logs.faults.reading import BY_ATTITUDE, MOTORS, read_rows
@@ -116,6 +118,8 @@ def assemble(
             findings.append(Finding("note", "file", text))
     findings += _unused_options(recording.signals, format, options)
     _require_signals(recording, options.partial, findings)
+    recording, more_findings = check_evenness(recording, options.fix)
+    findings += more_findings
     if options.fix:
         recording, more_findings = without_lost(recording)
         findings += more_findings

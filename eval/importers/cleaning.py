@@ -12,9 +12,11 @@ from dataclasses import replace
 import numpy as np
 
 from eval.importers.frames import rates_between
+from eval.importers.mapping import KEPT
 from eval.importers.rows import continuous
 from eval.importers.signals import MAD_TO_SD, Recording, Signal, median_step
-from eval.logs.faults.clock import LATE_S, LEAST_S, OF_POSE, SURE, delay_of
+from eval.logs.faults.clocks.delay import LATE_S, LEAST_S, OF_POSE, SURE, delay_of
+from eval.logs.faults.clocks.stamps import MEASURED, even_stamps, finding_of, measured_in
 from eval.logs.faults.drive.commands import has_both_signs
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.position import MEDIAN_SAMPLES, jumps_of
@@ -74,6 +76,25 @@ def _keep(
     for name in names:
         if name in signals and np.array_equal(signals[name].time_s, like.time_s):
             signals[name] = _select(signals[name], good)
+
+
+def check_evenness(recording: Recording, fix: bool) -> tuple[Recording, list[Finding]]:
+    """Return the recording with jittery stamps spaced evenly, and the findings.
+
+    Without `fix` the jitter is only reported.
+    """
+    signals, findings = dict(recording.signals), []
+    for name, (time_s, _) in recording.signals.items():
+        together = [n for n, s in signals.items() if np.array_equal(s.time_s, time_s)]
+        values = {n: signals[n].value for n in together}
+        even_s = even_stamps(time_s, measured_in(values)) if name in MEASURED else None
+        if even_s is None:
+            continue
+        todo = "" if fix else "leave --no-fix out: the import spaces them evenly"
+        names = ", ".join(n for n in together if not n.startswith(KEPT))
+        findings.append(finding_of(time_s, even_s, names, todo))
+        signals |= {n: Signal(even_s, value) for n, value in values.items()}
+    return (replace(recording, signals=signals) if fix else recording), findings
 
 
 def without_repeats(recording: Recording) -> tuple[Recording, list[Finding]]:

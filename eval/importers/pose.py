@@ -19,7 +19,7 @@ from eval.importers.options import ImportOptions
 from eval.importers.rows import averaged, continuous, row_times, rows_at
 from eval.importers.signals import Recording, Signal, median_step, with_readings
 from eval.logs.columns import FlightLogError
-from eval.logs.faults.clock import OF_POSE
+from eval.logs.faults.clocks.delay import OF_POSE
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.pose import GOOD, TIMES_BETTER, fit_pose_readings
 from eval.logs.faults.reading import ANGLES, TIMES, read_as

@@ -39,6 +39,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "time_stamps": ("stamps are 0 or go back", "log again"),
     "clock_offset": ("pose or gyro is late", ROTATE),
     "clock_drift": ("the pose's clock runs faster or slower than the gyro's", ROTATE),
+    "clock_jitter": ("stamps of the arrival of messages jitter", "log the time of measurement"),
     "motor_order": ("motors are in another order", PULSE),
     "motor_spin": ("motors turn the other way round", PULSE),
     "motor_dead": ("a motor never turns", PULSE),

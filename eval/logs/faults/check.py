@@ -10,7 +10,8 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.logs.columns import GROUPS
 from eval.logs.faults.catalogue import FAULTS
-from eval.logs.faults.clock import check_clock, check_pause, check_time
+from eval.logs.faults.clocks.delay import check_clock
+from eval.logs.faults.clocks.stamps import check_pause, check_stamps, check_time, with_even_stamps
 from eval.logs.faults.drive.commands import (
     check_controller_rate,
     check_gyro_scale,
@@ -67,8 +68,8 @@ class CheckContext:
 
 
 Check = Callable[[Rows, CheckContext], list[Finding]]
-CLOCK: tuple[Check, ...] = (lambda rows, _: check_time(rows),)
-"""The unit of the time, which all other checks need."""
+CLOCK: tuple[Check, ...] = (lambda rows, _: check_time(rows), lambda rows, _: check_stamps(rows))
+"""Unit and evenness of the time, which all other checks need."""
 POSE: tuple[Check, ...] = (
     lambda rows, _: check_copy(rows),
     lambda rows, _: check_still(rows),
@@ -172,7 +173,7 @@ def _without_doubted(rows: dict[str, np.ndarray], finding: Finding) -> dict[str,
     if readings := readings_in(finding.fix):
         return read_rows(rows, readings)
     if signal == "time":
-        return rows
+        return with_even_stamps(rows) if finding.fault == "clock_jitter" else rows
     return {name: value for name, value in rows.items() if name != signal}
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import conjugate, rotate
-from eval.logs.faults.clock import CLEARLY, LATE_S, late_against
+from eval.logs.faults.clocks.delay import CLEARLY, LATE_S, late_against
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows, turns_of
 from eval.logs.faults.reading import axes_matrix, option, read_as

@@ -134,6 +134,13 @@ def _speed_up_pose_clock(signals: Signals, _: Vehicle) -> Signals:
     return {**signals, **stretched}
 
 
+def _jitter_stamps(signals: Signals, _: Vehicle) -> Signals:
+    """Stamp each row by the arrival of its message, up to 80 % of the time between rows late."""
+    time_s, rng = signals["time"], np.random.default_rng(0)
+    late_s = rng.uniform(0.0, 0.8, len(time_s)) * float(np.median(np.diff(time_s)))
+    return {**signals, "time": time_s + late_s}
+
+
 def _drop_barometer(signals: Signals, _: Vehicle) -> Signals:
     """Add two seconds on the ground; then the barometer falls by 1.6 m as the motors start."""
     step = float(np.median(np.diff(signals["time"])))
@@ -243,6 +250,9 @@ KINDS: dict[str, Kind] = {
     ),
     "pose's clock off by 0.5 %": Kind(
         ("clock_drift",), change=_speed_up_pose_clock, needs=("quat", "rate")
+    ),
+    "stamps of arrival, up to 80 % of a row late": Kind(
+        ("clock_jitter",), change=_jitter_stamps, needs=("pos", "quat", "rate")
     ),
     "rotor speeds in rpm": Kind(("motor_unit",), (f"motor={RPM}",)),
     "electrical rotor speeds": Kind(("motor_unit",), ("motor=7",)),

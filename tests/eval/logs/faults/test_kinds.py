@@ -21,7 +21,7 @@ from eval.logs.faults.check import (
     run_checks,
     with_fixes,
 )
-from eval.logs.faults.clock import OF_POSE, check_clock, delay_of
+from eval.logs.faults.clocks.delay import OF_POSE, check_clock, delay_of
 from eval.logs.faults.drive import commands
 from eval.logs.faults.drive.commands import check_controller_rate
 from eval.logs.faults.drive.rate_following import delayed
@@ -47,7 +47,7 @@ OPEN = {
     "throttle is a share of the motors' speed", "motor map of another curve",
     "motor map of twice the thrust", "battery compensated twice", "mass on five links",
     "arms in mm", "speed_max in rpm", "inertia x 1000", "barometer falls on spin-up",
-    "field of view", "thrust -10 %",
+    "field of view", "thrust -10 %", "stamps of arrival, up to 80 % of a row late",
 }  # fmt: skip
 """Kinds that are reported and left to the reader; all others are corrected."""
 

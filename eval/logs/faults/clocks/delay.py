@@ -1,4 +1,4 @@
-"""Checks of clocks: the unit of time, and the delay and drift of the pose against the gyro.
+"""Check the clocks of pose and gyro: delay and drift of the pose, and a rotation of its axes.
 
 A constant rotation between their body axes is found with the delay, since each resembles the other.
 
@@ -18,16 +18,9 @@ from eval.effects.interface import GRAVITY
 from eval.importers.frames import rates_between, rotate
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import SPAN_S, WIDTH_S, Rows
-from eval.logs.faults.reading import TIMES, option
 from eval.logs.faults.relation import jackknife_error, smooth
 from eval.logs.velocity import velocity_from_position
 
-PAUSE_S = 5.0
-"""After a longer pause there may be another flight [s]."""
-CUT = "if another flight follows, cut it off with --end of suite import"
-"""What to do about a pause."""
-STEPS_S = (5e-5, 0.25)
-"""Possible time between rows of a log [s]."""
 REACH_S, STEP_S = 0.1, 0.002
 """Largest delay that is tried, in both directions, and the step between trials [s]."""
 BLOCKS = 8
@@ -124,40 +117,6 @@ class Late(NamedTuple):
             f"it gets later by {1e6 * self.drift:+.0f} ppm (± {1e6 * self.drift_error:.0f}), "
             f"{1e3 * self.drift * self.duration_s:+.1f} ms over the flight"
         )
-
-
-def check_time(rows: Rows, fastest: float | None = None) -> list[Finding]:
-    """Return a finding where the time between rows is impossible in seconds.
-
-    `time` (T,) is that of the slowest signal. `fastest` is the time between samples of the fastest,
-    in the same unit; None: of the rows.
-    """
-    step = float(np.median(np.diff(rows["time"])))
-    fastest, (low, high) = step if fastest is None else fastest, STEPS_S
-
-    def fitting(*steps: float) -> list[str]:
-        return [u for u, factor in TIMES.items() if all(low <= s * factor <= high for s in steps)]
-
-    # A signal may be slower than any row, so the fastest one decides where no unit fits both.
-    possible_units = fitting(step, fastest) or fitting(fastest)
-    if "s" in possible_units:
-        return []
-    figures = f"rows are {step:.3g} apart, which is no distance in s"
-    if len(possible_units) != 1:
-        return [Finding("doubt", "time", f"{figures}, ms, us or ns", "time_unit", step, 0.95)]
-    text = f"{figures}: time is in {possible_units[0]}"
-    return [Finding("corrected", "time", text, "time_unit", 1.0 / TIMES[possible_units[0]], 0.99,
-                    option(("time", possible_units[0])))]  # fmt: skip
-
-
-def check_pause(time_s: np.ndarray) -> list[Finding]:
-    """Return a note on the longest pause between the rows of a log at `time_s` (T,) [s]."""
-    steps = np.diff(time_s)
-    if np.max(steps, initial=0.0) <= PAUSE_S:
-        return []
-    k = int(np.argmax(steps))
-    text = f"none for {steps[k]:.3g} s after t = {time_s[k]:.2f} s: {CUT}"
-    return [Finding("note", "rows", text)]
 
 
 def check_clock(rows: Rows) -> list[Finding]:

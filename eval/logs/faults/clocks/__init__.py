@@ -1,0 +1,1 @@
+"""Checks of times: stamps, and the delay and drift between pose and gyro."""
