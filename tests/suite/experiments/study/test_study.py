@@ -107,7 +107,13 @@ def test_the_cache_is_named_by_what_other_packages_add(tmp_path, monkeypatch):
 def test_every_effect_that_touches_a_flight_is_flown_at_its_usual_size():
     conditions = effect_conditions(VEHICLE)
     flown = {condition.name for condition in conditions}
-    assert set(EFFECTS) - flown == {"gyro_bias", "accelerometer_bias", "clock_offset"}
+    assert set(EFFECTS) - flown == {
+        "lever_arm",
+        "attitude_offset",
+        "gyro_bias",
+        "accelerometer_bias",
+        "clock_offset",
+    }
     for condition in conditions:
         others, own = dict(condition.vehicle.effects), dict(VEHICLE.effects)
         assert others.pop(condition.name) != own.pop(condition.name, None), condition.name
