@@ -27,7 +27,7 @@ from eval.vehicles.vehicle import Vehicle
 from eval.worlds import Rows, rows_of
 from eval.worlds.collision import NEAR_STEPS, box_distances, near_solids
 from eval.worlds.engine import start_state
-from eval.worlds.slots import IDLE, GustDraws, Layout, empty_course, pad_gates
+from eval.worlds.slots import IDLE, GustDraws, Layout, insert_scenes
 from eval.worlds.trial import (
     DIVERGED,
     FLYING,
@@ -44,12 +44,12 @@ from eval.worlds.trial import (
 )
 from policies.observation import View, view_of
 from policies.spec import ActionSpec
-from tracks.common.masks import select
+from tracks.common.masks import select, take
 from tracks.formats.mujoco_scene import GROUND
 from tracks.geometry.camera import Camera, cast_rays_b, nearest
 from tracks.geometry.depth import depth_image
 from tracks.geometry.rotation import quat_to_rot, to_world
-from tracks.geometry.scene import Array, Scene, counts, pad, stack
+from tracks.geometry.scene import Array, Scene, counts
 from tracks.track import Track
 
 with contextlib.redirect_stdout(io.StringIO()):  # the import prints a list of missing packages
@@ -107,7 +107,7 @@ class MjxWorld:
         self._max_steps = 0
         self._has_noise = uses_noise(self._autopilot.plant)
         self._noise = [GustDraws(IDLE)] * slots
-        self._course = empty_course(slots, layout)
+        self._gate_count = np.ones(slots, np.int32)
         self._tracks: list[Track | None] = [None] * slots
         self._scene: Scene | None = None
         self._on_device: tuple[Course, Scene] | None = None
@@ -144,22 +144,16 @@ class MjxWorld:
         qpos = np.array(self._state.qpos)
         for slot, track, trial in entries:
             started[slot], self._tracks[slot] = True, track
-            gates = pad_gates(track.scene.gates, self._layout.gates, self._layout.corners)
-            scene = stack([track.scene._replace(gates=gates)], self._layout.solids)
-            if self._scene is None:
-                self._scene = jax.tree.map(lambda a: np.repeat(a, self.slots, axis=0), scene)
-            arrays = zip(jax.tree.leaves(self._scene), jax.tree.leaves(scene), strict=True)
-            for of_all_slots, of_slot in arrays:
-                of_all_slots[slot] = of_slot[0]
-            for field, value in zip(self._course.gates, gates, strict=True):
-                field[slot] = value
-            self._course.count[slot] = len(track.scene.gates.center_w)
+            self._gate_count[slot] = len(track.scene.gates.center_w)
             qpos[slot] = start_state(track)
             if noise is not None:
                 self._noise[slot] = GustDraws(trial)
                 noise[slot] = self._noise[slot].at(0, 1)[0]
+        scenes, slots = [track.scene for _, track, _ in entries], [slot for slot, _, _ in entries]
+        self._scene = insert_scenes(self._scene, scenes, slots, started, self._layout, np.float32)
+        course = Course(self._scene.gates, self._gate_count)
         # Copies, because on a CPU JAX may share memory with the arrays that it gets.
-        on_device = jax.tree.map(lambda a: jnp.array(a), (self._course, self._scene))
+        on_device = jax.tree.map(lambda a: jnp.array(a), (course, self._scene))
         self._on_device = on_device
         with jax.default_matmul_precision(PRECISION):
             self._state = self._start(
@@ -211,11 +205,8 @@ class MjxWorld:
 
     def collided_with(self, slot: int) -> str:
         """Return the name of the solid that the trial in `slot` collided with."""
-        track = self._tracks[slot]
+        track, scene = self._tracks[slot], take(self._scene, [slot])
         assert track is not None
-        gates = pad_gates(track.scene.gates, self._layout.gates, self._layout.corners)
-        scene = pad(track.scene._replace(gates=gates), self._layout.solids)
-        scene = jax.tree.map(lambda a: np.asarray(a[None], np.float32), scene)
         qpos, qvel = np.asarray(self._state.qpos)[[slot]], np.asarray(self._state.qvel)[[slot]]
         distance = _distances_at(scene, qpos, qvel, self._half_size, self._middle_b)
         return _solid_names(track, self._layout)[int(np.asarray(distance)[0].argmin())]

@@ -21,10 +21,11 @@ from eval.quadrotor.plant import MAX_DELAY, Motion, make_plant, uses_noise
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import Rows, rows_of
 from eval.worlds.engine import BODY, DepthCamera, compile_model, contact_name, start_state
-from eval.worlds.slots import IDLE, GustDraws, Layout, empty_course, pad_gates
+from eval.worlds.slots import IDLE, GustDraws, Layout, insert_scenes
 from eval.worlds.trial import (
     DIVERGED,
     FLYING,
+    Course,
     Progress,
     Rules,
     TrialSpec,
@@ -39,7 +40,7 @@ from policies.spec import ActionSpec
 from tracks.common.masks import make_contiguous, select, take
 from tracks.formats.mujoco_scene import MESH_GROUP
 from tracks.geometry.camera import Camera
-from tracks.geometry.scene import Scene, stack
+from tracks.geometry.scene import Scene
 from tracks.geometry.tiles import depth_images, make_tiles
 from tracks.track import Track
 
@@ -75,12 +76,15 @@ class SceneSlots(ABC):
         physics. The policy's action is by default an acceleration.
         """
         self.slots = slots
-        self._vehicles, self._layout, self._rules = [vehicle] * slots, layout, rules
+        self._vehicles, self._rules = [vehicle] * slots, rules
+        self._solids = layout.solids
+        # The scenes have no meshes, of which MuJoCo casts the rays.
+        self._layout = layout._replace(solids=layout.solids._replace(triangles=0))
         self._autopilot = make_autopilot(vehicle, action)
         self.dt = self._autopilot.dt
         self._depth_camera, self._tiles = DepthCamera(camera), make_tiles(camera)
         self._threads = threads
-        self._course = empty_course(slots, layout)
+        self._gate_count = np.ones(slots, np.int32)
         self._progress = start_progress(np.zeros((slots, 3)))
         self._progress = self._progress._replace(ended=np.full(slots, -1, np.int32))
         self._models: list[mujoco.MjModel] = []
@@ -116,21 +120,24 @@ class SceneSlots(ABC):
         if vehicles is not None:
             self._set_vehicles([slot for slot, _, _ in entries], vehicles)
         for slot, track, trial in entries:
-            model = compile_model(track, self._vehicles[slot], self.dt, self._layout.solids)
+            model = compile_model(track, self._vehicles[slot], self.dt, self._solids)
             if not self._models:
                 self._build(model)
             self._models[slot] = model
             if track.mesh_sizes:  # meshes do not move, so one computation suffices for all images
                 self._meshes[slot] = mujoco.MjData(model)
                 mujoco.mj_kinematics(model, self._meshes[slot])
-            self._course.count[slot] = len(track.scene.gates.center_w)
+            self._gate_count[slot] = len(track.scene.gates.center_w)
             if self._noise is not None:
                 self._noise[slot] = GustDraws(trial)
         ids = np.array([slot for slot, _, _ in entries], np.int32)
         started = np.zeros(self.slots, bool)
         started[ids] = True
-        self._scene = self._insert_scenes([track.scene for _, track, _ in entries], ids, started)
-        self._course = self._course._replace(gates=self._scene.gates)
+        scenes = [
+            track.scene._replace(triangles=track.scene.triangles[:0]) for _, track, _ in entries
+        ]
+        self._scene = insert_scenes(self._scene, scenes, ids, started, self._layout, np.float64)
+        self._course = Course(self._scene.gates, self._gate_count)
         self._batch.set_models(self._models)
         self._batch.reset(ids, stage=_NOTHING)
         for slot, track, _ in entries:
@@ -156,21 +163,6 @@ class SceneSlots(ABC):
             )
         plant = make_plant(self._vehicles[0], self.dt, values, MAX_DELAY)
         self._autopilot = replace(self._autopilot, plant=plant)
-
-    def _insert_scenes(self, scenes: list[Scene], ids: np.ndarray, started: np.ndarray) -> Scene:
-        """Return the scenes of all slots without meshes, with `scenes` in the slots `ids`."""
-        layout = self._layout
-        padded = [
-            scene._replace(
-                gates=pad_gates(scene.gates, layout.gates, layout.corners),
-                triangles=scene.triangles[:0],
-            )
-            for scene in scenes
-        ]
-        index_of_scene = np.zeros(self.slots, int)
-        index_of_scene[ids] = np.arange(len(ids))
-        new = take(stack(padded, layout.solids._replace(triangles=0), np.float64), index_of_scene)
-        return select(started, new, self._scene or new)
 
     def _motion(self) -> Motion:
         rot_w = self._xmat[:, BODY].reshape(self.slots, 3, 3).copy()

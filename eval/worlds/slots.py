@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import PurePath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.worlds.trial import Course, TrialSpec
+from eval.worlds.trial import TrialSpec
+from tracks.common.masks import select, take
 from tracks.families import MAX_COUNTS
-from tracks.geometry.scene import Counts, Gates, counts
+from tracks.geometry.scene import Counts, Gates, Scene, counts, stack
 from tracks.track import Track
 
 
@@ -55,17 +56,26 @@ def slot_groups(trials: Sequence[TrialSpec], tracks: Mapping[str, Track]) -> lis
     return list(groups.values())
 
 
-def empty_course(slots: int, layout: Layout) -> Course:
-    """Return the gates of empty slots, as arrays of the layout's size."""
-    shape = slots, layout.gates
-    gates = Gates(
-        np.zeros((*shape, 3)),
-        np.tile(np.eye(3), (*shape, 1, 1)),
-        np.zeros((*shape, layout.corners, 2)),
-        np.zeros(shape),
-        np.zeros(shape),
-    )
-    return Course(gates, np.ones(slots, np.int32))
+def insert_scenes(
+    before: Scene | None,
+    scenes: Sequence[Scene],
+    slots: Any,
+    started: np.ndarray,
+    layout: Layout,
+    dtype: Any,
+) -> Scene:
+    """Return the padded scenes of all N slots, with `scenes` in `slots`, which `started` (N,) bool.
+
+    The other slots keep their scene of `before`; at first (None) they get the first of `scenes`.
+    """
+    padded = [
+        scene._replace(gates=pad_gates(scene.gates, layout.gates, layout.corners))
+        for scene in scenes
+    ]
+    number = np.zeros(len(started), int)
+    number[slots] = np.arange(len(slots))
+    new = take(stack(padded, layout.solids, dtype), number)
+    return select(started, new, before or new)
 
 
 def pad_gates(gates: Gates, number: int, corners: int) -> Gates:
