@@ -214,12 +214,6 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
     yield from _Slots(task, policy, world).run(share)
 
 
-def _stepping(world: World) -> dict[str, Any]:
-    """Return the flight's metadata on the integrator of `world`; {} if it does not name one."""
-    integrator = getattr(world, "integrator", None)
-    return {} if integrator is None else {"integrator": integrator, "step_s": world.dt}
-
-
 class _Slots:
     """The slots of a simulator, with the trial and the policy's hidden state in each."""
 
@@ -257,6 +251,8 @@ class _Slots:
     def run(self, share: Sequence[Numbered]) -> Iterator[Ended]:
         """Fly the numbered trials; a slot takes the next one when its trial has ended."""
         waiting = list(reversed(share))
+        integrator = getattr(self._world, "integrator", None)
+        stepping = {"integrator": integrator, "step_s": self._world.dt} if integrator else {}
         while waiting or (self._index >= 0).any():
             self._fill(waiting)
             # A trial that ended at its start, as in a contact, makes no decision.
@@ -267,8 +263,7 @@ class _Slots:
                 result = self._result(int(slot))
                 flight = None
                 if self._recorder:
-                    about = result._asdict() | _stepping(self._world)
-                    flight = self._recorder.finish(int(slot), about)
+                    flight = self._recorder.finish(int(slot), result._asdict() | stepping)
                 self._index[slot] = -1
                 yield index, result, flight
 

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from eval.judging.judge import Record
 from eval.logs.flight import Flight
 from eval.worlds.trial import TrialResult, TrialSpec, track_of
-from suite.common.console import Console
 from suite.judging.content import policy_digest
 from suite.judging.evaluate import file_digests
 from suite.judging.flying import default_policy, fly_trials, load_in_manner, manners
@@ -147,11 +146,3 @@ def _refuse_changed(
                 "differ; restore the judged version, or run suite eval again with another --out, "
                 "then view that folder"
             )
-
-
-def record_first_trials(evaluation: Evaluation, path: Path, console: Console) -> None:
-    """Write a rerun recording of the first trial of every track and level to `path`."""
-    from eval.view.recording import write_recording
-
-    write_recording(path, *fly_again(evaluation, first_trials(evaluation)))
-    console.say(f"written: {path} (open it with: rerun {path})")
