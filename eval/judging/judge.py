@@ -2,8 +2,7 @@
 
 On one machine, a trial's outcome depends on (track, difficulty, seed) only, to the bit. So policies
 are always called with the same number of rows, every row is computed separately, and trials share
-no random numbers. Trials are flown in slots, places in the simulator for one trial at a time. A
-slot takes the next trial when its trial has ended.
+no random numbers. A slot of the simulator takes the next trial when its trial has ended.
 """
 
 from __future__ import annotations

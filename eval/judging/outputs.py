@@ -73,7 +73,7 @@ class Outputs:
         self._faults = np.zeros((slots, 3), int)
 
     def start(self, slot: int) -> None:
-        """Reset the statistics of `slot`, a place in the simulator, for a new trial."""
+        """Reset the statistics of `slot` for a new trial."""
         self._count[slot], self._largest[slot], self._up[slot] = 0, 0.0, 0.0
         self._faults[slot] = 0
 

@@ -1,8 +1,4 @@
-"""Record the flights of trials while the judge flies them.
-
-Trials are flown in slots, places in the simulator for one trial at a time. Each slot records its
-own flight.
-"""
+"""Record the flights of trials while the judge flies them; each slot records its own flight."""
 
 from __future__ import annotations
 

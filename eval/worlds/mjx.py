@@ -4,8 +4,7 @@ MuJoCo's JAX engine moves the free body. Its contacts are disabled: they take te
 all other computations, and a trial ends at the first contact anyway. Collisions are found by signed
 distances instead, and depth images by analytic ray casting. The steps between two decisions of the
 policy are one compiled function. States are float32, so a flight departs slowly from the same
-flight in `mujoco`. A trial's outcome does not depend on the other trials. A slot is a place in the
-simulator for one trial at a time.
+flight in `mujoco`. A trial's outcome does not depend on the other trials.
 """
 
 from __future__ import annotations
@@ -20,20 +19,19 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from eval.quadrotor.autopilot import AutopilotState, autopilot_step, make_autopilot, start_autopilot
+from eval.quadrotor.autopilot import AutopilotState, autopilot_step, start_autopilot
 from eval.quadrotor.model import compile_quadrotor
-from eval.quadrotor.plant import Motion, uses_noise
+from eval.quadrotor.plant import Motion
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import Rows, rows_of
 from eval.worlds.collision import NEAR_STEPS, box_distances, near_solids
 from eval.worlds.engine import start_state
-from eval.worlds.slots import IDLE, GustDraws, Layout, insert_scenes
+from eval.worlds.slots import Layout, Slots
 from eval.worlds.trial import (
     DIVERGED,
     FLYING,
     Course,
     Progress,
-    Rules,
     TrialSpec,
     has_diverged,
     is_wrench,
@@ -43,7 +41,6 @@ from eval.worlds.trial import (
     start_progress,
 )
 from policies.observation import View, view_of
-from policies.spec import ActionSpec
 from tracks.common.masks import select, take
 from tracks.formats.mujoco_scene import GROUND
 from tracks.geometry.camera import Camera, cast_rays_b, nearest
@@ -75,29 +72,17 @@ class SlotStates(NamedTuple):
     """Progress of the trials."""
 
 
-class MjxWorld:
+class MjxWorld(Slots):
     """A world that simulates all slots in one compiled JAX program, for GPUs."""
 
     name = "mjx"
     integrator = "euler"
     compiles = True
-    actions = ("ctbr", "motors")
+    dtype = np.float32
 
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        camera: Camera,
-        layout: Layout,
-        rules: Rules,
-        slots: int,
-        threads: int = 1,
-        action: ActionSpec | None = None,
-    ) -> None:
+    def __init__(self, vehicle: Vehicle, camera: Camera, *arguments: Any, **settings: Any) -> None:
         """Make the world; the arguments are those of `MujocoWorld`, but `threads` has no effect."""
-        self.slots = slots
-        self._layout, self._rules, self._camera = layout, rules, camera
-        self._autopilot = make_autopilot(vehicle, action)
-        self.dt = self._autopilot.dt
+        super().__init__(vehicle, camera, *arguments, **settings)
         free = mujoco.MjSpec()
         free.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         self._model = mjx.put_model(compile_quadrotor(free, vehicle, self.dt))
@@ -105,11 +90,7 @@ class MjxWorld:
         self._middle_b = -np.asarray(self._autopilot.plant.constants.com_offset_b)
         self._rays_b = jnp.asarray(cast_rays_b(camera), jnp.float32)
         self._max_steps = 0
-        self._has_noise = uses_noise(self._autopilot.plant)
-        self._noise = [GustDraws(IDLE)] * slots
-        self._gate_count = np.ones(slots, np.int32)
-        self._tracks: list[Track | None] = [None] * slots
-        self._scene: Scene | None = None
+        self._tracks: list[Track | None] = [None] * self.slots
         self._on_device: tuple[Course, Scene] | None = None
         self._state = self._idle()
 
@@ -121,16 +102,13 @@ class MjxWorld:
         progress = start_progress(motion.pos_w)
         progress = progress._replace(ended=jnp.full(self.slots, -1, jnp.int32))
         qpos = jnp.tile(jnp.asarray([0.0, 0, 0, 1, 0, 0, 0]), (self.slots, 1))
-        loops = start_autopilot(self._autopilot, motion, self._no_draws())
+        loops = start_autopilot(self._autopilot, motion, self._draws_at(np.zeros(self.slots, int)))
         return SlotStates(qpos, jnp.zeros((self.slots, 6)), loops, progress)
 
     @property
     def progress(self) -> Progress:
         """Progress of the trial in each slot."""
         return jax.tree.map(np.asarray, self._state.progress)
-
-    def _no_draws(self) -> np.ndarray | None:
-        return np.zeros((self.slots, 3), np.float32) if self._has_noise else None
 
     def load(self, entries: list[tuple[int, Track, TrialSpec]]) -> None:
         """Start trials from (slot, track, trial).
@@ -140,20 +118,12 @@ class MjxWorld:
         """
         for _, track, _ in entries:
             _check_near(track)
-        started, noise = np.zeros(self.slots, bool), self._no_draws()
-        qpos = np.array(self._state.qpos)
-        for slot, track, trial in entries:
-            started[slot], self._tracks[slot] = True, track
-            self._gate_count[slot] = len(track.scene.gates.center_w)
-            qpos[slot] = start_state(track)
-            if noise is not None:
-                self._noise[slot] = GustDraws(trial)
-                noise[slot] = self._noise[slot].at(0, 1)[0]
-        scenes, slots = [track.scene for _, track, _ in entries], [slot for slot, _, _ in entries]
-        self._scene = insert_scenes(self._scene, scenes, slots, started, self._layout, np.float32)
-        course = Course(self._scene.gates, self._gate_count)
+        started, qpos = self._insert(entries, meshes=True), np.array(self._state.qpos)
+        for slot, track, _ in entries:
+            self._tracks[slot], qpos[slot] = track, start_state(track)
+        noise = self._draws_at(np.where(started, 0, np.asarray(self._state.progress.step) + 1))
         # Copies, because on a CPU JAX may share memory with the arrays that it gets.
-        on_device = jax.tree.map(lambda a: jnp.array(a), (course, self._scene))
+        on_device = jax.tree.map(lambda a: jnp.array(a), (self._course, self._scene))
         self._on_device = on_device
         with jax.default_matmul_precision(PRECISION):
             self._state = self._start(
@@ -239,12 +209,7 @@ class MjxWorld:
         # Periods between decisions differ by one step. With the longest period for all calls, the
         # program is compiled only once.
         self._max_steps = max_steps = max(self._max_steps, int(steps.max(initial=0)))
-        noise = None
-        if self._has_noise:
-            first = np.asarray(self._state.progress.step) + 1
-            pairs = zip(first.tolist(), self._noise, strict=True)
-            noise = np.stack([draws.at(step, max_steps) for step, draws in pairs], axis=1)
-            noise = noise.astype(np.float32)
+        noise = self._draws(np.asarray(self._state.progress.step) + 1, max_steps)
         with jax.default_matmul_precision(PRECISION):
             self._state, rows = self._fly(
                 self._state, jnp.asarray(action_b, jnp.float32), jnp.asarray(steps), noise,

@@ -1,8 +1,7 @@
 """Fly over the link in real time: many trials with a simulated vehicle, or one with a real vehicle.
 
-A trial is one flight on a track that a seed determines. The companion (`companion.py`) runs the
-policy and its checks. This module exchanges its datagrams with the vehicle, writes its logs and
-computes statistics of its delays.
+The companion (`companion.py`) runs the policy and its checks. This module exchanges its datagrams
+with the vehicle, writes its logs and computes statistics of its delays.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Run a simulated vehicle in a separate process, which flies in real time at its end of the link.
-
-The link connects the vehicle with the companion, which runs the policy.
-"""
+"""Run a simulated vehicle in another process, which flies in real time at its end of the link."""
 
 from __future__ import annotations
 
