@@ -25,7 +25,8 @@ from policies.policy import Policy
 from suite.common.console import Console
 from suite.judging.link.companion import FINISHED, Companion, Row
 from suite.judging.link.messages import Wire
-from suite.judging.link.server import COMPANION, VEHICLE, WAIT_S, FlightRequest, VehicleProcess
+from suite.judging.link.server import COMPANION, VEHICLE, WAIT_S, VehicleProcess
+from suite.judging.link.simulated import FlightRequest
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
 from suite.judging.trials import TrialSet, log_name
@@ -94,7 +95,7 @@ def _fly_trial(
         camera, rate_hz = policy.spec.camera, policy.spec.rate_hz
         vehicle.start(
             FlightRequest(
-                track, trial, trial_set.vehicle, rules, camera, rate_hz, address, policy.name
+                track, trial, trial_set.vehicle, rules, camera, rate_hz, policy.name, address
             )
         )
         # Fly until the trial ends or the companion hands over.
