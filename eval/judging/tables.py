@@ -1,7 +1,4 @@
-"""Compute the numbers of summary.json, and print them as tables.
-
-A cell is the set of trials of one policy on one track family at one level.
-"""
+"""Compute the numbers of summary.json, and print them as tables."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Write a video of a trial, a flight along a track, from behind the drone.
+"""Write a video of a trial from behind the drone, next to the policy's depth image.
 
-The policy's depth image is next to the view. `scene3d.py` draws the frames and `video_file.py`
-encodes them, so neither a display nor a GPU is needed.
+`scene3d.py` draws the frames and `video_file.py` encodes them, so neither a display nor a GPU is
+needed.
 """
 
 from __future__ import annotations

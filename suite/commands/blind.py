@@ -1,7 +1,6 @@
 """The command `suite blind`: make test cases with hidden effects, diagnose them, score the answers.
 
-An effect is one physical cause of a mismatch, such as drag. The true effects of the cases (the
-answers) are in a folder that the diagnosis does not read.
+The true effects of the cases (the answers) are in a folder that the diagnosis does not read.
 """
 
 from __future__ import annotations

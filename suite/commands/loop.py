@@ -1,8 +1,7 @@
 """The command `suite loop`: correct a simulation from flights, and fine-tune a policy in it.
 
 The stages are: train a policy; fly it; record flights; fit a Delta Action Model to them, or name
-the hidden effect; fine-tune the policy; fly again. A Delta Action Model is a network that corrects
-actions so that simulated flights match measured ones.
+the hidden effect; fine-tune the policy; fly again.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Judge policies (`suite eval`): fly the trials in a simulator and write tables of the results.
 
-A trial is one judged flight: a track, its level (difficulty 0 to 9) and a seed. The result of each
-trial is written to a journal when it ends, so an interrupted evaluation continues. An entry is a
-policy in one manner (commanded speed, with or without safety monitor); each has a journal.
+The result of each trial is written to a journal when it ends, so an interrupted evaluation
+continues. An entry is a policy in one manner (commanded speed, with or without safety monitor);
+each has a journal.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Fly trials of an earlier evaluation again, to show them as a recording or video (`suite view`).
 
-A trial is one judged flight. A repetition of it gives the same flight to the bit, so an evaluation
-stores no flights. To show a trial, it is flown again with the same policy, vehicle, sensors and
-track; their SHA-256 must be the same.
+A repetition of a trial gives the same flight to the bit, so an evaluation stores no flights. The
+SHA-256 of policy, vehicle, sensors and track must be the same.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """The trials that a command flies: tracks and levels by name, with vehicle and sensors.
 
-A trial is one judged flight; its track, level (difficulty 0 to 9) and seed determine it. A track is
-a family, which draws it from the seed, or a file. `read_trial_set` reads all that the options of
-`suite eval`, `suite collect` and `suite fly` name.
+`read_trial_set` reads all that the options of `suite eval`, `suite collect` and `suite fly` name.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""The settings of a loop, computed from a recipe (named settings of a training) and the options.
+"""The settings of a loop, computed from a recipe and the options.
 
-The true vehicle produces the flights. In a loop with a hidden vehicle it differs from the vehicle
-file of the simulation; else it is the same.
+The true vehicle produces the flights; without a hidden vehicle it is that of the simulation.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Export a policy to other formats (`suite export`).
 
 An export in C is compiled, and its actions are compared with those of the original policy (parity).
-A card, a Markdown page next to the export, has the largest difference and the time per step.
+Its card has the largest difference and the time per step.
 """
 
 from __future__ import annotations

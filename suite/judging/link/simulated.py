@@ -2,7 +2,7 @@
 
 It sends its state and depth images over MAVLink, and flies the received set points (body rates and
 thrust). Before the first set point it stays at the trial's start. If set points stop, it brakes and
-hovers. The physics are those of the judge, which flies policies in MuJoCo and scores them.
+hovers. The physics are those of the judge.
 """
 
 from __future__ import annotations
