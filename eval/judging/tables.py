@@ -81,9 +81,9 @@ def summarise(results: Sequence[TrialResult]) -> dict[str, Any]:
         groups.setdefault((result.policy, result.track, result.difficulty), []).append(result)
     cells = [_cell(*key, rows) for key, rows in groups.items()]
     paired = []
-    for (policy, *cell), rows in groups.items():
+    for (policy, track, level), rows in groups.items():
         first = results[0].policy
-        others = {other.trial: other for other in groups.get((first, *cell), [])}
+        others = {other.trial: other for other in groups.get((first, track, level), [])}
         pairs = [(row, others[row.trial]) for row in rows if row.trial in others]
         if policy != first and pairs:
             paired.append(_pairing(*zip(*pairs, strict=True)))
