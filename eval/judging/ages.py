@@ -3,8 +3,7 @@
 A view is the observable state with the depth image; its age is the delay after which the policy
 uses it. A view is taken at the physics step that precedes its decision by the age, and is stored
 until the decision. With jitter, each decision has its own random age from the trial's seed. At the
-start of a trial, before any view is old enough, the policy gets the first view. A slot is a place
-in the simulator, in which one trial (flight) is flown.
+start of a trial, before any view is old enough, the policy gets the first view.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Call a policy, and check and limit its actions before they are flown.
-
-The judge (which flies policies and scores them) and the environments use it.
-"""
+"""Call a policy, and check and limit its actions before the judge or an environment flies them."""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 
 On one machine, a trial's outcome depends on (track, difficulty, seed) only, to the bit. So policies
 are always called with the same number of rows, every row is computed separately, and trials share
-no random numbers. Trials are flown in slots, places in the simulator for one trial at a time. A
-slot takes the next trial when its trial has ended.
+no random numbers. A slot of the simulator takes the next trial when its trial has ended.
 """
 
 from __future__ import annotations
@@ -214,12 +213,6 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
     yield from _Slots(task, policy, world).run(share)
 
 
-def _stepping(world: World) -> dict[str, Any]:
-    """Return the flight's metadata on the integrator of `world`; {} if it does not name one."""
-    integrator = getattr(world, "integrator", None)
-    return {} if integrator is None else {"integrator": integrator, "step_s": world.dt}
-
-
 class _Slots:
     """The slots of a simulator, with the trial and the policy's hidden state in each."""
 
@@ -257,6 +250,8 @@ class _Slots:
     def run(self, share: Sequence[Numbered]) -> Iterator[Ended]:
         """Fly the numbered trials; a slot takes the next one when its trial has ended."""
         waiting = list(reversed(share))
+        integrator = getattr(self._world, "integrator", None)
+        stepping = {"integrator": integrator, "step_s": self._world.dt} if integrator else {}
         while waiting or (self._index >= 0).any():
             self._fill(waiting)
             # A trial that ended at its start, as in a contact, makes no decision.
@@ -267,8 +262,7 @@ class _Slots:
                 result = self._result(int(slot))
                 flight = None
                 if self._recorder:
-                    about = result._asdict() | _stepping(self._world)
-                    flight = self._recorder.finish(int(slot), about)
+                    flight = self._recorder.finish(int(slot), result._asdict() | stepping)
                 self._index[slot] = -1
                 yield index, result, flight
 

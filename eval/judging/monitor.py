@@ -9,8 +9,7 @@ action is flown. The judge and real-time flights (`suite fly`) use the same moni
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +17,6 @@ from eval.effects.interface import GRAVITY
 from policies.policy import Hidden, Policy, Wrapper
 from policies.spec import PolicyError, PolicySpec
 from tracks.geometry.camera import pixel_rays_b
-from tracks.input.ranges import Range
 
 SAMPLES = 24
 """Number of points of a predicted path, which are 13 cm apart at 5 m/s."""
@@ -31,24 +29,18 @@ LIFT_LEAST = 1.0
 [m/s^2]."""
 STOP_SPEED = 0.5
 """Speed below which the deceleration of the manoeuvre "stop" becomes weaker [m/s]."""
-
-
-@dataclass(frozen=True)
-class MonitorLimits:
-    """Limits and settings of the monitor."""
-
-    tilt_deg: Annotated[float, Range(1.0, 89.0)] = 75.0
-    """Largest tilt that an action may command [deg]."""
-    speed: Annotated[float, Range(0.1, 100.0)] = 12.0
-    """Speed above which an action may not accelerate further [m/s]."""
-    clearance_m: Annotated[float, Range(0.0, 10.0)] = 0.15
-    """Least allowed distance of a path from the points of the image [m]."""
-    way_out: Annotated[float, Range(0.1, 100.0)] = 12.0
-    """Acceleration of an evasive manoeuvre [m/s^2]."""
-    lag_s: Annotated[float, Range(0.0, 1.0)] = 0.1
-    """Time for which the last action still acts [s]."""
-    horizon_s: Annotated[float, Range(0.05, 5.0)] = 0.6
-    """Horizon of the prediction [s]."""
+TILT_DEG = 75.0
+"""Largest tilt that an action may command [deg]."""
+MOST_SPEED = 12.0
+"""Speed above which an action may not accelerate further [m/s]."""
+CLEARANCE_M = 0.15
+"""Least allowed distance of a path from the points of the image [m]."""
+WAY_OUT = 12.0
+"""Acceleration of an evasive manoeuvre [m/s^2]."""
+LAG_S = 0.1
+"""Time for which the last action still acts [s]."""
+HORIZON_S = 0.6
+"""Horizon of the prediction [s]."""
 
 
 class Seen(NamedTuple):
@@ -69,9 +61,6 @@ class Seen(NamedTuple):
 class Monitored(Wrapper):
     """A `Policy` that runs another policy and monitors its actions."""
 
-    limits = MonitorLimits()
-    """Limits of the monitor."""
-
     def __init__(self, policy: Policy) -> None:
         """Refuse kinds of action and image that the monitor does not support."""
         super().__init__(policy)
@@ -91,8 +80,8 @@ class Monitored(Wrapper):
         """Return the policy's actions (n, 3), limited or replaced where necessary."""
         action, hidden = super().act(hidden, state, image, fresh)
         seen = seen_of(self.spec, state, image)
-        action_b = limited(self.limits, np.asarray(action, float), seen)
-        action_b, replaced = last_moment(self.limits, action_b, seen, 1.0 / self.spec.rate_hz)
+        action_b = limited(np.asarray(action, float), seen)
+        action_b, replaced = last_moment(action_b, seen, 1.0 / self.spec.rate_hz)
         self.interventions += int(replaced.sum())
         return action_b.astype(np.float32), hidden
 
@@ -108,23 +97,23 @@ def seen_of(spec: PolicySpec, state: np.ndarray, image: np.ndarray) -> Seen:
     return Seen(vel_b, up_b, last_b, points_b, hit)
 
 
-def limited(limits: MonitorLimits, action_b: np.ndarray, seen: Seen) -> np.ndarray:
+def limited(action_b: np.ndarray, seen: Seen) -> np.ndarray:
     """Return actions (N, 3) [m/s^2] reduced to the limits of tilt and speed."""
     speed = np.linalg.norm(seen.vel_b, axis=-1, keepdims=True)
     ahead = seen.vel_b / np.maximum(speed, 1e-6)
     along = (action_b * ahead).sum(-1, keepdims=True)
-    action_b = np.where((speed > limits.speed) & (along > 0), action_b - along * ahead, action_b)
+    action_b = np.where((speed > MOST_SPEED) & (along > 0), action_b - along * ahead, action_b)
     # The specific force is along the thrust, so its direction is the tilt.
     force_b = action_b + GRAVITY * seen.up_b
     lift = (force_b * seen.up_b).sum(-1, keepdims=True)
     horizontal_b = force_b - lift * seen.up_b
-    largest_horizontal = np.tan(np.radians(limits.tilt_deg)) * np.maximum(lift, LIFT_LEAST)
+    largest_horizontal = np.tan(np.radians(TILT_DEG)) * np.maximum(lift, LIFT_LEAST)
     size = np.linalg.norm(horizontal_b, axis=-1, keepdims=True)
     horizontal_b *= np.minimum(1.0, largest_horizontal / np.maximum(size, 1e-6))
     return lift * seen.up_b + horizontal_b - GRAVITY * seen.up_b
 
 
-def ways_out(limits: MonitorLimits, seen: Seen) -> np.ndarray:
+def ways_out(seen: Seen) -> np.ndarray:
     """Return the actions (5, N, 3) [m/s^2]: stop, climb, left, right, and back with climb."""
     speed = np.linalg.norm(seen.vel_b, axis=-1, keepdims=True)
     back = -seen.vel_b / np.maximum(speed, STOP_SPEED)
@@ -132,33 +121,29 @@ def ways_out(limits: MonitorLimits, seen: Seen) -> np.ndarray:
     left /= np.maximum(np.linalg.norm(left, axis=-1, keepdims=True), 1e-6)
     back_and_up = back + seen.up_b
     back_and_up /= np.maximum(np.linalg.norm(back_and_up, axis=-1, keepdims=True), 1e-6)
-    return limits.way_out * np.stack([back, seen.up_b, left, -left, back_and_up])
+    return WAY_OUT * np.stack([back, seen.up_b, left, -left, back_and_up])
 
 
-def last_moment(
-    limits: MonitorLimits, action_b: np.ndarray, seen: Seen, period_s: float
-) -> tuple[np.ndarray, np.ndarray]:
+def last_moment(action_b: np.ndarray, seen: Seen, period_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the actions (N, 3) [m/s^2] to fly, and which of them are manoeuvres (N,).
 
     A manoeuvre replaces the policy's action if three conditions hold: the policy's path is
     blocked; every manoeuvre would be blocked if it began one decision later; and the best one that
     begins now has more clearance than all of these.
     """
-    times = np.linspace(FIRST_S, limits.horizon_s, SAMPLES)
-    policy_clearance = clearance(limits, seen, action_b, None, times, period_s)
+    times = np.linspace(FIRST_S, HORIZON_S, SAMPLES)
+    policy_clearance = clearance(seen, action_b, None, times, period_s)
     replaced = np.zeros(len(action_b), bool)
-    rows = np.flatnonzero(policy_clearance < limits.clearance_m)
+    rows = np.flatnonzero(policy_clearance < CLEARANCE_M)
     if not len(rows):
         return action_b, replaced
     seen_blocked, policy_b = Seen(*(x[rows] for x in seen)), action_b[rows]
-    ways = ways_out(limits, seen_blocked)
-    later = np.stack(
-        [clearance(limits, seen_blocked, policy_b, way, times, period_s) for way in ways]
-    )
-    now = np.stack([clearance(limits, seen_blocked, way, None, times, period_s) for way in ways])
+    ways = ways_out(seen_blocked)
+    later = np.stack([clearance(seen_blocked, policy_b, way, times, period_s) for way in ways])
+    now = np.stack([clearance(seen_blocked, way, None, times, period_s) for way in ways])
     best = now.argmax(0)
     columns = np.arange(len(rows))
-    blocked_later = (later < limits.clearance_m).all(0)
+    blocked_later = (later < CLEARANCE_M).all(0)
     is_better = now[best, columns] > np.maximum(policy_clearance[rows], later.max(0))
     chosen = blocked_later & is_better
     flown_b = action_b.copy()
@@ -168,7 +153,6 @@ def last_moment(
 
 
 def clearance(
-    limits: MonitorLimits,
     seen: Seen,
     first_b: np.ndarray,
     then_b: np.ndarray | None,
@@ -178,7 +162,6 @@ def clearance(
     """Return the least distance (N,) of a path from the points of the image [m].
 
     Args:
-        limits: its `lag_s` is used, for which the last action still acts.
         seen: observations of N rows.
         first_b: (N, 3) the action from now on [m/s^2].
         then_b: (N, 3) the action after one period [m/s^2]; None: `first_b` continues.
@@ -186,12 +169,12 @@ def clearance(
         period_s: time between decisions [s].
     """
     path = seen.vel_b[:, None] * times[:, None]
-    # The last action acts for `lag_s`, then the new one.
+    # The last action acts for `LAG_S`, then the new one.
     until_lag = _displacement(seen.last_b, times, 0.0)
-    path += until_lag - _displacement(seen.last_b, times, limits.lag_s)
-    path += _displacement(first_b, times, limits.lag_s)
+    path += until_lag - _displacement(seen.last_b, times, LAG_S)
+    path += _displacement(first_b, times, LAG_S)
     if then_b is not None:
-        path += _displacement(then_b - first_b, times, limits.lag_s + period_s)
+        path += _displacement(then_b - first_b, times, LAG_S + period_s)
     # Squared distances |path|^2 + |point|^2 - 2 path . point, (N, T, P).
     squared = (
         (path**2).sum(-1)[:, :, None]

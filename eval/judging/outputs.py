@@ -8,6 +8,7 @@ accelerates.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections.abc import Container, Sequence
 from typing import Any
@@ -72,7 +73,7 @@ class Outputs:
         self._faults = np.zeros((slots, 3), int)
 
     def start(self, slot: int) -> None:
-        """Reset the statistics of `slot`, a place in the simulator, for a new trial."""
+        """Reset the statistics of `slot` for a new trial."""
         self._count[slot], self._largest[slot], self._up[slot] = 0, 0.0, 0.0
         self._faults[slot] = 0
 
@@ -294,9 +295,8 @@ def _level_states(spec: PolicySpec, offset: np.ndarray) -> np.ndarray:
 def check_rows(policy: Policy) -> tuple[Note, ...]:
     """Refuse a policy object whose answer for a row depends on the other rows.
 
-    A row is the observation of one trial. A copy of the object is tested, if it can be copied, so
-    that the object itself stays as it is. An object that fails here, as it takes another number of
-    rows, is not tested.
+    A row is the observation of one trial. If possible a copy is tested, so that the object itself
+    stays as it is. An object that fails here, as it takes another number of rows, is not tested.
 
     Returns:
         A note if the same inputs give two answers: the policy is random or keeps memory.
@@ -304,7 +304,9 @@ def check_rows(policy: Policy) -> tuple[Note, ...]:
     Raises:
         ValueError: naming the largest change of an answer.
     """
-    tested = _copy(policy)
+    tested = policy
+    with contextlib.suppress(Exception):  # an object that cannot be copied is tested itself
+        tested = copy.deepcopy(policy)
     try:
         first, again, other = (_two_answers(tested, ROWS, seed) for seed in (0, 0, 1))
         alone = _two_answers(tested, 1, 0)
@@ -341,14 +343,6 @@ def _two_answers(policy: Policy, count: int, seed: int) -> np.ndarray:
         action, hidden = checked_act(policy, hidden, state.copy(), image.copy(), flags)
         actions.append(np.asarray(action))
     return np.stack(actions)
-
-
-def _copy(policy: Policy) -> Policy:
-    """Return a copy of a policy, or the policy itself if it cannot be copied."""
-    try:
-        return copy.deepcopy(policy)
-    except Exception:  # any error of an object's own code
-        return policy
 
 
 def _run(policy: Policy, state: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

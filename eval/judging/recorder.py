@@ -1,8 +1,4 @@
-"""Record the flights of trials while the judge flies them.
-
-Trials are flown in slots, places in the simulator for one trial at a time. Each slot records its
-own flight.
-"""
+"""Record the flights of trials while the judge flies them; each slot records its own flight."""
 
 from __future__ import annotations
 
@@ -13,19 +9,9 @@ import numpy as np
 from eval.logs.flight import Flight
 from eval.worlds import Rows
 
-_EMPTY = (
-    0.0,  # time_s
-    np.zeros(3),  # pos_w
-    np.zeros(4),  # quat_wxyz
-    np.zeros(3),  # vel_w
-    np.zeros(3),  # rate_b
-    0.0,  # thrust_cmd
-    np.zeros(3),  # rate_cmd_b
-    np.zeros(4),  # rotor_speed
-    0,  # gate
-)
-"""A row of zeros that gives the columns of an empty flight their shapes, before the action; a
-flight is empty if its trial ended at the start."""
+_EMPTY = [np.zeros(size) for size in ((), 3, 4, 3, 3, (), 3, 4, ())]
+"""A row of zeros with the shapes of the fields of `Rows` after `due`, for the columns of an empty
+flight; a flight is empty if its trial ended at the start."""
 
 
 class Recorder:

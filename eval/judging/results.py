@@ -24,8 +24,6 @@ MOST_TRIALS = 1_000_000
 """Largest number of rows of a trials.parquet that is read; they take about a gigabyte of memory."""
 MOST_TEXT = 1000
 """Largest number of characters of a name in a trials.parquet."""
-JOURNAL = "trials.journal.jsonl"
-"""Name of the journal in the output folder."""
 
 
 def write_results(
@@ -58,10 +56,9 @@ def write_trials(
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    schema = pa.schema(
-        [pa.field(name, _column_type(kind)) for name, kind in _kinds().items()],
-        metadata={"suite": to_json(header)},
-    )
+    types = {"str": pa.string(), "int": pa.int64(), "float": pa.float64(), "bool": pa.bool_()}
+    fields = [pa.field(name, types[kind.split(" | ")[0]]) for name, kind in _kinds().items()]
+    schema = pa.schema(fields, metadata={"suite": to_json(header)})
     columns = {name: [getattr(result, name) for result in results] for name in TrialResult._fields}
     with replacing_file(path) as temporary:
         pq.write_table(pa.table(columns, schema=schema), temporary)
@@ -71,20 +68,6 @@ def _kinds() -> dict[str, str]:
     """Return name -> type, as text, of each field of `TrialResult`."""
     annotations = TrialResult.__annotations__.items()
     return {name: getattr(kind, "__forward_arg__", kind) for name, kind in annotations}
-
-
-def _column_type(kind: str) -> Any:
-    """Return the Parquet type of a field, from its type as text."""
-    import pyarrow as pa
-
-    kinds = {
-        "str": pa.string(),
-        "str | None": pa.string(),
-        "int": pa.int64(),
-        "float": pa.float64(),
-        "bool": pa.bool_(),
-    }
-    return kinds[kind]
 
 
 def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:

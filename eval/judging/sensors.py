@@ -2,8 +2,7 @@
 
 They change only the policy's observation; the autopilot, its commanded heading and the scoring use
 the true state. All random numbers come from the trial's seed, model by model and in a fixed order,
-so a trial's outcome depends on the trial only. A slot is a place in the simulator, in which one
-trial (flight) is flown.
+so a trial's outcome depends on the trial only.
 
 With an estimator, a Kalman filter for each trial gives the policy its state. After each physics
 step an IMU measurement is simulated. Gate corners are detected at the camera's frame rate and reach

@@ -103,17 +103,6 @@ def expected_largest(values: np.ndarray, among: int) -> float | None:
     return float(np.sort(values) @ np.array(probability))
 
 
-def paired_bootstrap(first: np.ndarray, second: np.ndarray, seed: int = 0) -> Interval:
-    """Return the median of first - second with its interval; both are (n,), on the same trials.
-
-    Raises:
-        ValueError: where the lengths differ.
-    """
-    if len(first) != len(second):
-        raise ValueError(f"{len(first)} values against {len(second)}: pairs need as many of each")
-    return bootstrap(np.asarray(first, float) - np.asarray(second, float), seed)
-
-
 def mcnemar_exact(only_first: int, only_second: int) -> float:
     """Return the two-sided exact p-value of McNemar's test.
 

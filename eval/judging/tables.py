@@ -1,7 +1,4 @@
-"""Compute the numbers of summary.json, and print them as tables.
-
-A cell is the set of trials of one policy on one track family at one level.
-"""
+"""Compute the numbers of summary.json, and print them as tables."""
 
 from __future__ import annotations
 
@@ -15,7 +12,6 @@ from eval.judging.statistics import (
     Interval,
     bootstrap,
     expected_largest,
-    paired_bootstrap,
     paired_success,
     wilson,
 )
@@ -84,13 +80,13 @@ def summarise(results: Sequence[TrialResult]) -> dict[str, Any]:
     for result in results:
         groups.setdefault((result.policy, result.track, result.difficulty), []).append(result)
     cells = [_cell(*key, rows) for key, rows in groups.items()]
-    policies = list(dict.fromkeys(result.policy for result in results))
     paired = []
-    for (policy, track, difficulty), rows in groups.items():
-        against = groups.get((policies[0], track, difficulty), [])
-        if policy != policies[0]:
-            pairing = _pairing(policy, policies[0], track, difficulty, rows, against)
-            paired += [pairing] if pairing else []
+    for (policy, track, level), rows in groups.items():
+        first = results[0].policy
+        others = {other.trial: other for other in groups.get((first, track, level), [])}
+        pairs = [(row, others[row.trial]) for row in rows if row.trial in others]
+        if policy != first and pairs:
+            paired.append(_pairing(*zip(*pairs, strict=True)))
     return {"cells": cells, "paired": paired}
 
 
@@ -122,30 +118,14 @@ def _cell(policy: str, track: str, difficulty: int, rows: list[TrialResult]) -> 
     )
 
 
-def _pairing(
-    policy: str,
-    against: str,
-    track: str,
-    difficulty: int,
-    rows: list[TrialResult],
-    others: list[TrialResult],
-) -> Pairing | None:
-    """Return the differences of `rows` from `others` on common trials; None if there are none."""
-    by_trial = {other.trial: other for other in others}
-    pairs = [(row, by_trial[row.trial]) for row in rows if row.trial in by_trial]
-    if not pairs:
-        return None
-    first, second = zip(*pairs, strict=True)
-    success = paired_success(
-        np.array([row.success for row in first]), np.array([row.success for row in second])
-    )
-    speed = paired_bootstrap(
-        np.array([row.v_mean for row in first]),
-        np.array([row.v_mean for row in second]),
-        _seed(track, difficulty),
-    )
-    interval = Interval(success.value, success.low, success.high)
-    return Pairing(policy, against, track, difficulty, len(pairs), interval, success.p_value, speed)
+def _pairing(rows: Sequence[TrialResult], others: Sequence[TrialResult]) -> Pairing:
+    """Return the differences of a cell's `rows` from another policy's, on the same trials."""
+    policy, against, track, level = rows[0].policy, others[0].policy, *rows[0].trial[:2]
+    success = paired_success(*(np.array([row.success for row in each]) for each in (rows, others)))
+    faster = [row.v_mean - other.v_mean for row, other in zip(rows, others, strict=True)]
+    speed = bootstrap(np.array(faster), _seed(track, level))
+    interval = Interval(*success[:3])
+    return Pairing(policy, against, track, level, len(rows), interval, success.p_value, speed)
 
 
 def percent(interval: Interval) -> str:

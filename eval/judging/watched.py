@@ -32,17 +32,13 @@ class Watched(Wrapper):
             self._remembers |= not np.array_equal(new_hidden[~fresh], hidden[~fresh])
         return output, new_hidden
 
-    def extreme_share(self) -> float:
-        """Return the share of outputs at their component's own largest size; 0 if too few."""
+    def doubts(self) -> list[Note]:
+        """Return a note if most outputs are at their component's own largest size."""
         outputs = np.abs(np.concatenate([*self._outputs, np.zeros((0, self.spec.action.size))]))
         largest = outputs.max(0, initial=0.0)
         if len(outputs) < LEAST_DECISIONS or not largest.min() > 0.0:  # also for NaN
-            return 0.0
-        return float((outputs >= EXTREME * largest).mean())
-
-    def doubts(self) -> list[Note]:
-        """Return a note if the outputs are extreme at most decisions."""
-        share = self.extreme_share()
+            return []
+        share = (outputs >= EXTREME * largest).mean()
         if share <= OFTEN:
             return []
         text = f"{share:.0%} of its outputs are at their own largest values"

@@ -19,7 +19,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from eval.view.blueprint import BACKGROUND, tabs_blueprint
-from eval.view.recording import open_recording, time_columns
+from eval.view.recording import log_curves, open_recording, time_columns
 from eval.view.solids import DRONE_HALF_SIZE
 from tracks.common.provenance import stamp
 
@@ -114,8 +114,9 @@ def _log_flight(
         _log_series(recording, root, label, states, colour, 1.2)
         errors = _concatenate_with_gaps(simulation.errors)
         for k, name in enumerate(ERRORS):
+            style = rr.SeriesLines(names=[simulation.label], colors=[colour], widths=[1.5])
             line = f"{root}/error_{name}/{label}"
-            _log_line(recording, line, states.time_s, errors[:, k], simulation.label, colour, 1.5)
+            log_curves(recording, line, states.time_s, errors[:, k], style)
 
 
 def _log_drone(
@@ -153,25 +154,9 @@ def _log_series(
 ) -> None:
     """Log velocity and body rates as curves, one for each axis."""
     values = np.concatenate([states.vel_w, states.rate_b], axis=1)
-    for k, name in enumerate(SERIES):
-        line = f"{root}/{name}/{label}"
-        _log_line(recording, line, states.time_s, values[:, k], label, colour, width)
-
-
-def _log_line(
-    recording: rr.RecordingStream,
-    entity: str,
-    time_s: np.ndarray,
-    values: np.ndarray,
-    label: str,
-    colour: tuple[int, int, int],
-    width: float,
-) -> None:
-    """Log one curve with its style."""
     style = rr.SeriesLines(names=[label], colors=[colour], widths=[width])
-    recording.log(entity, style, static=True)
-    columns = rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64))
-    recording.send_columns(entity, time_columns(time_s), columns)
+    for k, name in enumerate(SERIES):
+        log_curves(recording, f"{root}/{name}/{label}", states.time_s, values[:, k], style)
 
 
 def _concatenate_with_gaps(parts: Sequence[np.ndarray]) -> np.ndarray:
@@ -206,11 +191,10 @@ def _flight_view(root: str, flight: ComparedFlight) -> rrb.Vertical:
         rrb.TimeSeriesView(origin=f"{root}/error_{name}", name=f"{name} error [{unit}]")
         for name, unit in ERRORS.items()
     ]
-    units = {"velocity": "m/s", "rates": "rad/s"}
     series = [
-        rrb.TimeSeriesView(origin=f"{root}/{name}", name=f"{name.replace('_', ' ')} [{unit}]")
+        rrb.TimeSeriesView(origin=f"{root}/{name}", name=f"{group} {axis} [{ERRORS[group]}]")
         for name in SERIES
-        for unit in [units[name.split("_")[0]]]
+        for group, axis in [name.split("_")]
     ]
     return rrb.Vertical(
         rrb.Horizontal(overview, rrb.Vertical(*errors), column_shares=[1.6, 1.0]),

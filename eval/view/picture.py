@@ -1,7 +1,4 @@
-"""Draw pictures of trials (flights along a track) as PNG, PDF or SVG, without a display.
-
-`write_picture` draws one trial from above and from the side, `write_grid` several from above.
-"""
+"""Draw pictures of trials as PNG, PDF or SVG, without a display."""
 
 from __future__ import annotations
 

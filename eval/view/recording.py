@@ -283,10 +283,21 @@ def _log_series(recording: rr.RecordingStream, root: str, flight: Flight) -> Non
         ("rotors", flight.rotor_speed, all_rows, ["1", "2", "3", "4"], [*axes, *grey]),
     ]
     for name, values, rows, names, colour in series:
-        entity = f"{root}/{name}"
-        recording.log(entity, rr.SeriesLines(names=names, colors=colour), static=True)
-        columns = rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64)[rows])
-        recording.send_columns(entity, time_columns(flight.time_s[rows]), columns)
+        style = rr.SeriesLines(names=names, colors=colour)
+        log_curves(recording, f"{root}/{name}", flight.time_s[rows], values[rows], style)
+
+
+def log_curves(
+    recording: rr.RecordingStream,
+    entity: str,
+    time_s: np.ndarray,
+    values: np.ndarray,
+    style: rr.SeriesLines,
+) -> None:
+    """Log a curve (T,) or several (T, n) at the times `time_s` (T,) [s]."""
+    recording.log(entity, style, static=True)
+    columns = rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64))
+    recording.send_columns(entity, time_columns(time_s), columns)
 
 
 def _log_events(

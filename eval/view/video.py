@@ -1,7 +1,7 @@
-"""Write a video of a trial, a flight along a track, from behind the drone.
+"""Write a video of a trial from behind the drone, next to the policy's depth image.
 
-The policy's depth image is next to the view. `scene3d.py` draws the frames and `video_file.py`
-encodes them, so neither a display nor a GPU is needed.
+`scene3d.py` draws the frames and `video_file.py` encodes them, so neither a display nor a GPU is
+needed.
 """
 
 from __future__ import annotations
@@ -114,7 +114,8 @@ def video_frames(
     for time in times:
         row = int(np.searchsorted(flight.time_s, time, side="right")) - 1
         pos, eye, target = (
-            _interpolate(flight, values, time) for values in (flight.pos_w, eye_w, target_w)
+            np.array([np.interp(time, flight.time_s, column) for column in values.T])
+            for values in (flight.pos_w, eye_w, target_w)
         )
         passed = int(flight.gate[row])
         trail = (flight.time_s[:-1] > time - TRAIL_S) & (flight.time_s[1:] <= time)
@@ -147,10 +148,6 @@ def _finite_part(flight: Flight) -> Flight:
     rows = {name: getattr(flight, name) for name in Flight._fields[:-2]}
     finite = {name: each[: not_finite[0]] for name, each in rows.items() if each is not None}
     return flight._replace(**finite)
-
-
-def _interpolate(flight: Flight, values: np.ndarray, time: float) -> np.ndarray:
-    return np.array([np.interp(time, flight.time_s, column) for column in values.T])
 
 
 def _chase_camera(flight: Flight, rot_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -61,7 +61,7 @@ def write_gif(
     path: Path,
     frames: Iterable[Image.Image],
     fps: int,
-    swatches: np.ndarray | None = None,
+    swatches: np.ndarray,
     on_frame: Callable[[int], None] | None = None,
 ) -> None:
     """Write frames as a GIF that loops, all with one palette.
@@ -82,12 +82,9 @@ def write_gif(
     indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=durations, loop=0)
 
 
-def _palette(frame: Image.Image, swatches: np.ndarray | None) -> Image.Image:
+def _palette(frame: Image.Image, swatches: np.ndarray) -> Image.Image:
     """Return an image with a palette for `frame` and `swatches`, both with the same weight."""
     pixels = np.asarray(frame, dtype=np.uint8).reshape(-1, 3)
-    if swatches is not None:
-        swatch_pixels = np.repeat(
-            swatches.astype(np.uint8), max(1, len(pixels) // len(swatches)), axis=0
-        )
-        pixels = np.concatenate([pixels, swatch_pixels])
+    repeats = max(1, len(pixels) // len(swatches))
+    pixels = np.concatenate([pixels, np.repeat(swatches.astype(np.uint8), repeats, axis=0)])
     return Image.fromarray(pixels[None]).quantize(COLOURS)

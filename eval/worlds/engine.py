@@ -153,11 +153,11 @@ def contact_name(model: mujoco.MjModel, data: mujoco.MjData) -> str:
     return solid_name(model.geom(int(deepest.geom[1 if first_is_body else 0])).name)
 
 
-def refuse_start_contact(name: str, track: Track, vehicle: Vehicle) -> None:
-    """Raise an error for a track on which `vehicle` is in contact at the start.
+def course_notes(name: str, track: Track, vehicle: Vehicle) -> list[str]:
+    """Return notes on what is probably a mistake in a track from a file that `vehicle` flies.
 
     Raises:
-        ValueError: naming the track, the start and the touched solid.
+        ValueError: if the vehicle is in contact at the start, with the start and the touched solid.
     """
     model = compile_model(track, vehicle, 1.0 / vehicle.controller.frequency, counts(track.scene))
     data = mujoco.MjData(model)
@@ -169,15 +169,6 @@ def refuse_start_contact(name: str, track: Track, vehicle: Vehicle) -> None:
             f"{name}: at start.position {np.round(track.start_pos_w, 3).tolist()} the body of "
             f"{vehicle.name!r} ({sides} m) touches {contact_name(model, data)}; move the start away"
         )
-
-
-def course_notes(name: str, track: Track, vehicle: Vehicle) -> list[str]:
-    """Return notes on what is probably a mistake in a track from a file that `vehicle` flies.
-
-    Raises:
-        ValueError: if the vehicle is in contact at the start.
-    """
-    refuse_start_contact(name, track, vehicle)
     return [*track_notes(name, track), *opening_notes(name, track, vehicle)]
 
 
@@ -194,10 +185,10 @@ def opening_notes(name: str, track: Track, vehicle: Vehicle) -> list[str]:
     ]
 
 
-def warn_of(notes: Iterable[object], stacklevel: int = 2) -> None:
-    """Issue each note as a Python warning; level 1 is the caller's line, 2 that of its caller."""
+def warn_of(notes: Iterable[object]) -> None:
+    """Issue each note as a Python warning at the line of the caller's caller."""
     for note in notes:
-        warnings.warn(str(note), stacklevel=stacklevel + 1)
+        warnings.warn(str(note), stacklevel=3)
 
 
 def start_state(track: Track) -> np.ndarray:

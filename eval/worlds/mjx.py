@@ -4,8 +4,7 @@ MuJoCo's JAX engine moves the free body. Its contacts are disabled: they take te
 all other computations, and a trial ends at the first contact anyway. Collisions are found by signed
 distances instead, and depth images by analytic ray casting. The steps between two decisions of the
 policy are one compiled function. States are float32, so a flight departs slowly from the same
-flight in `mujoco`. A trial's outcome does not depend on the other trials. A slot is a place in the
-simulator for one trial at a time.
+flight in `mujoco`. A trial's outcome does not depend on the other trials.
 """
 
 from __future__ import annotations
@@ -20,20 +19,19 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from eval.quadrotor.autopilot import AutopilotState, autopilot_step, make_autopilot, start_autopilot
+from eval.quadrotor.autopilot import AutopilotState, autopilot_step, start_autopilot
 from eval.quadrotor.model import compile_quadrotor
-from eval.quadrotor.plant import Motion, uses_noise
+from eval.quadrotor.plant import Motion
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import Rows, rows_of
 from eval.worlds.collision import NEAR_STEPS, box_distances, near_solids
 from eval.worlds.engine import start_state
-from eval.worlds.slots import IDLE, GustDraws, Layout, empty_course, pad_gates
+from eval.worlds.slots import Layout, Slots
 from eval.worlds.trial import (
     DIVERGED,
     FLYING,
     Course,
     Progress,
-    Rules,
     TrialSpec,
     has_diverged,
     is_wrench,
@@ -43,13 +41,12 @@ from eval.worlds.trial import (
     start_progress,
 )
 from policies.observation import View, view_of
-from policies.spec import ActionSpec
-from tracks.common.masks import select
+from tracks.common.masks import select, take
 from tracks.formats.mujoco_scene import GROUND
 from tracks.geometry.camera import Camera, cast_rays_b, nearest
 from tracks.geometry.depth import depth_image
 from tracks.geometry.rotation import quat_to_rot, to_world
-from tracks.geometry.scene import Array, Scene, counts, pad, stack
+from tracks.geometry.scene import Array, Scene, counts
 from tracks.track import Track
 
 with contextlib.redirect_stdout(io.StringIO()):  # the import prints a list of missing packages
@@ -75,29 +72,17 @@ class SlotStates(NamedTuple):
     """Progress of the trials."""
 
 
-class MjxWorld:
+class MjxWorld(Slots):
     """A world that simulates all slots in one compiled JAX program, for GPUs."""
 
     name = "mjx"
     integrator = "euler"
     compiles = True
-    actions = ("ctbr", "motors")
+    dtype = np.float32
 
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        camera: Camera,
-        layout: Layout,
-        rules: Rules,
-        slots: int,
-        threads: int = 1,
-        action: ActionSpec | None = None,
-    ) -> None:
+    def __init__(self, vehicle: Vehicle, camera: Camera, *arguments: Any, **settings: Any) -> None:
         """Make the world; the arguments are those of `MujocoWorld`, but `threads` has no effect."""
-        self.slots = slots
-        self._layout, self._rules, self._camera = layout, rules, camera
-        self._autopilot = make_autopilot(vehicle, action)
-        self.dt = self._autopilot.dt
+        super().__init__(vehicle, camera, *arguments, **settings)
         free = mujoco.MjSpec()
         free.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         self._model = mjx.put_model(compile_quadrotor(free, vehicle, self.dt))
@@ -105,11 +90,7 @@ class MjxWorld:
         self._middle_b = -np.asarray(self._autopilot.plant.constants.com_offset_b)
         self._rays_b = jnp.asarray(cast_rays_b(camera), jnp.float32)
         self._max_steps = 0
-        self._has_noise = uses_noise(self._autopilot.plant)
-        self._noise = [GustDraws(IDLE)] * slots
-        self._course = empty_course(slots, layout)
-        self._tracks: list[Track | None] = [None] * slots
-        self._scene: Scene | None = None
+        self._tracks: list[Track | None] = [None] * self.slots
         self._on_device: tuple[Course, Scene] | None = None
         self._state = self._idle()
 
@@ -121,16 +102,13 @@ class MjxWorld:
         progress = start_progress(motion.pos_w)
         progress = progress._replace(ended=jnp.full(self.slots, -1, jnp.int32))
         qpos = jnp.tile(jnp.asarray([0.0, 0, 0, 1, 0, 0, 0]), (self.slots, 1))
-        loops = start_autopilot(self._autopilot, motion, self._no_draws())
+        loops = start_autopilot(self._autopilot, motion, self._draws_at(np.zeros(self.slots, int)))
         return SlotStates(qpos, jnp.zeros((self.slots, 6)), loops, progress)
 
     @property
     def progress(self) -> Progress:
         """Progress of the trial in each slot."""
         return jax.tree.map(np.asarray, self._state.progress)
-
-    def _no_draws(self) -> np.ndarray | None:
-        return np.zeros((self.slots, 3), np.float32) if self._has_noise else None
 
     def load(self, entries: list[tuple[int, Track, TrialSpec]]) -> None:
         """Start trials from (slot, track, trial).
@@ -140,24 +118,10 @@ class MjxWorld:
         """
         for _, track, _ in entries:
             _check_near(track)
-        started, noise = np.zeros(self.slots, bool), self._no_draws()
-        qpos = np.array(self._state.qpos)
-        for slot, track, trial in entries:
-            started[slot], self._tracks[slot] = True, track
-            gates = pad_gates(track.scene.gates, self._layout.gates, self._layout.corners)
-            scene = stack([track.scene._replace(gates=gates)], self._layout.solids)
-            if self._scene is None:
-                self._scene = jax.tree.map(lambda a: np.repeat(a, self.slots, axis=0), scene)
-            arrays = zip(jax.tree.leaves(self._scene), jax.tree.leaves(scene), strict=True)
-            for of_all_slots, of_slot in arrays:
-                of_all_slots[slot] = of_slot[0]
-            for field, value in zip(self._course.gates, gates, strict=True):
-                field[slot] = value
-            self._course.count[slot] = len(track.scene.gates.center_w)
-            qpos[slot] = start_state(track)
-            if noise is not None:
-                self._noise[slot] = GustDraws(trial)
-                noise[slot] = self._noise[slot].at(0, 1)[0]
+        started, qpos = self._insert(entries, meshes=True), np.array(self._state.qpos)
+        for slot, track, _ in entries:
+            self._tracks[slot], qpos[slot] = track, start_state(track)
+        noise = self._draws_at(np.where(started, 0, np.asarray(self._state.progress.step) + 1))
         # Copies, because on a CPU JAX may share memory with the arrays that it gets.
         on_device = jax.tree.map(lambda a: jnp.array(a), (self._course, self._scene))
         self._on_device = on_device
@@ -211,11 +175,8 @@ class MjxWorld:
 
     def collided_with(self, slot: int) -> str:
         """Return the name of the solid that the trial in `slot` collided with."""
-        track = self._tracks[slot]
+        track, scene = self._tracks[slot], take(self._scene, [slot])
         assert track is not None
-        gates = pad_gates(track.scene.gates, self._layout.gates, self._layout.corners)
-        scene = pad(track.scene._replace(gates=gates), self._layout.solids)
-        scene = jax.tree.map(lambda a: np.asarray(a[None], np.float32), scene)
         qpos, qvel = np.asarray(self._state.qpos)[[slot]], np.asarray(self._state.qvel)[[slot]]
         distance = _distances_at(scene, qpos, qvel, self._half_size, self._middle_b)
         return _solid_names(track, self._layout)[int(np.asarray(distance)[0].argmin())]
@@ -248,12 +209,7 @@ class MjxWorld:
         # Periods between decisions differ by one step. With the longest period for all calls, the
         # program is compiled only once.
         self._max_steps = max_steps = max(self._max_steps, int(steps.max(initial=0)))
-        noise = None
-        if self._has_noise:
-            first = np.asarray(self._state.progress.step) + 1
-            pairs = zip(first.tolist(), self._noise, strict=True)
-            noise = np.stack([draws.at(step, max_steps) for step, draws in pairs], axis=1)
-            noise = noise.astype(np.float32)
+        noise = self._draws(np.asarray(self._state.progress.step) + 1, max_steps)
         with jax.default_matmul_precision(PRECISION):
             self._state, rows = self._fly(
                 self._state, jnp.asarray(action_b, jnp.float32), jnp.asarray(steps), noise,

@@ -1,8 +1,8 @@
 """Base class of simulators ("worlds") that find contacts with MuJoCo's C engine, in many slots.
 
-A slot is a place for one trial at a time, a flight along a track. Every slot has its own MuJoCo
-model, padded to a common size, and its own MjData in a `mujoco.batch`. After each operation the
-contacts of the current state are up to date, so the rules are applied before the next step.
+Every slot has its own MuJoCo model, padded to a common size, and its own MjData in a
+`mujoco.batch`. After each operation the contacts of the current state are up to date, so the rules
+are applied before the next step.
 """
 
 from __future__ import annotations
@@ -16,17 +16,16 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from eval.quadrotor.autopilot import AutopilotState, autopilot_step, make_autopilot, start_autopilot
-from eval.quadrotor.plant import MAX_DELAY, Motion, make_plant, uses_noise
+from eval.quadrotor.autopilot import AutopilotState, autopilot_step, start_autopilot
+from eval.quadrotor.plant import MAX_DELAY, Motion, make_plant
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import Rows, rows_of
 from eval.worlds.engine import BODY, DepthCamera, compile_model, contact_name, start_state
-from eval.worlds.slots import IDLE, GustDraws, Layout, empty_course, pad_gates
+from eval.worlds.slots import Slots
 from eval.worlds.trial import (
     DIVERGED,
     FLYING,
     Progress,
-    Rules,
     TrialSpec,
     has_diverged,
     judge_state,
@@ -35,11 +34,9 @@ from eval.worlds.trial import (
     start_progress,
 )
 from policies.observation import View, view_of
-from policies.spec import ActionSpec
 from tracks.common.masks import make_contiguous, select, take
 from tracks.formats.mujoco_scene import MESH_GROUP
 from tracks.geometry.camera import Camera
-from tracks.geometry.scene import Scene, stack
 from tracks.geometry.tiles import depth_images, make_tiles
 from tracks.track import Track
 
@@ -49,7 +46,7 @@ _NOTHING = int(mujoco.mjtStage.mjSTAGE_NONE)
 """Stage of the engine before any computation."""
 
 
-class SceneSlots(ABC):
+class SceneSlots(Slots, ABC):
     """A `World` without dynamics, computed in NumPy over all slots, except for contacts.
 
     Subclasses define `_move` (the motion of the bodies), and may replace `_control` (what the
@@ -57,38 +54,16 @@ class SceneSlots(ABC):
     """
 
     name: str
-    actions = ("ctbr", "motors")
 
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        camera: Camera,
-        layout: Layout,
-        rules: Rules,
-        slots: int,
-        threads: int = 1,
-        action: ActionSpec | None = None,
-    ) -> None:
-        """Make the world.
-
-        Every track fits the padded sizes of `layout`. Results do not depend on the threads for
-        physics. The policy's action is by default an acceleration.
-        """
-        self.slots = slots
-        self._vehicles, self._layout, self._rules = [vehicle] * slots, layout, rules
-        self._autopilot = make_autopilot(vehicle, action)
-        self.dt = self._autopilot.dt
+    def __init__(self, vehicle: Vehicle, camera: Camera, *arguments: Any, **settings: Any) -> None:
+        """Make the world; the arguments are those of `Slots`."""
+        super().__init__(vehicle, camera, *arguments, **settings)
+        self._vehicles = [vehicle] * self.slots
         self._depth_camera, self._tiles = DepthCamera(camera), make_tiles(camera)
-        self._threads = threads
-        self._course = empty_course(slots, layout)
-        self._progress = start_progress(np.zeros((slots, 3)))
-        self._progress = self._progress._replace(ended=np.full(slots, -1, np.int32))
+        self._progress = start_progress(np.zeros((self.slots, 3)))
+        self._progress = self._progress._replace(ended=np.full(self.slots, -1, np.int32))
         self._models: list[mujoco.MjModel] = []
-        self._scene: Scene | None = None
         self._meshes: dict[int, mujoco.MjData] = {}
-        self._noise: list[GustDraws] | None = None
-        if uses_noise(self._autopilot.plant):
-            self._noise = [GustDraws(IDLE)] * slots
 
     @property
     def progress(self) -> Progress:
@@ -115,7 +90,7 @@ class SceneSlots(ABC):
         """
         if vehicles is not None:
             self._set_vehicles([slot for slot, _, _ in entries], vehicles)
-        for slot, track, trial in entries:
+        for slot, track, _ in entries:
             model = compile_model(track, self._vehicles[slot], self.dt, self._layout.solids)
             if not self._models:
                 self._build(model)
@@ -123,14 +98,8 @@ class SceneSlots(ABC):
             if track.mesh_sizes:  # meshes do not move, so one computation suffices for all images
                 self._meshes[slot] = mujoco.MjData(model)
                 mujoco.mj_kinematics(model, self._meshes[slot])
-            self._course.count[slot] = len(track.scene.gates.center_w)
-            if self._noise is not None:
-                self._noise[slot] = GustDraws(trial)
         ids = np.array([slot for slot, _, _ in entries], np.int32)
-        started = np.zeros(self.slots, bool)
-        started[ids] = True
-        self._scene = self._insert_scenes([track.scene for _, track, _ in entries], ids, started)
-        self._course = self._course._replace(gates=self._scene.gates)
+        started = self._insert(entries, meshes=False)  # MuJoCo casts the rays on meshes
         self._batch.set_models(self._models)
         self._batch.reset(ids, stage=_NOTHING)
         for slot, track, _ in entries:
@@ -138,7 +107,7 @@ class SceneSlots(ABC):
         self._batch.forward(ids, stage=TO_CONTACTS)
 
         motion = self._motion()
-        noise = self._draws(np.where(started, -1, self._progress.step))
+        noise = self._draws_at(np.where(started, 0, self._progress.step + 1))
         initial = start_autopilot(self._autopilot, motion, noise)
         self._loops = make_contiguous(select(started, initial, getattr(self, "_loops", initial)))
         self._progress = select(started, start_progress(motion.pos_w), self._progress)
@@ -156,21 +125,6 @@ class SceneSlots(ABC):
             )
         plant = make_plant(self._vehicles[0], self.dt, values, MAX_DELAY)
         self._autopilot = replace(self._autopilot, plant=plant)
-
-    def _insert_scenes(self, scenes: list[Scene], ids: np.ndarray, started: np.ndarray) -> Scene:
-        """Return the scenes of all slots without meshes, with `scenes` in the slots `ids`."""
-        layout = self._layout
-        padded = [
-            scene._replace(
-                gates=pad_gates(scene.gates, layout.gates, layout.corners),
-                triangles=scene.triangles[:0],
-            )
-            for scene in scenes
-        ]
-        index_of_scene = np.zeros(self.slots, int)
-        index_of_scene[ids] = np.arange(len(ids))
-        new = take(stack(padded, layout.solids._replace(triangles=0), np.float64), index_of_scene)
-        return select(started, new, self._scene or new)
 
     def _motion(self) -> Motion:
         rot_w = self._xmat[:, BODY].reshape(self.slots, 3, 3).copy()
@@ -197,7 +151,7 @@ class SceneSlots(ABC):
     def view(self, wanted: np.ndarray) -> View:
         """Return the current view; images only for the slots in `wanted` (N,) bool."""
         motion = self._motion()
-        camera, slots = self._depth_camera.camera, np.flatnonzero(wanted)
+        camera, slots = self._camera, np.flatnonzero(wanted)
         depth = np.full((self.slots, camera.height, camera.width), camera.range_m)
         depth[slots] = self._images(slots, *take(motion[:2], slots))
         gate = next_gate(self._course, self._progress.gates)
@@ -249,7 +203,7 @@ class SceneSlots(ABC):
             step, motion = self._progress.step, self._motion()
             gate_w = next_centre(self._course, self._progress.gates)
             rotor_speed = self._loops.plant.rotor_speed
-            draws = self._draws(step)
+            draws = self._draws_at(step + 1)
             loops, push = self._control(motion, action_b, gate_w, step, draws)
             self._loops = make_contiguous(select(flying, loops, self._loops))
             if record:
@@ -265,16 +219,6 @@ class SceneSlots(ABC):
             if len(diverged):  # their invalid numbers must not enter later computations
                 self._batch.reset(diverged.astype(np.int32), stage=TO_CONTACTS)
         return rows
-
-    def _draws(self, step: np.ndarray) -> np.ndarray | None:
-        """Return the random draws of the gusts (N, 3) for the step after `step` (N,).
-
-        -1 means before the start. None for a vehicle without gusts.
-        """
-        if self._noise is None:
-            return None
-        pairs = zip(step.tolist(), self._noise, strict=True)
-        return np.concatenate([draws.at(k + 1, 1) for k, draws in pairs])
 
     def _rows(self, due: np.ndarray, rotor_speed: np.ndarray) -> list[Rows]:
         """Return the rows of the flight logs at this step; [] if no slot is `due` (N,) bool."""

@@ -1,19 +1,22 @@
-"""Parts that the simulators ("worlds") with slots share: scene sizes, gates and random numbers.
-
-A slot flies one trial at a time, which is a flight along a track.
-"""
+"""Parts that the simulators ("worlds") with slots share: scenes, gates and random numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import PurePath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.worlds.trial import Course, TrialSpec
+from eval.quadrotor.autopilot import make_autopilot
+from eval.quadrotor.plant import uses_noise
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds.trial import Course, Rules, TrialSpec
+from policies.spec import ActionSpec
+from tracks.common.masks import select, take
 from tracks.families import MAX_COUNTS
-from tracks.geometry.scene import Counts, Gates, counts
+from tracks.geometry.camera import Camera
+from tracks.geometry.scene import Counts, Gates, Scene, counts, stack
 from tracks.track import Track
 
 
@@ -53,19 +56,6 @@ def slot_groups(trials: Sequence[TrialSpec], tracks: Mapping[str, Track]) -> lis
         track = tracks.get(trial.track)
         groups.setdefault(trial.track if track and track.mesh_sizes else "", []).append(number)
     return list(groups.values())
-
-
-def empty_course(slots: int, layout: Layout) -> Course:
-    """Return the gates of empty slots, as arrays of the layout's size."""
-    shape = slots, layout.gates
-    gates = Gates(
-        np.zeros((*shape, 3)),
-        np.tile(np.eye(3), (*shape, 1, 1)),
-        np.zeros((*shape, layout.corners, 2)),
-        np.zeros(shape),
-        np.zeros(shape),
-    )
-    return Course(gates, np.ones(slots, np.int32))
 
 
 def pad_gates(gates: Gates, number: int, corners: int) -> Gates:
@@ -125,3 +115,72 @@ class GustDraws:
             self._rows = np.concatenate([self._rows[passed:], new_rows])
             self._first += passed
         return self._rows[step - self._first :][:count]
+
+
+class Slots:
+    """Scenes, gates and gusts of N slots, which the simulators with slots share."""
+
+    actions = ("ctbr", "motors")
+    dtype: Any = np.float64
+    """Type of the numbers of scenes and gusts."""
+    _course: Course
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        camera: Camera,
+        layout: Layout,
+        rules: Rules,
+        slots: int,
+        threads: int = 1,
+        action: ActionSpec | None = None,
+    ) -> None:
+        """Make the slots.
+
+        Every track fits the padded sizes of `layout`. Results do not depend on the threads for
+        physics. The policy's action is by default an acceleration.
+        """
+        self.slots = slots
+        self._camera, self._layout, self._rules, self._threads = camera, layout, rules, threads
+        self._autopilot = make_autopilot(vehicle, action)
+        self.dt = self._autopilot.dt
+        self._gate_count = np.ones(slots, np.int32)
+        self._scene: Scene | None = None
+        self._gusts: list[GustDraws] | None = None
+        if uses_noise(self._autopilot.plant):
+            self._gusts = [GustDraws(IDLE)] * slots
+
+    def _insert(self, entries: list[tuple[int, Track, TrialSpec]], meshes: bool) -> np.ndarray:
+        """Store the scenes, gates and gusts of new trials; return which slots have one, (N,) bool.
+
+        Without `meshes` they are left out of the scenes. Slots without a trial get any scene.
+        """
+        slots, scenes = [slot for slot, _, _ in entries], []
+        for slot, track, trial in entries:
+            self._gate_count[slot] = len(track.scene.gates.center_w)
+            if self._gusts is not None:
+                self._gusts[slot] = GustDraws(trial)
+            gates = pad_gates(track.scene.gates, self._layout.gates, self._layout.corners)
+            triangles = track.scene.triangles[: None if meshes else 0]
+            scenes.append(track.scene._replace(gates=gates, triangles=triangles))
+        solids = self._layout.solids if meshes else self._layout.solids._replace(triangles=0)
+        number, started = np.zeros(self.slots, int), np.zeros(self.slots, bool)
+        number[slots], started[slots] = np.arange(len(slots)), True
+        new = take(stack(scenes, solids, self.dtype), number)
+        self._scene = select(started, new, self._scene or new)
+        self._course = Course(self._scene.gates, self._gate_count)
+        return started
+
+    def _draws(self, step: np.ndarray, count: int) -> np.ndarray | None:
+        """Return the draws (count, N, 3) of the gusts for the steps from `step` (N,) on, if any."""
+        if self._gusts is None:
+            return None
+        pairs = zip(step.tolist(), self._gusts, strict=True)
+        return np.stack([draws.at(k, count) for k, draws in pairs], axis=1).astype(
+            self.dtype, copy=False
+        )
+
+    def _draws_at(self, step: np.ndarray) -> np.ndarray | None:
+        """Return the draws (N, 3) of the gusts for one step (N,); 0 is the start."""
+        draws = self._draws(step, 1)
+        return None if draws is None else draws[0]

@@ -1,7 +1,6 @@
 """Specification, end and score of a trial, with the same rules in every simulator.
 
-A trial is a flight of a policy along a track. The rules are pure functions of NumPy or JAX arrays,
-whose rows are N trials.
+The rules are pure functions of NumPy or JAX arrays, whose rows are N trials.
 """
 
 from __future__ import annotations

@@ -1,24 +1,21 @@
 """The command `suite blind`: make test cases with hidden effects, diagnose them, score the answers.
 
-An effect is one physical cause of a mismatch, such as drag. The true effects of the cases (the
-answers) are in a folder that the diagnosis does not read.
+The true effects of the cases (the answers) are in a folder that the diagnosis does not read.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from suite.common.console import Console
 from suite.common.options import Command
 from suite.common.work import WorkersOption, read_workers_option
+from tracks.common.files import plain
 from tracks.input.ranges import Range, Seed
-
-if TYPE_CHECKING:
-    from suite.blind.make import Manifest
 
 
 @dataclass(frozen=True)
@@ -83,14 +80,22 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if config.what == "plan":
         return _plan(config, console)
     if config.what == "strengths":
-        return _strengths(console)
+        from suite.blind.oracle import write_table
+
+        path = write_table(console)
+        console.say(f"written: {path}")
+        return {"table": str(path)}
     if config.what == "make":
         from suite.blind.cases import SETS
         from suite.blind.make import make_set
 
         seed = SETS[config.set] if config.seed is None else config.seed
         manifest = make_set(config.out, seed, config.count, console, config.simulator, workers)
-        return _show_manifest(manifest, config, console)
+        count, out = len(manifest.cases), config.out
+        console.say(f"{count} cases in {out / 'cases'}, answers in {out / 'answers'}")
+        for name in manifest.failed:
+            console.note(f"warning: {name} could not be made; answers/failed.json has the reason")
+        return {"out": str(out), "made": count, "failed": plain(manifest.failed)}
     if config.what == "run":
         from suite.blind.run import diagnose_by_command, run_set
 
@@ -98,7 +103,6 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         console.say(f"{done} cases diagnosed; score them with `suite blind score`")
         return {"diagnosed": done, "out": str(config.out)}
     from suite.blind.score import not_run, report, score_set, shares
-    from tracks.common.files import plain
 
     verdicts = score_set(config.out)
     console.say(report(config.out, verdicts))
@@ -110,31 +114,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     }
 
 
-def _show_manifest(manifest: Manifest, config: Config, console: Console) -> dict[str, Any]:
-    """Print how many cases were made and which ones failed, and return both for --json."""
-    from tracks.common.files import plain
-
-    count = len(manifest.cases)
-    console.say(f"{count} cases in {config.out / 'cases'}, answers in {config.out / 'answers'}")
-    for name in manifest.failed:
-        console.note(f"warning: {name} could not be made; answers/failed.json has the reason")
-    return {"out": str(config.out), "made": count, "failed": plain(manifest.failed)}
-
-
-def _strengths(console: Console) -> dict[str, Any]:
-    """Compute the table of detectable strengths, and return its path for --json."""
-    from suite.blind.oracle import write_table
-
-    path = write_table(console)
-    console.say(f"written: {path}")
-    return {"table": str(path)}
-
-
 def _plan(config: Config, console: Console) -> dict[str, Any]:
     """Print flights that separate `config.effects`, and return the flights for --json."""
     from eval.effects import EFFECTS
     from suite.diagnose.plan import plan_for, separations_of
-    from tracks.common.files import plain
 
     names = [EFFECTS.find(name).name for name in config.effects]
     if len(names) < 2:

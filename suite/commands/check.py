@@ -1,8 +1,4 @@
-"""The command `suite check`: find faults of an interface in logs, vehicle and policy files.
-
-A fault is a wrong unit, sign, scale, order, delay or rate. A finding is a record of a fault, or of
-a doubtful value.
-"""
+"""The command `suite check`: find faults of an interface in logs, vehicle and policy files."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""The command `suite collect`: record simulated flights as logs.
-
-The logs are for the diagnosis, or for the fit of a Delta Action Model, a network that corrects
-actions so that simulated flights match measured ones.
-"""
+"""The command `suite collect`: record simulated flights as logs, for a diagnosis or a fit."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The command `suite completion`: print the script with which a shell completes commands.
-
-Completion: after the first letters of a word, the Tab key writes the others.
-"""
+"""The command `suite completion`: print the script with which a shell completes commands."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""The command `suite delta`: fit a Delta Action Model to recorded flights.
-
-This model is a network that adds a correction to the action, so that simulated flights match
-measured ones.
-"""
+"""The command `suite delta`: fit a Delta Action Model to recorded flights."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The command `suite diagnose`: name the physical effects that a vehicle file lacks, from flights.
-
-An effect is one physical cause of a mismatch between simulation and flights, such as drag.
-"""
+"""The command `suite diagnose`: name the effects that a vehicle file lacks, from flights."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""The command `suite effects`: list the catalogue of physical effects, or describe one.
-
-An effect is one physical cause of a mismatch between simulation and flights. A vehicle file may
-have any number of them.
-"""
+"""The command `suite effects`: list the catalogue of physical effects, or describe one."""
 
 from __future__ import annotations
 

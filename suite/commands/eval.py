@@ -47,8 +47,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         check_place(config.rerun)
     answer = evaluate(config.flown, config.out, console, read_workers_option(config.workers))
     if config.rerun:
-        from suite.judging.replay import record_first_trials
+        from eval.view.recording import write_recording
+        from suite.judging.replay import first_trials, fly_again
 
-        record_first_trials(config.flown, config.rerun, console)
+        write_recording(config.rerun, *fly_again(config.flown, first_trials(config.flown)))
+        console.say(f"written: {config.rerun} (open it with: rerun {config.rerun})")
         answer["rerun"] = str(config.rerun)
     return answer

@@ -69,6 +69,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: for a file, a mapping or an option that cannot be used.
     """
+    import numpy as np
+
     from eval.importers import import_log
     from eval.importers.options import ImportOptions
     from eval.logs.faults.finding import finding_lines
@@ -100,8 +102,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         console.say(line)
     for warning in log.warnings:
         console.say(f"note      file: {warning}")
-    rows, speed = len(log.time_s), _largest_finite(log.speed)
-    speed_text = "no speed" if speed is None else f"up to {speed:.1f} m/s"
+    rows, has_speed = len(log.time_s), np.isfinite(log.speed).any()
+    speed_text = f"up to {np.nanmax(log.speed):.1f} m/s" if has_speed else "no speed"
     console.say(f"{rows} rows, {log.duration_s:.1f} s, {speed_text}: {config.out}")
     return {
         "flight": str(config.out),
@@ -124,10 +126,3 @@ def _check(config: Config) -> None:
     if config.pose_map is not None and config.pose is None:
         raise ValueError("--pose-map describes the file of --pose, which is not given")
     check_no_input(config.out, [config.file, config.pose])
-
-
-def _largest_finite(speed: Any) -> float | None:
-    """Return the largest finite value of an array; None if it has no finite value."""
-    import numpy as np
-
-    return float(np.nanmax(speed)) if np.isfinite(speed).any() else None

@@ -1,7 +1,4 @@
-"""The command `suite tracks`: list the track families, or draw a track as a picture.
-
-A family is the rule that draws a track from a seed and a level of difficulty.
-"""
+"""The command `suite tracks`: list the track families, or draw a track as a picture."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The command `suite train`: train a policy by backpropagation through differentiable dynamics.
-
-The dynamics are those of a quadrotor or of a point mass. A recipe is a named set of settings.
-"""
+"""The command `suite train`: train a policy by backpropagation through differentiable dynamics."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The command `suite view`: fly trials again, and write a recording, pictures and a video.
-
-A trial is one judged flight: a track, its level (difficulty 0 to 9) and a seed.
-"""
+"""The command `suite view`: fly trials again, and write a recording, pictures and a video."""
 
 from __future__ import annotations
 

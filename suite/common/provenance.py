@@ -96,22 +96,6 @@ def _sources(module: str) -> list[Path]:
     return sorted(path for path in files if path.is_file())
 
 
-def run_record(config: Any, seed: int | None) -> dict[str, Any]:
-    """Return everything that is needed to repeat a run: stamp, versions, machine and `config`.
-
-    The dataclass `config` has all defaults filled in. The seed is None if the run has none.
-    """
-    return {
-        **stamp(schema=1, seed=seed),
-        "python": platform.python_version(),
-        "packages": package_versions(),
-        "machine": machine(),
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "config_type": _type_name(config),
-        "config": config,
-    }
-
-
 def _type_name(config: Any) -> str:
     """Return the full name of a configuration's class, which shows the kind of a run."""
     return f"{type(config).__module__}.{type(config).__qualname__}"
@@ -139,15 +123,25 @@ def refuse_other_run(folder: str | os.PathLike[str], config: Any) -> None:
 def write_run_record(
     folder: str | os.PathLike[str], config: Any, seed: int | None, resumed: bool = False
 ) -> None:
-    """Write `run_record` to `folder`/run.json.
+    """Write everything that is needed to repeat a run to `folder`/run.json.
 
-    With `resumed`, an interrupted run in this folder continues. The git commits in its record are
-    kept as `earlier_commits`, since their code made a part of the run.
+    The dataclass `config` has all defaults filled in. The seed is None if the run has none. With
+    `resumed`, an interrupted run in this folder continues. The git commits in its record are kept
+    as `earlier_commits`, since their code made a part of the run.
 
     Raises:
         ValueError: if the existing record cannot be read.
     """
-    path, record = Path(folder) / "run.json", run_record(config, seed)
+    path = Path(folder) / "run.json"
+    record = {
+        **stamp(schema=1, seed=seed),
+        "python": platform.python_version(),
+        "packages": package_versions(),
+        "machine": machine(),
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "config_type": _type_name(config),
+        "config": config,
+    }
     commits: set[str] = set()
     if resumed and path.is_file():
         try:

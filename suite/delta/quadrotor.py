@@ -2,8 +2,7 @@
 
 The replay of a window starts from the measured state; this includes the rotor speeds and the
 commands that are delayed and still to act. Each row of the log is one step of the attitude loop.
-The commanded yaw rate is the recorded one, because an action does not set the heading. The plant is
-the model of mixer, rotors and effects of the vehicle, for steps of a given length.
+The commanded yaw rate is the recorded one, because an action does not set the heading.
 """
 
 from __future__ import annotations

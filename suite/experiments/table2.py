@@ -1,6 +1,6 @@
 """The page `table2`: a policy on three tracks at all ten levels, and the paper's table.
 
-A cell is all trials of one track and level. "Printed" numbers are those of the paper.
+"Printed" numbers are those of the paper.
 """
 
 from __future__ import annotations

@@ -1,10 +1,4 @@
-"""Check a policy's interface and that of flight logs, and name probable faults (`suite check`).
-
-The contract of a policy lists names, units, frames and rate of its inputs and outputs. A fault is
-an error of an interface or a log, such as a wrong unit, sign, scale, order, delay or rate. A
-finding is a record of a probable fault: what it is (`fault`), which signal it is in, the evidence,
-and how to fix it.
-"""
+"""Check a policy's contract and flight logs, and name probable faults (`suite check`)."""
 
 from __future__ import annotations
 

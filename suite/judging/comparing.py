@@ -1,8 +1,7 @@
 """Compare the success rates of separate evaluations on the same trials (`suite compare`).
 
-An evaluation is one `suite eval`. A trial is one judged flight: a track, its level (difficulty 0 to
-9) and a seed. Evaluations on different trials or under different conditions are refused. Policies
-of one method that differ only in the seed of their training are compared as a group.
+Evaluations on different trials or under different conditions are refused. Policies of one method
+that differ only in the seed of their training are compared as a group.
 """
 
 from __future__ import annotations

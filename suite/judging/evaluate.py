@@ -1,8 +1,8 @@
 """Judge policies (`suite eval`): fly the trials in a simulator and write tables of the results.
 
-A trial is one judged flight: a track, its level (difficulty 0 to 9) and a seed. The result of each
-trial is written to a journal when it ends, so an interrupted evaluation continues. An entry is a
-policy in one manner (commanded speed, with or without safety monitor); each has a journal.
+The result of each trial is written to a journal when it ends, so an interrupted evaluation
+continues. An entry is a policy in one manner (commanded speed, with or without safety monitor);
+each has a journal.
 """
 
 from __future__ import annotations
@@ -91,7 +91,13 @@ def evaluate(
         for manner in manners(evaluation.speed, evaluation.monitor)
         for source, policy, label in zip(sources, policies, labels, strict=True)
     ]
-    _refuse_equal_labels([entry.label for entry in entries])
+    names = [entry.label for entry in entries]
+    if repeated := next((name for name in names if names.count(name) > 1), None):
+        # Tables would merge the two entries.
+        raise ValueError(
+            f"{repeated} would be judged twice; give each --policy and each --speed once "
+            "(speeds are compared to 6 digits)"
+        )
     # Announce the work, and fly what the journals lack.
     count = len(trial_set.trials)
     workers = workers_for(count, workers, evaluation.simulator)
@@ -196,16 +202,6 @@ def file_digests(
         contents["sensors"] = sensors_table(sensors)
     contents |= {f"track {name}": track for name, track in tracks.items()}
     return {name: digest_of(content) for name, content in contents.items()}
-
-
-def _refuse_equal_labels(labels: list[str]) -> None:
-    """Refuse two entries with the same label, which tables would merge."""
-    for label in labels:
-        if labels.count(label) > 1:
-            raise ValueError(
-                f"{label} would be judged twice; give each --policy and each --speed once "
-                "(speeds are compared to 6 digits)"
-            )
 
 
 def _open_journals(

@@ -117,19 +117,17 @@ def checkpoint_folder(policy: str, option: str = "--policy") -> Path:
     return folder
 
 
-def policy_labels(
-    sources: Sequence[str], names: Sequence[str], option: str = "--policy"
-) -> list[str]:
+def policy_labels(sources: Sequence[str], names: Sequence[str]) -> list[str]:
     """Return each policy's label: its name, or its source if several policies have that name.
 
-    The user gave the `sources` with `option`; `names` are those of the loaded policies.
+    The user gave the `sources`; `names` are those of the loaded policies.
 
     Raises:
         ValueError: if a source is given twice.
     """
     if len(set(sources)) < len(sources):
         repeated = next(source for source in sources if list(sources).count(source) > 1)
-        raise ValueError(f"{option} {repeated} is given twice; give each policy once")
+        raise ValueError(f"--policy {repeated} is given twice; give each policy once")
     return [
         source if list(names).count(name) > 1 else name
         for source, name in zip(sources, names, strict=True)

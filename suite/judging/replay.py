@@ -1,8 +1,7 @@
 """Fly trials of an earlier evaluation again, to show them as a recording or video (`suite view`).
 
-A trial is one judged flight. A repetition of it gives the same flight to the bit, so an evaluation
-stores no flights. To show a trial, it is flown again with the same policy, vehicle, sensors and
-track; their SHA-256 must be the same.
+A repetition of a trial gives the same flight to the bit, so an evaluation stores no flights. The
+SHA-256 of policy, vehicle, sensors and track must be the same.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from eval.judging.judge import Record
 from eval.logs.flight import Flight
 from eval.worlds.trial import TrialResult, TrialSpec, track_of
-from suite.common.console import Console
 from suite.judging.content import policy_digest
 from suite.judging.evaluate import file_digests
 from suite.judging.flying import default_policy, fly_trials, load_in_manner, manners
@@ -147,11 +145,3 @@ def _refuse_changed(
                 "differ; restore the judged version, or run suite eval again with another --out, "
                 "then view that folder"
             )
-
-
-def record_first_trials(evaluation: Evaluation, path: Path, console: Console) -> None:
-    """Write a rerun recording of the first trial of every track and level to `path`."""
-    from eval.view.recording import write_recording
-
-    write_recording(path, *fly_again(evaluation, first_trials(evaluation)))
-    console.say(f"written: {path} (open it with: rerun {path})")

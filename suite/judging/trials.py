@@ -1,8 +1,6 @@
 """The trials that a command flies: tracks and levels by name, with vehicle and sensors.
 
-A trial is one judged flight; its track, level (difficulty 0 to 9) and seed determine it. A track is
-a family, which draws it from the seed, or a file. `read_trial_set` reads all that the options of
-`suite eval`, `suite collect` and `suite fly` name.
+`read_trial_set` reads all that the options of `suite eval`, `suite collect` and `suite fly` name.
 """
 
 from __future__ import annotations
@@ -81,17 +79,6 @@ def is_track_file(name: str) -> bool:
     return name.endswith(".toml")
 
 
-def custom_tracks(names: Sequence[str]) -> dict[str, Track]:
-    """Return the tracks of those `names` that are files, by name.
-
-    Raises:
-        ValueError: for an invalid file, with the invalid key.
-    """
-    from tracks.formats.custom import load_track
-
-    return {name: load_track(name) for name in names if is_track_file(name)}
-
-
 def trial_list(
     tracks: Sequence[str],
     levels: Sequence[int],
@@ -152,6 +139,7 @@ def read_trial_set(
     from eval.sensors.sensors_file import load_sensors
     from eval.worlds import differences, world_class
     from eval.worlds.engine import course_notes
+    from tracks.formats.custom import load_track
 
     world_class(options.simulator)
     check_ranges(options, options=True)
@@ -159,7 +147,7 @@ def read_trial_set(
     sensors = load_sensors(options.sensors)
     if track is None:
         names, levels = parse_tracks(options.track), parse_levels(options.difficulty)
-        tracks = custom_tracks(names)
+        tracks = {name: load_track(name) for name in names if is_track_file(name)}
     else:
         names, levels, tracks = [track.family], [0], {track.family: track}
     notes = without_signal(vehicle)

@@ -1,8 +1,4 @@
-"""Compare the policies that a loop judged on the same trials: numbers, tables and sentences.
-
-The trials of one track and level are a cell. A p-value is that of the exact two-sided McNemar test,
-which compares the successes on equal trials.
-"""
+"""Compare the policies that a loop judged on the same trials: numbers, tables and sentences."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""The settings of a loop, computed from a recipe (named settings of a training) and the options.
+"""The settings of a loop, computed from a recipe and the options.
 
-The true vehicle produces the flights. In a loop with a hidden vehicle it differs from the vehicle
-file of the simulation; else it is the same.
+The true vehicle produces the flights; without a hidden vehicle it is that of the simulation.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from eval.judging.judge import check_records
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -23,6 +22,7 @@ from suite.diagnose.estimate.parameters import refuse_own_motion
 from suite.judging.content import policy_digest
 from suite.judging.flying import checkpoint_folder, default_policy
 from suite.judging.trials import is_track_file, parse_levels, parse_tracks
+from suite.loop.options import Config
 from suite.train.config import TrainConfig, check
 from suite.train.overrides import at_rate, check_owned, check_phases, phase_configs, with_changes
 from suite.train.recipes import (
@@ -152,63 +152,49 @@ def loop_by_content(config: LoopConfig) -> LoopConfig:
     return replace(config, policy=policy, vehicle=vehicle, sensors=sensors, hidden_vehicle=hidden)
 
 
-def resolve(
-    *,
-    recipe: str | None = None,
-    hidden_vehicle: str | None = None,
-    simulator: str = EXACT_SIMULATORS[0],
-    sensors: str = "perfect",
-    policy: str | None = None,
-    track: str = "all",
-    difficulty: str = "0,3",
-    trials: int | None = None,
-    flights: int | None = None,
-    vehicle: str = "reference",
-    seed: int = 0,
-    iterations: int | None = None,
-    finetune_iterations: int | None = None,
-    fit_iterations: int | None = None,
-    delta: bool = True,
-    changes: Sequence[str] = (),
-) -> LoopConfig:
-    """Return the settings of a loop from a recipe and options.
+def resolve(options: Config) -> LoopConfig:
+    """Return the settings of a loop from its options.
 
-    Numbers that are None are those of the loop's size (`SIZES`, `HIDDEN_SIZE`). Without `recipe` it
+    Numbers that are None are those of the loop's size (`SIZES`, `HIDDEN_SIZE`). Without a recipe it
     is that of the policy. With a hidden vehicle or another simulator nothing is trained from
-    scratch, and the default policy is the shipped one. With a policy, `changes` apply to its
-    fine-tuning, else to the recipe.
+    scratch, and the default policy is the shipped one. With a policy, `--set` changes its
+    fine-tuning, else the recipe.
 
     Raises:
         ValueError: for an invalid option, with what is allowed.
     """
+
+    def given(value: Any, otherwise: Any) -> Any:
+        """Return the value of an option if there is one."""
+        return otherwise if value is None else value
+
     # The kind of loop, its recipe and its size.
+    simulator, hidden_vehicle = options.simulator, options.hidden_vehicle
     hidden = hidden_vehicle is not None or simulator != EXACT_SIMULATORS[0]
-    if hidden and policy is None:
-        policy = default_policy()
-    if recipe is None:
-        recipe = policy if policy in RECIPES else "race"
-    training = replace(named_recipe(recipe), seed=seed)
+    policy = default_policy() if hidden and options.policy is None else options.policy
+    recipe = given(options.recipe, policy if policy in RECIPES else "race")
+    training = replace(named_recipe(recipe), seed=options.seed)
     size = HIDDEN_SIZE if hidden else SIZES.get(recipe, SIZES[""])
-    if iterations is not None:
-        training = with_iterations(training, iterations)
+    if options.iterations is not None:
+        training = with_iterations(training, options.iterations)
     # The simulation's vehicle, and options that contradict each other.
-    simulated = load_vehicle(vehicle)
-    _check_changes(changes, policy, iterations, hidden)
-    if not delta and not hidden:
+    simulated = load_vehicle(options.vehicle)
+    _check_changes(options.set, policy, options.iterations, hidden)
+    if options.no_delta and not hidden:
         raise ValueError(
             "--no-delta: without --hidden-vehicle the loop needs the Delta Action Model; leave "
             "--no-delta out, or give a hidden vehicle"
         )
-    if not delta and fit_iterations is not None:
+    if options.no_delta and options.fit_iterations is not None:
         raise ValueError(
-            f"--fit-iterations is {fit_iterations}, but with --no-delta no Delta Action Model is "
-            "fitted; leave one of the two out"
+            f"--fit-iterations is {options.fit_iterations}, but with --no-delta no Delta Action "
+            "Model is fitted; leave one of the two out"
         )
     if not hidden and policy is None:
-        training = with_changes(training, changes)
+        training = with_changes(training, options.set)
         check_phases(training)
     # The true vehicle, which must differ from the simulation's.
-    true, true_vehicle = None, vehicle if hidden_vehicle is None else hidden_vehicle
+    true, true_vehicle = None, options.vehicle if hidden_vehicle is None else hidden_vehicle
     if hidden:
         refuse_own_motion(simulated)
         world_class(simulator)
@@ -216,11 +202,11 @@ def resolve(
         true = load_vehicle(true_vehicle)
         if simulated == replace(true, name=simulated.name) and simulator in EXACT_SIMULATORS:
             raise ValueError(
-                f"--hidden-vehicle {true_vehicle} is the simulation's vehicle {vehicle}: nothing "
-                "is hidden; give a vehicle file with one more effect, such as "
+                f"--hidden-vehicle {true_vehicle} is the simulation's vehicle {options.vehicle}: "
+                "nothing is hidden; give a vehicle file with one more effect, such as "
                 "examples/hidden.toml, or another simulator, such as --simulator rotorpy"
             )
-    digests = _digests(simulated, load_sensors(sensors), true)
+    digests = _digests(simulated, load_sensors(options.sensors), true)
     # The settings of the fine-tuning.
     if policy is not None:
         spec = load_policy_checkpoint(checkpoint_folder(policy)).spec
@@ -228,31 +214,32 @@ def resolve(
         training = replace(at_rate(last, spec.rate_hz), spec=spec)
         digests["policy"] = policy_digest(policy)
     tuning = finetune(training)
-    steps = size.finetune_iterations if finetune_iterations is None else finetune_iterations
+    steps = given(options.finetune_iterations, size.finetune_iterations)
     if steps is not None:
         tuning = with_iterations(tuning, steps)
     if hidden:
         tuning = with_usual_spreads(with_quadrotor(tuning, simulated))
     if policy is not None:
-        tuning = with_changes(tuning, changes)
-    fit_steps = size.fit_iterations if fit_iterations is None else fit_iterations
+        tuning = with_changes(tuning, options.set)
     check(tuning)
     config = LoopConfig(
         training=training,
         tuning=tuning,
-        fit=FitConfig(iterations=fit_steps, seed=seed),
+        fit=FitConfig(
+            iterations=given(options.fit_iterations, size.fit_iterations), seed=options.seed
+        ),
         policy=policy,
-        track=track,
-        difficulty=difficulty,
-        trials=size.trials if trials is None else trials,
-        flights=size.flights if flights is None else flights,
-        vehicle=vehicle,
-        sensors=sensors,
-        seed=seed,
+        track=options.track,
+        difficulty=options.difficulty,
+        trials=given(options.trials, size.trials),
+        flights=given(options.flights, size.flights),
+        vehicle=options.vehicle,
+        sensors=options.sensors,
+        seed=options.seed,
         digests=digests,
         hidden_vehicle=true_vehicle if hidden else None,
         simulator=simulator,
-        delta=delta,
+        delta=not options.no_delta,
     )
     check_ranges(config)
     _check_seeds(config)

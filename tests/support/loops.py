@@ -9,7 +9,14 @@ import numpy as np
 import eval.judging.judge
 import suite.train.run
 from eval.worlds.trial import Rules
+from suite.loop import config as loop_config
 from suite.loop.config import RECORDED_FROM
+from suite.loop.options import Config
+
+
+def resolve(**options):
+    """Return the settings of a loop with these options."""
+    return loop_config.resolve(Config(**options))
 
 
 def made_update(trained, config, delta=None, begin=0):

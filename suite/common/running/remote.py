@@ -1,8 +1,8 @@
 """Do a job on another machine of a cluster, which shares no files with this one.
 
-A job is work whose product is a folder. The other machine gets and returns the content of folders.
-It works in a folder of the user's cache that is named by the SHA-256 of the job. So a second worker
-continues from the files of one that was killed.
+The other machine gets and returns the content of folders. It works in a folder of the user's cache
+that is named by the SHA-256 of the job. So a second worker continues from the files of one that was
+killed.
 """
 
 from __future__ import annotations

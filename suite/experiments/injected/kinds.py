@@ -1,8 +1,8 @@
 """The catalogue of injected faults: each changes the signals of a flight or its vehicle file.
 
-A fault is an error of an interface or a log, such as a wrong unit or sign. Most faults are made by
-a reading: an expression such as "rate=x,-y,z" that converts a signal, here a correct one into a
-wrong one (`eval.logs.faults.reading`). "race" marks faults that ended flights in a vision race.
+Most faults are made by a reading: an expression such as "rate=x,-y,z" that converts a signal, here
+a correct one into a wrong one (`eval.logs.faults.reading`). "race" marks faults that ended flights
+in a vision race.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The tables printed in Su et al. 2026 (paper.toml), and the goals of our policy by cell.
-
-A cell is the trials of one track at one level of difficulty.
-"""
+"""The tables printed in Su et al. 2026 (paper.toml), and the goals of our policy by cell."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Fly policies under conditions: single effects at their usual size, and sweeps.
 
-An effect is one physical cause of a mismatch, such as drag. Its neutral value is the one that
-changes nothing, such as a drag of 0. A sweep is a series of conditions in which one disturbance
-grows.
+The neutral value of an effect changes nothing, such as a drag of 0. A sweep is a series of
+conditions in which one disturbance grows.
 """
 
 from __future__ import annotations

@@ -29,14 +29,14 @@ from suite.common.stages import announce
 from suite.experiments.study.cache import FLIES, Workspace, code_digest, digest
 from suite.judging.content import PolicyContent, policy_digest
 from suite.judging.flying import (
-    TRIALS_A_PROCESS,
     default_policy,
     flying_estimate,
     policy_labels,
     relative_cost,
+    workers_for,
 )
 from suite.judging.trials import parse_levels, trial_list
-from tracks.common.work import run_pieces, usable_cores, worker_count
+from tracks.common.work import run_pieces, worker_count
 from tracks.families import JUDGED
 
 Key = TypeVar("Key", bound=Hashable)
@@ -73,9 +73,12 @@ def fly_trials(
     # 1. Find the journal of each request. Requests with the same setup share one.
     policies = {request.policy for request in requests.values()}
     digests = {policy: policy_digest(policy) for policy in policies}
-    # Everything except the trial that determines the outcome of a flight.
-    inputs = {
-        key: {
+    names: dict[Key, str] = {}
+    setups: dict[str, TrialRequest] = {}
+    inputs: dict[str, dict[str, Any]] = {}
+    for key, request in requests.items():
+        # Everything except the trial that determines the outcome of a flight.
+        entry = {
             "policy_sha256": digests[request.policy],
             "vehicle": request.vehicle,
             "sensors": request.sensors,
@@ -83,31 +86,26 @@ def fly_trials(
             "code": code_digest(*FLIES),
             "engines": engines(),
         }
-        for key, request in requests.items()
-    }
-    names = {key: digest(entry) for key, entry in inputs.items()}
-    setups = {names[key]: request for key, request in requests.items()}
-    # Trials of each journal: dictionaries as sets that keep their order.
-    requested: dict[str, dict[TrialSpec, None]] = {name: {} for name in setups}
-    for key, request in requests.items():
-        requested[names[key]].update(dict.fromkeys(request.trials))
+        names[key] = name = digest(entry)
+        earlier = setups[name].trials if name in setups else ()
+        trials = list(dict.fromkeys([*earlier, *request.trials]))
+        setups[name], inputs[name] = replace(request, trials=trials), entry
     with ExitStack() as stack:
         journals = {
             name: stack.enter_context(Journal(workspace.cache / "trials" / f"{name}.jsonl", entry))
-            for name, entry in {names[key]: entry for key, entry in inputs.items()}.items()
+            for name, entry in inputs.items()
         }
         # 2. Read which trials are done, and fly the others in pieces of work.
         missing = [
-            replace(setups[name], trials=journals[name].missing(list(trials)))
-            for name, trials in requested.items()
+            replace(setup, trials=journals[name].missing(setup.trials))
+            for name, setup in setups.items()
         ]
         remaining = sum(len(request.trials) for request in missing)
-        total = sum(map(len, requested.values()))
+        total = sum(len(setup.trials) for setup in setups.values())
         if remaining < total:
             console.note(f"{title}: {total - remaining} of {total} trials were flown before")
         if remaining:
-            useful_processes = max(1, remaining // TRIALS_A_PROCESS)
-            workers = workspace.workers or min(usable_cores(), useful_processes)
+            workers = workers_for(remaining, workspace.workers, "mujoco")
             cost = sum(relative_cost(one.simulator) * len(one.trials) for one in missing)
             announce(console, f"{title}: {remaining} trials", flying_estimate(cost, workers))
             trial_numbers, all_journals = count(total - remaining + 1), list(journals.values())

@@ -1,7 +1,4 @@
-"""Options that several experiments have, and the recipe that they select.
-
-A recipe is a named set of settings of a training (`suite/train/recipes.py`).
-"""
+"""Options that several experiments have, and the recipe that they select."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Export a policy to other formats (`suite export`).
 
 An export in C is compiled, and its actions are compared with those of the original policy (parity).
-A card, a Markdown page next to the export, has the largest difference and the time per step.
+Its card has the largest difference and the time per step.
 """
 
 from __future__ import annotations
@@ -76,7 +76,12 @@ def _record_source(
         ValueError: naming the file and what to do.
     """
     source, digest = str(shipped.locate(policy).resolve()), policy_digest(policy)
-    records = _read_sources(out / NOTE)
+    path, records = out / NOTE, {}
+    if path.is_file():
+        try:
+            records = {file: dict(entry) for file, entry in read_json(path)["files"].items()}
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"{path}: not a record of exports ({error}); move it away") from error
     for files in exports:
         old = records.get(files[0], {})
         present = [file for file in files if (out / file).exists()]
@@ -90,17 +95,7 @@ def _record_source(
                 f"{policy}; give another --out, or move the file away"
             )
         records[files[0]] = {"source": source, "sha256": digest}
-    write_json(out / NOTE, {**stamp(1, seed), "files": records})
-
-
-def _read_sources(path: Path) -> dict[str, dict[str, str]]:
-    """Return the source policy and its SHA-256 for each exported file; {} without a record."""
-    if not path.is_file():
-        return {}
-    try:
-        return {file: dict(entry) for file, entry in read_json(path)["files"].items()}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: not a record of exports ({error}); move it away") from error
+    write_json(path, {**stamp(1, seed), "files": records})
 
 
 CARD = "card.md"
@@ -137,8 +132,8 @@ def card_text(
 
 def _success_rates(source: str) -> str:
     """Return the table of success rates in the card of the policy, or a line that has none."""
-    path = shipped.locate(source) / "card.md"
-    text = Path(path).read_text(encoding="utf-8") if path.is_file() else ""
+    path = shipped.locate(source) / CARD
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
     lines = text.splitlines()
     headers = [k for k, line in enumerate(lines) if line.startswith("|") and "success" in line]
     if not headers:

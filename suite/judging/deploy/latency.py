@@ -1,7 +1,6 @@
 """Measure the time of a policy's single steps on one thread, in C, ONNX Runtime and torch.
 
-A step is one decision of the policy. The three ways to run a policy are called engines. They run in
-turn, in blocks of steps, so that the load of the machine affects all of them alike.
+These engines run in turn, in blocks of steps, so that the load of the machine affects all alike.
 """
 
 from __future__ import annotations

@@ -113,12 +113,10 @@ class Recorder(Wrapper):
         return Observed(*arrays)
 
 
-def observed_flights(
-    policy: Policy, vehicle: str = "reference", levels: tuple[int, ...] = LEVELS
-) -> Observed:
+def observed_flights(policy: Policy, levels: tuple[int, ...] = LEVELS) -> Observed:
     """Return the inputs of `policy` on one flight of a random track at each level."""
     recorder = Recorder(policy)
     trials = [TrialSpec(TRACK, level, SEED + k) for k, level in enumerate(levels)]
     options = JudgeOptions(slots=len(trials), workers=1)
-    fly(recorder, trials, load_vehicle(vehicle), options=options)
+    fly(recorder, trials, load_vehicle("reference"), options=options)
     return recorder.observed()

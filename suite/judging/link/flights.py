@@ -1,8 +1,7 @@
 """Fly over the link in real time: many trials with a simulated vehicle, or one with a real vehicle.
 
-A trial is one flight on a track that a seed determines. The companion (`companion.py`) runs the
-policy and its checks. This module exchanges its datagrams with the vehicle, writes its logs and
-computes statistics of its delays.
+The companion (`companion.py`) runs the policy and its checks. This module exchanges its datagrams
+with the vehicle, writes its logs and computes statistics of its delays.
 """
 
 from __future__ import annotations
@@ -19,14 +18,15 @@ import numpy as np
 
 from eval.logs import flight as recorded
 from eval.logs.columns import FlightLogError
-from eval.logs.flight_log import FlightLog, log_from_flight, write_flight
+from eval.logs.flight_log import log_from_flight, write_flight
 from eval.worlds.trial import Rules, TrialSpec, track_of
 from policies.observation import Observation
 from policies.policy import Policy
 from suite.common.console import Console
 from suite.judging.link.companion import FINISHED, Companion, Row
 from suite.judging.link.messages import Wire
-from suite.judging.link.server import COMPANION, VEHICLE, WAIT_S, FlightRequest, VehicleProcess
+from suite.judging.link.server import COMPANION, VEHICLE, WAIT_S, VehicleProcess
+from suite.judging.link.simulated import FlightRequest
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
 from suite.judging.trials import TrialSet, log_name
@@ -95,14 +95,14 @@ def _fly_trial(
         camera, rate_hz = policy.spec.camera, policy.spec.rate_hz
         vehicle.start(
             FlightRequest(
-                track, trial, trial_set.vehicle, rules, camera, rate_hz, address, policy.name
+                track, trial, trial_set.vehicle, rules, camera, rate_hz, policy.name, address
             )
         )
         # Fly until the trial ends or the companion hands over.
         result = None
         with _no_garbage_collection():
             while result is None and companion.over is None:
-                exchange(companion, link)
+                link.send(companion.receive(link.receive(POLL_S)))
                 result = vehicle.result()
         if result is None:
             wait_s = AFTER_S if companion.over == FINISHED else 0.0
@@ -123,11 +123,6 @@ def _fly_trial(
     return Flight(row, companion.rows)
 
 
-def exchange(companion: Companion, link: UdpLink) -> None:
-    """Pass received datagrams to the companion, and send its answers."""
-    link.send(companion.receive(link.receive(POLL_S)))
-
-
 def fly_link(
     companion: Companion,
     link: UdpLink,
@@ -145,7 +140,7 @@ def fly_link(
             if clock() - heartbeat_s > HEARTBEAT_S:
                 link.send([companion.heartbeat()])
                 heartbeat_s = clock()
-            exchange(companion, link)
+            link.send(companion.receive(link.receive(POLL_S)))
             if not companion.rows and clock() - begin_s > wait_s:
                 return
 
@@ -155,18 +150,39 @@ def write_log(
 ) -> str | None:
     """Write a flight's log into `out` and return its name; None if it is no valid flight log.
 
-    `about` has the track, level and seed, and is stored in the log. `console` shows why a log is
-    not written.
+    A flight with fewer than two states has none. `about` has the track, level and seed, and is
+    stored in the log. `console` shows why a log is not written.
     """
-    log = log_of(companion, about)
-    name = log_name(about["track"], about["difficulty"], about["seed"])
+    rows = companion.rows
+    if len(rows) < 2:
+        return None
+    start_s = rows[0].state.time_s
+    flight = recorded.Flight(
+        time_s=np.array([row.state.time_s - start_s for row in rows]),
+        pos_w=np.stack([row.state.pos_w for row in rows]),
+        quat_wxyz=np.stack([row.state.quat_wxyz for row in rows]),
+        vel_w=np.stack([row.state.vel_w for row in rows]),
+        rate_b=np.stack([row.state.rate_b for row in rows]),
+        thrust_cmd=np.array([row.thrust for row in rows]),
+        rate_cmd_b=np.stack([row.rate_b for row in rows]),
+        rotor_speed=np.full((len(rows), 4), np.nan),
+        action_b=np.stack([row.action_b for row in rows]),
+        policy_step=np.array([row.decided for row in rows]),
+        gate=np.array([row.gate for row in rows], np.int32),
+        depth_m=None,
+        about={**about, "events": companion.events, "handed_over": companion.over},
+        action_kind=companion.action_kind,
+    )
+    name, log = (
+        log_name(about["track"], about["difficulty"], about["seed"]),
+        log_from_flight(flight),
+    )
     try:
-        if log is not None:
-            write_flight(out / name, log)
-            return name
+        write_flight(out / name, log)
     except FlightLogError as error:
         console.note(f"warning: the flight's log is not written: {error}")
-    return None
+        return None
+    return name
 
 
 def totals(flights: list[Flight], limits: Limits) -> dict[str, Any]:
@@ -220,28 +236,3 @@ def delays(rows: list[Row], deadline_s: float) -> dict[str, Any]:
             "max": float(delay_ms.max()),
         }
     return statistics
-
-
-def log_of(companion: Companion, about: dict[str, Any]) -> FlightLog | None:
-    """Return the log of the companion's flight; None with fewer than two states."""
-    rows = companion.rows
-    if len(rows) < 2:
-        return None
-    start_s = rows[0].state.time_s
-    flight = recorded.Flight(
-        time_s=np.array([row.state.time_s - start_s for row in rows]),
-        pos_w=np.stack([row.state.pos_w for row in rows]),
-        quat_wxyz=np.stack([row.state.quat_wxyz for row in rows]),
-        vel_w=np.stack([row.state.vel_w for row in rows]),
-        rate_b=np.stack([row.state.rate_b for row in rows]),
-        thrust_cmd=np.array([row.thrust for row in rows]),
-        rate_cmd_b=np.stack([row.rate_b for row in rows]),
-        rotor_speed=np.full((len(rows), 4), np.nan),
-        action_b=np.stack([row.action_b for row in rows]),
-        policy_step=np.array([row.decided for row in rows]),
-        gate=np.array([row.gate for row in rows], np.int32),
-        depth_m=None,
-        about={**about, "events": companion.events, "handed_over": companion.over},
-        action_kind=companion.action_kind,
-    )
-    return log_from_flight(flight)

@@ -1,8 +1,7 @@
 """The work of `suite fly`: fly a policy over a MAVLink link, simulated or to a real vehicle.
 
-The link connects the vehicle with the companion, which runs the policy. Simulated flights are
-compared with the same trials of the judge, which flies policies in MuJoCo without a link and scores
-them. The companion hands over when it stops sending commands; then the autopilot flies alone.
+Simulated flights are compared with the same trials of the judge, which flies without a link. The
+companion hands over when it stops sending commands; then the autopilot flies alone.
 """
 
 from __future__ import annotations

@@ -1,7 +1,5 @@
 """Convert between the link's messages (MAVLink 2, dialect `common`) and values in our frames.
 
-The link connects the vehicle with the companion computer, which runs the policy.
-
 | content | message |
 |---|---|
 | state of the vehicle | ODOMETRY (331): LOCAL_NED, velocity there or in BODY_FRD |

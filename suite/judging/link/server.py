@@ -1,7 +1,4 @@
-"""Run a simulated vehicle in a separate process, which flies in real time at its end of the link.
-
-The link connects the vehicle with the companion, which runs the policy.
-"""
+"""Run a simulated vehicle in another process, which flies in real time at its end of the link."""
 
 from __future__ import annotations
 
@@ -11,15 +8,12 @@ import time
 from multiprocessing.connection import Connection
 from typing import NamedTuple
 
-from eval.vehicles.vehicle import Vehicle
-from eval.worlds.trial import Rules, TrialResult, TrialSpec
+from eval.worlds.trial import TrialResult
 from suite.common.errors import WorkFailed
 from suite.judging.link.messages import Wire
-from suite.judging.link.simulated import SimulatedVehicle
+from suite.judging.link.simulated import FlightRequest, SimulatedVehicle
 from suite.judging.link.udp import UdpLink
 from tracks.common.work.pickling import register_dict_views
-from tracks.geometry.camera import Camera
-from tracks.track import Track
 
 VEHICLE, COMPANION = 1, 2
 """MAVLink system numbers of the two ends of the link."""
@@ -28,22 +22,6 @@ WAIT_S = 30.0
 SLIP_S = 0.02
 """Longest delay of a step that the following steps make up for [s]. After a longer one (a slip) the
 later steps are shifted in time."""
-
-
-class FlightRequest(NamedTuple):
-    """A flight for the vehicle's process: track, trial, vehicle, when it ends, and its camera."""
-
-    track: Track
-    trial: TrialSpec
-    vehicle: Vehicle
-    rules: Rules
-    camera: Camera
-    image_hz: float
-    """Rate of the depth images [Hz]."""
-    address: str
-    """UDP address of the other end."""
-    policy: str
-    """Name of the policy, for the result."""
 
 
 class VehicleResult(NamedTuple):
@@ -110,11 +88,7 @@ def fly_in_real_time(request: FlightRequest, pipe: Connection) -> VehicleResult:
     """Fly one trial in real time, until it ends or the pipe has a message (to stop)."""
     link = UdpLink(request.address)
     try:
-        wire = Wire(VEHICLE, COMPANION)
-        vehicle = SimulatedVehicle(
-            request.track, request.trial, request.vehicle, request.camera, request.image_hz, wire,
-            request.rules,
-        )  # fmt: skip
+        vehicle = SimulatedVehicle(request, Wire(VEHICLE, COMPANION))
         begin, due, slips = time.monotonic(), time.monotonic(), 0
         while not vehicle.over and not pipe.poll():
             # Wait until the step is due; if it is too late, shift the later steps.
@@ -131,4 +105,4 @@ def fly_in_real_time(request: FlightRequest, pipe: Connection) -> VehicleResult:
         slips += not vehicle.over and time.monotonic() - due > SLIP_S + vehicle.dt
     finally:
         link.close()
-    return VehicleResult(vehicle.result(request.policy), slips)
+    return VehicleResult(vehicle.result(), slips)

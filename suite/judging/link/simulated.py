@@ -2,10 +2,12 @@
 
 It sends its state and depth images over MAVLink, and flies the received set points (body rates and
 thrust). Before the first set point it stays at the trial's start. If set points stop, it brakes and
-hovers. The physics are those of the judge, which flies policies in MuJoCo and scores them.
+hovers. The physics are those of the judge.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -31,33 +33,40 @@ BRAKE_MOST = 6.0
 """Largest deceleration while braking, on each axis [m/s^2]."""
 
 
+class FlightRequest(NamedTuple):
+    """A flight of a simulated vehicle."""
+
+    track: Track
+    trial: TrialSpec
+    """The trial, whose seed determines the gusts."""
+    vehicle: Vehicle
+    rules: Rules
+    """When the trial ends."""
+    camera: Camera
+    image_hz: float
+    """Rate of the depth images [Hz]."""
+    policy: str
+    """Name of the policy, for the result."""
+    address: str = ""
+    """UDP address of the other end."""
+
+
 class SimulatedVehicle:
     """The vehicle of one trial; `step` makes one physics step."""
 
-    def __init__(
-        self,
-        track: Track,
-        trial: TrialSpec,
-        vehicle: Vehicle,
-        camera: Camera,
-        image_hz: float,
-        wire: Wire,
-        rules: Rules | None = None,
-    ) -> None:
-        """Place the vehicle at the start of `track`.
-
-        The seed of `trial` determines the gusts. `image_hz` is the rate of the images [Hz].
-        """
-        self._vehicle, self._wire, self._trial = vehicle, wire, trial
-        self._autopilot = make_autopilot(vehicle)
+    def __init__(self, request: FlightRequest, wire: Wire) -> None:
+        """Place the vehicle at the start of its track."""
+        self._request, self._wire, trial = request, wire, request.trial
+        self._autopilot = make_autopilot(request.vehicle)
         self.dt = self._autopilot.dt
-        self._judged = OneTrial(track, vehicle, self.dt, rules or Rules())
+        self._judged = OneTrial(request.track, request.vehicle, self.dt, request.rules)
         self._data = mujoco.MjData(self._judged.model)
         motion = self._judged.put_at_start(self._data)
         self._gusts = GustDraws(trial) if uses_noise(self._autopilot.plant) else None
         first = self._gusts and self._gusts.at(0, 1)
         self._plant = start_autopilot(self._autopilot, motion, first).plant
-        self._eye, self._steps_an_image = DepthCamera(camera), 1 / (image_hz * self.dt)
+        self._eye = DepthCamera(request.camera)
+        self._steps_an_image = 1 / (request.image_hz * self.dt)
         self._command: Command | None = None
         self._command_step = self._ticks = 0
         self.images = 0
@@ -90,8 +99,8 @@ class SimulatedVehicle:
                 isinstance(message, SetPoint)
                 and np.isfinite([*message.rate_b, message.thrust]).all()
             ):
-                thrust = np.clip(message.thrust, 0.0, 1.0) * self._vehicle.full_thrust
-                limit = np.array(self._vehicle.controller.rate_max)
+                thrust = np.clip(message.thrust, 0.0, 1.0) * self._request.vehicle.full_thrust
+                limit = np.array(self._request.vehicle.controller.rate_max)
                 rate_b = np.clip(message.rate_b, -limit, limit)
                 self._command = Command(np.array([thrust]), rate_b[None])
                 self._command_step = int(self._judged.progress.step[0])
@@ -138,17 +147,18 @@ class SimulatedVehicle:
         acc_w = (-BRAKE * motion.vel_w).clip(-BRAKE_MOST, BRAKE_MOST)
         force_w = action_to_force(to_local(motion.rot_w, acc_w), motion.rot_w)
         heading_w = level_heading(motion.rot_w)
-        return attitude_command(self._vehicle.controller, force_w, motion.rot_w, heading_w)
+        controller = self._request.vehicle.controller
+        return attitude_command(controller, force_w, motion.rot_w, heading_w)
 
-    def result(self, policy: str) -> TrialResult:
+    def result(self) -> TrialResult:
         """Return the trial's result so far; an unfinished one counts as a timeout."""
         columns = result_columns(self._judged.progress, 0, self.dt)
         is_collision = columns["ended_by"] == "collision"
         return TrialResult(
-            *self._trial,
+            *self._request.trial,
             **columns,
-            policy=policy,
-            vehicle=self._vehicle.name,
+            policy=self._request.policy,
+            vehicle=self._request.vehicle.name,
             world="link",
             collided_with=contact_name(self._judged.model, self._data) if is_collision else None,
             bad_actions=0,

@@ -1,8 +1,8 @@
 """The watchdog of a flight over a link: checks of the received states, with their limits.
 
-Beyond a limit the companion computer, which runs the policy, hands over: it stops sending commands,
-and the autopilot flies alone. The policy's actions are checked elsewhere: by the action guard
-(`eval/judging/guard.py`), and with `--monitor` by the safety monitor (`eval/judging/monitor.py`).
+Beyond a limit the companion hands over. The policy's actions are checked elsewhere: by the action
+guard (`eval/judging/guard.py`), and with `--monitor` by the safety monitor
+(`eval/judging/monitor.py`).
 """
 
 from __future__ import annotations

@@ -121,7 +121,6 @@ def test_a_trial_whose_first_answer_is_late_ends_where_it_started():
 
 
 SPEC = PolicySpec(rate_hz=15.0)
-BOUNDS = monitor.MonitorLimits()
 PERIOD_S = 1.0 / SPEC.rate_hz
 
 
@@ -146,50 +145,50 @@ def test_depths_come_back_as_points_along_the_rays():
 
 def test_tilt_and_speed_bend_an_action_and_small_ones_pass():
     gentle = np.array([[2.0, 1.0, 0.5]])
-    np.testing.assert_allclose(monitor.limited(BOUNDS, gentle, seen()), gentle, atol=1e-12)
-    wild = monitor.limited(BOUNDS, np.array([[200.0, 0.0, 0.0]]), seen(vel_b=(1.0, 0.0, 0.0)))[0]
+    np.testing.assert_allclose(monitor.limited(gentle, seen()), gentle, atol=1e-12)
+    wild = monitor.limited(np.array([[200.0, 0.0, 0.0]]), seen(vel_b=(1.0, 0.0, 0.0)))[0]
     tilt = np.degrees(np.arctan2(wild[0], wild[2] + 9.81))
-    assert tilt == pytest.approx(BOUNDS.tilt_deg)
-    fast = monitor.limited(BOUNDS, np.array([[5.0, 1.0, 0.0]]), seen(vel_b=(15.0, 0.0, 0.0)))[0]
+    assert tilt == pytest.approx(monitor.TILT_DEG)
+    fast = monitor.limited(np.array([[5.0, 1.0, 0.0]]), seen(vel_b=(15.0, 0.0, 0.0)))[0]
     np.testing.assert_allclose(fast, [0.0, 1.0, 0.0], atol=1e-12)
     braking = np.array([[-5.0, 0.0, 0.0]])
-    assert (monitor.limited(BOUNDS, braking, seen(vel_b=(15.0, 0.0, 0.0))) == braking).all()
+    assert (monitor.limited(braking, seen(vel_b=(15.0, 0.0, 0.0))) == braking).all()
 
 
 def test_how_near_a_path_comes_is_worked_out():
     times = np.array([0.0, 0.2, 0.4])
     ahead = seen(vel_b=(5.0, 0.0, 0.0), depth_m=3.0)
-    coast = monitor.clearance(BOUNDS, ahead, np.zeros((1, 3)), None, times, PERIOD_S)
+    coast = monitor.clearance(ahead, np.zeros((1, 3)), None, times, PERIOD_S)
     points = ahead.points_b[0]
     path = np.array([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]])
     expected = np.linalg.norm(points[None] - path[:, None], axis=-1).min()
     assert coast == pytest.approx(expected)
-    stop = monitor.clearance(BOUNDS, ahead, np.array([[-20.0, 0, 0]]), None, times, PERIOD_S)
+    stop = monitor.clearance(ahead, np.array([[-20.0, 0, 0]]), None, times, PERIOD_S)
     assert stop > coast
-    assert monitor.clearance(BOUNDS, seen(), np.zeros((1, 3)), None, times, PERIOD_S) == np.inf
+    assert monitor.clearance(seen(), np.zeros((1, 3)), None, times, PERIOD_S) == np.inf
 
 
 def test_a_way_out_is_taken_at_the_last_moment_and_not_before():
     """Towards a wall as wide as the image: from afar the policy has its will, near it has not."""
     will = np.zeros((1, 3))
     taken_at, action, view, blocked = None, will, seen(), 0
-    times = np.linspace(0.025, BOUNDS.horizon_s, 24)
+    times = np.linspace(0.025, monitor.HORIZON_S, 24)
     for depth_m in np.arange(6.0, 0.3, -0.1):
         view = seen(vel_b=(4.0, 0.0, 0.0), depth_m=depth_m)
-        action, taken = monitor.last_moment(BOUNDS, will, view, PERIOD_S)
+        action, taken = monitor.last_moment(will, view, PERIOD_S)
         if taken[0]:
             taken_at = depth_m
             break
         assert (action == will).all()
-        ahead = monitor.clearance(BOUNDS, view, will, None, times, PERIOD_S)
-        blocked += bool(ahead[0] < BOUNDS.clearance_m)
+        ahead = monitor.clearance(view, will, None, times, PERIOD_S)
+        blocked += bool(ahead[0] < monitor.CLEARANCE_M)
     assert blocked >= 3  # its path is blocked and there is time yet
     assert taken_at is not None and 0.6 < taken_at < 2.5
-    assert any((action == way).all() for way in monitor.ways_out(BOUNDS, view))
+    assert any((action == way).all() for way in monitor.ways_out(view))
     assert action[0, 0] < 0 or action[0, 2] > 0
     # The same wall, flown away from, is left alone.
     away = seen(vel_b=(-4.0, 0.0, 0.0), depth_m=taken_at)
-    assert not monitor.last_moment(BOUNDS, will, away, PERIOD_S)[1][0]
+    assert not monitor.last_moment(will, away, PERIOD_S)[1][0]
 
 
 def test_every_row_is_judged_by_itself():

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from eval.judging.plans import over_plan, plans
-from eval.judging.results import JOURNAL, Journal, read_trials, write_results
+from eval.judging.results import Journal, read_trials, write_results
 from eval.judging.tables import NOTE, markdown_table, summarise
 from eval.worlds.trial import TrialResult, TrialSpec, track_of
 from suite.common.errors import explain
@@ -45,7 +45,7 @@ def test_files(tmp_path):
 
 
 def test_journal_resumes_after_a_kill(tmp_path):
-    path, about = tmp_path / JOURNAL, {"policy": "ours", "vehicle": "reference"}
+    path, about = tmp_path / "journal.jsonl", {"policy": "ours", "vehicle": "reference"}
     with Journal(path, about) as journal:
         for row in ROWS[:3]:
             journal.append(row)
@@ -69,7 +69,7 @@ def test_journal_resumes_after_a_kill(tmp_path):
 
 
 def test_journal_of_something_else_is_refused(tmp_path):
-    path = tmp_path / JOURNAL
+    path = tmp_path / "journal.jsonl"
     Journal(path, {"policy": "ours", "world": "mujoco"}).close()
     said = "otherwise (policy is 'ours' there, 'theirs' here; git_commit is None there, 'a' here); "
     with pytest.raises(ValueError, match=re.escape(said)):

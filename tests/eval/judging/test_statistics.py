@@ -11,7 +11,6 @@ from eval.judging.statistics import (
     bootstrap,
     expected_largest,
     mcnemar_exact,
-    paired_bootstrap,
     paired_success,
     wilson,
 )
@@ -76,14 +75,6 @@ def test_bootstrap_repeats_and_has_no_value_without_trials():
     assert bootstrap(values, 3) != bootstrap(values[::2], 3)
     assert bootstrap(values).value == 16
     assert np.isnan(bootstrap(np.array([]))).all()
-
-
-def test_paired_bootstrap_is_of_the_differences():
-    first = np.array([1.0, 2.0, 30.0, 4.0])
-    found = paired_bootstrap(first, first - 0.5)
-    assert found == (0.5, 0.5, 0.5)
-    with pytest.raises(ValueError, match="pairs"):
-        paired_bootstrap(first, first[:2])
 
 
 def test_the_expected_largest_is_that_of_all_picks():

@@ -248,7 +248,7 @@ def test_a_video_plays_the_whole_flight(tmp_path, kind):
 
 def test_a_gif_is_as_long_as_its_frames_at_any_rate(tmp_path):
     frames = [Image.new("RGB", (8, 8), (20 * k, 0, 0)) for k in range(12)]
-    write_gif(tmp_path / "a.gif", frames, 12)
+    write_gif(tmp_path / "a.gif", frames, 12, np.array([[255, 0, 0]]))
     with Image.open(tmp_path / "a.gif") as video:
         lasting = [frame.info["duration"] for frame in ImageSequence.Iterator(video)]
     assert sum(lasting) == 1000

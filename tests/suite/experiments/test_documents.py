@@ -39,7 +39,7 @@ class Sky:
         self.stop_after = None
         self._fly = judging.fly_share
         monkeypatch.setattr(judging, "fly_share", self.fly)
-        monkeypatch.setattr(judging, "usable_cores", lambda: 1)
+        monkeypatch.setattr("suite.judging.flying.usable_cores", lambda: 1)
 
     def fly(self, task, share):
         options = replace(task.options, slots=8, rules=Rules(time_limit_s=0.1))

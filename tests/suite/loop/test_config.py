@@ -17,13 +17,14 @@ from suite.common.usage import renamed
 from suite.delta.replay import nominal_model
 from suite.loop import delta_action, hidden_effect, measured
 from suite.loop.compare import cell_grid, overall_grid, policy_results
-from suite.loop.config import loop_by_content, resolve
+from suite.loop.config import loop_by_content
 from suite.loop.hidden_effect import LABELS
 from suite.loop.variants import DeltaModel, Variant
 from suite.loop.work import LoopRun, Quiet, plan
 from suite.train.config import PointMassConfig
 from tests.support import commands
 from tests.support.judged_cells import results_of
+from tests.support.loops import resolve
 from tests.support.point_mass_flights import fly
 from tests.support.vehicles import with_effects
 
@@ -96,16 +97,16 @@ def test_sizes_are_the_recipes_options_go_first_and_a_policy_has_its_own_recipe(
 def test_settings_are_of_the_fine_tuning_and_its_rate_where_a_policy_is_given():
     """Else of the recipe, which the fine-tuning follows at its share of the learning rate."""
     changes = ("optimizer.rate=1e-4", "episode.rest_share=0.2")
-    given = resolve(policy="race-paper", changes=changes).tuning
+    given = resolve(policy="race-paper", set=changes).tuning
     assert (given.optimizer.rate, given.episode.rest_share) == (1e-4, 0.2)
-    trained = resolve(recipe="quick", changes=changes).tuning
+    trained = resolve(recipe="quick", set=changes).tuning
     assert (trained.optimizer.rate, trained.episode.rest_share) == (pytest.approx(3e-5), 0.2)
     # A policy of 30 Hz has 180 steps where the recipe has 90, which 4 does not divide.
     changes = ("episode.image_stride=4",)
-    found = resolve(policy="race", recipe="race-paper", changes=changes)
+    found = resolve(policy="race", recipe="race-paper", set=changes)
     assert found.tuning.episode.steps == 180
     with pytest.raises(ValueError, match=r"divisors of episode.steps \(90\)"):
-        resolve(recipe="race-paper", changes=changes)
+        resolve(recipe="race-paper", set=changes)
 
 
 def hidden_loop(policy="race-paper", hidden="racer5"):

@@ -28,11 +28,10 @@ from suite.delta.fit import DeltaFit, ReplayErrors
 from suite.delta.replay import nominal_model
 from suite.loop import hidden_effect, work
 from suite.loop.compare import CAVEAT, policy_results
-from suite.loop.config import resolve
 from suite.loop.hidden_effect import LABELS, LOOP, describe_hidden, hidden_effects
 from tests.support.engines import STAND_IN
 from tests.support.judged_cells import results_of
-from tests.support.loops import Small
+from tests.support.loops import Small, resolve
 
 EXAMPLE = "examples/hidden.toml"
 SIZES = "loop --recipe quick --track zigzag --difficulty 0 --trials 2 --flights 2"

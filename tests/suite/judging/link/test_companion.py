@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from eval.logs.flight_log import read_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialSpec
 from policies.spec import ActionSpec, NoAnswer, PolicySpec
 from suite.common.console import Console
-from suite.judging.link.flights import log_of, write_log
+from suite.judging.link.flights import write_log
 from suite.judging.link.messages import OperatorText, SetPoint, State, Wire, dialect, signing_key
 from suite.judging.link.watchdog import Limits, jump_fault
 from tests.support.commands import refused
@@ -260,10 +261,12 @@ def test_a_state_may_lie_half_a_metre_off_where_its_speed_leads():
         assert (jump_fault(last, state, Limits()) is not None) == jumped
 
 
-def test_a_flight_of_thrust_and_rates_becomes_a_log(bench):
+def test_a_flight_of_thrust_and_rates_becomes_a_log(bench, tmp_path):
     hover = Steady((9.81, 0.0, 0.0, 0.0), PolicySpec(action=ActionSpec("ctbr")))
-    log = log_of(bench(hover).fly().companion, {})
-    assert log is not None and log.action_b is None
+    about = TrialSpec("zigzag", 0, 0)._asdict()
+    name = write_log(bench(hover).fly(40).fly(40).fly(40).companion, about, tmp_path, Console())
+    log = read_flight(tmp_path / str(name))
+    assert log.action_b is None
     np.testing.assert_allclose(log.extra["action_thrust"], 9.81, rtol=1e-6)
 
 

@@ -29,7 +29,7 @@ from suite.judging.link.messages import (
     flip_quat,
     image_packets,
 )
-from suite.judging.link.simulated import LOST_S, SimulatedVehicle
+from suite.judging.link.simulated import LOST_S, FlightRequest, SimulatedVehicle
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
 from tests.support.commands import answer, refused, run
@@ -123,9 +123,9 @@ def flown():
     """A flight of two seconds in lockstep: vehicle, companion."""
     trial = TrialSpec("zigzag", 0, 0)
     track, vehicle, pilot = track_of({}, trial), load_vehicle("reference"), Pursuit()
-    sim = SimulatedVehicle(
-        track, trial, vehicle, pilot.spec.camera, 30.0, Wire(1, 2), Rules(time_limit_s=4.0)
-    )
+    rules, camera = Rules(time_limit_s=4.0), pilot.spec.camera
+    request = FlightRequest(track, trial, vehicle, rules, camera, 30.0, "pursuit")
+    sim = SimulatedVehicle(request, Wire(1, 2))
     companion = Companion(pilot, track, vehicle, Wire(2, 1), lambda: sim.time_s)
     out = []
     while sim.time_s < 2.2:
@@ -136,19 +136,19 @@ def flown():
 def test_both_ends_agree_on_the_flight(flown, tmp_path):
     sim, companion = flown
     assert companion.flying and companion.gate >= 1
-    assert sim.result("pursuit").gates_passed == companion.gate
+    assert sim.result().gates_passed == companion.gate
     rows = companion.rows
     assert np.mean([row.decided for row in rows]) == pytest.approx(0.3, abs=0.02)
     found = delays(rows, 0.02)
     assert found["deadlines_missed"] == 0 and found["state_age_ms"]["max"] < 3.0
     # The camera keeps time with the decisions: no image waits for a whole period.
     assert found["image_age_ms"]["max"] <= 10.0 + 1e-6
-    name = write_log(companion, sim.result("pursuit")._asdict(), tmp_path, Console())
+    name = write_log(companion, sim.result()._asdict(), tmp_path, Console())
     log = read_flight(tmp_path / name)
     assert log.about["handed_over"] is None and log.about["events"]
     assert log.action_b is not None and log.action_b.shape == (len(rows), 3)
     assert log.gate is not None and log.gate.max() == companion.gate
-    row = {**sim.result("p")._asdict(), "handed_over": None}
+    row = {**sim.result()._asdict(), "handed_over": None}
     row |= {"vehicle_slips": 0, "missed_decisions": 0}
     assert totals([Flight(row, rows)], Limits())["set_points"] == len(rows)
 
