@@ -16,6 +16,7 @@ from suite.diagnose.estimate.parameters import (
     JOIN,
     Candidate,
     ParameterSpace,
+    effects_in,
     indices_of,
     parameter_of,
 )
@@ -57,7 +58,8 @@ def composites(among: Sequence[Candidate]) -> list[Candidate]:
 
 def acts_through(candidate: Candidate) -> bool:
     """Return whether `candidate`, or a part of it, only acts through other effects."""
-    return any(one.carried in candidate.effects for one in COMPOSITES if one.carried)
+    names = effects_in(candidate.name)
+    return any(one.carried in names for one in COMPOSITES if one.carried)
 
 
 def carried(among: Sequence[Candidate]) -> list[Candidate]:

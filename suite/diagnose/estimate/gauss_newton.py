@@ -61,7 +61,7 @@ def gauss_newton_step(
     which stretches are fitted; all are if not given.
     """
     hessian, gradient = equations.sums(inside)
-    indices = np.array(equations.numbers, dtype=int)
+    indices = np.array(equations.along, dtype=int)
     low, high, scale = (space.array(name)[indices] for name in ("low", "high", "step"))
     change = solve(hessian, gradient, low - theta[indices], high - theta[indices], scale)
     return change, float(2 * gradient @ change - change @ hessian @ change)

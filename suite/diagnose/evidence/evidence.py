@@ -88,7 +88,7 @@ class Evidence(ABC):
         on the flights gets no score.
         """
         equations = current.block.equations
-        along = list(equations.numbers)
+        along = list(equations.along)
         scale, theta = self.space.array("step")[along], current.at.theta
         low, high = ((self.space.array(end) - theta)[along] / scale for end in ("low", "high"))
         hessian, gradient = equations.hessian * np.outer(scale, scale), equations.gradient * scale

@@ -283,16 +283,6 @@ class Finding:
         """(P,) all parameters, as fitted."""
         return self.search.estimate.theta
 
-    def by_effect(self) -> dict[str, list[NamedEffect]]:
-        """Return the named effects, grouped by the effect's name in the catalogue.
-
-        A group has several entries if the effect was named for several motors.
-        """
-        groups: dict[str, list[NamedEffect]] = {}
-        for named in self.names:
-            groups.setdefault(named.candidate.name, []).append(named)
-        return groups
-
     def removed(self, names: Sequence[NamedEffect]) -> float:
         """Return the share of the gap that `names` remove when they are added last.
 

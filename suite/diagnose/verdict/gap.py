@@ -262,16 +262,6 @@ def rollout_size(shift: np.ndarray, windows: FlightWindows, z: float = 0.0) -> E
     return EffectSize(force, growth("rates", TORQUE_S, 1), growth("position", 1.0, 2))
 
 
-def view_size(shift: np.ndarray, in_world: bool, z: float = 0.0) -> EffectSize:
-    """Return the size of an effect that shifts a view's mean accelerations by `shift` (M, 3).
-
-    A view is a part of the dynamics: here the force (with `in_world` true) or the torque. For `z`
-    see `rms_length`.
-    """
-    rms = rms_length(shift, z)
-    return EffectSize(rms, 0.0, None) if in_world else EffectSize(0.0, rms, None)
-
-
 def upper_size(
     slope: np.ndarray,
     change: np.ndarray,
