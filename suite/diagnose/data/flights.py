@@ -173,7 +173,8 @@ def _floor(view: View, flights: Sequence[SmoothedFlight], logs: Sequence[FlightL
     power = []
     for flight, log in zip(flights, logs, strict=True):
         imu_acc_w = flight.rows.imu_acc_w if view.in_world else None
-        path = flight.rows.vel_w if view.in_world else flight.rows.rate_b
+        motion = flight.rows.motion
+        path = motion.vel_w if view.in_world else motion.rate_b
         good = np.asarray(flight.rows.good)
         own = good & np.isfinite(log.vel_w if view.in_world else log.rate_b).all(axis=1)
         series = np.asarray(path if imu_acc_w is None else imu_acc_w)[own]

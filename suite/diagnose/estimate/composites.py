@@ -23,12 +23,10 @@ from suite.diagnose.estimate.parameters import (
 
 
 class Composite(NamedTuple):
-    """Effects that are tested as one hypothesis."""
+    """Effects that are tested as one hypothesis: their names, and a description for people."""
 
     parts: tuple[str, ...]
-    """Names of the effects."""
     about: str
-    """Description for people."""
     carried: str | None = None
     """Name of the effect that only acts through the others (carried by them); None where each acts
     on its own."""
@@ -40,7 +38,6 @@ COMPOSITES = (
     Composite((WIND, "quadratic_drag"), PASSED_ON, carried=WIND),
     Composite(("mass_offset", "com_offset"), "a payload: its mass, and where it sits"),
 )
-"""All composites."""
 LEAST_USUAL = 0.3
 """Smallest drag with which a fit of a composite begins, as a share of a drag's usual size."""
 

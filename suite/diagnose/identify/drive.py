@@ -21,7 +21,7 @@ from eval.vehicles.vehicle_check import check_vehicle
 from suite.diagnose.data.sampling import follow_lag, hold
 from suite.diagnose.data.steps import LONGEST_S
 from suite.diagnose.data.view import FlightRows
-from suite.diagnose.evidence.moments import accelerations_on, motion_of
+from suite.diagnose.evidence.moments import accelerations_on
 from suite.diagnose.identify.grid import STEP_S, FlightGrid
 
 DRIVES = {
@@ -157,7 +157,7 @@ class DrivenVehicle:
                 commanded = after_delay_and_lag(flight.signals["torque_cmd_b"], numbers)
                 torque_b = np.nan_to_num(commanded)
                 wrench = Wrench(np.zeros_like(torque_b), torque_b)
-                _, turn_b = accelerations(plant, motion_of(rows), wrench)
+                _, turn_b = accelerations(plant, rows.motion, wrench)
             return acc_w, turn_b
 
         return accelerations_of

@@ -173,11 +173,6 @@ class SearchResult:
         """Places of the named effects' parameters in the vector of all."""
         return fitted_by(self.named)
 
-    @property
-    def moved(self) -> np.ndarray:
-        """(K,) change of the named effects' parameters since the start."""
-        return (self.estimate.theta - self.start.theta)[self.indices]
-
     def half_widths(self) -> np.ndarray:
         """Return the half-widths (K,) of the 95 % intervals of the named effects' parameters."""
         return self.judged.half_widths(self.indices)

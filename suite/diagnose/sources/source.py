@@ -203,7 +203,8 @@ def sizes_by_effect(
     a number of standard errors to its upper limit. The model's own numerical error may change the
     parameters by `model_error` (K,); this is subtracted before the upper end is computed.
     """
-    entries, width, change = found.last.evidence.space.entries, found.half_widths(), found.moved
+    entries, width = found.last.evidence.space.entries, found.half_widths()
+    change = (found.estimate.theta - found.start.theta)[found.indices]
     certain = less_error(change, model_error)
     error, sizes = np.broadcast_to(model_error, change.shape), {}
     effects = np.array([entries[index].effect for index in found.indices])

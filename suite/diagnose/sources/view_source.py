@@ -295,9 +295,9 @@ def inputs_of(flight: SmoothedFlight) -> np.ndarray:
     thrust = thrust / np.maximum(thrust.mean(), 1e-9)
     mixed = thrust @ PATTERNS.T / 4.0
     # The height matters near the ground only.
-    nearness_to_ground = 1.0 / (1.0 + np.maximum(rows.pos_w[:, 2:], 0.0))
+    nearness_to_ground = 1.0 / (1.0 + np.maximum(rows.motion.pos_w[:, 2:], 0.0))
     drop = rows.voltage_drop[:, None]
-    signals = np.concatenate([vel_b, rows.rate_b, mixed, nearness_to_ground, drop], axis=1)
+    signals = np.concatenate([vel_b, rows.motion.rate_b, mixed, nearness_to_ground, drop], axis=1)
     row, column = np.triu_indices(signals.shape[1])
     speed = np.linalg.norm(vel_b, axis=1, keepdims=True)
     products = [signals, signals[:, row] * signals[:, column], speed * vel_b]

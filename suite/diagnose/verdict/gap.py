@@ -25,14 +25,7 @@ import numpy as np
 
 from suite.diagnose.data.noise import Linearisation, Noise
 from suite.diagnose.data.whitening import block_of, make_whitening, rotor_spread, slow_energy
-from suite.diagnose.data.windows import (
-    LENGTH_S,
-    SLICES,
-    STATE,
-    STATE_GROUPS,
-    FlightWindows,
-    take,
-)
+from suite.diagnose.data.windows import LENGTH_S, SLICES, STATE, STATE_GROUPS, FlightWindows, take
 from suite.diagnose.estimate.gauss_newton import Z95
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds

@@ -246,9 +246,8 @@ def test_an_effect_that_the_models_own_error_may_be_has_no_size_for_certain():
     space = SimpleNamespace(entries=[SimpleNamespace(effect="clock_offset")])
     named = [SimpleNamespace(candidate=SimpleNamespace(name="clock_offset"))]
     last = SimpleNamespace(evidence=SimpleNamespace(space=space))
-    found: Any = SimpleNamespace(
-        named=named, last=last, indices=[0], moved=change, half_widths=lambda: width
-    )
+    found: Any = SimpleNamespace(named=named, last=last, indices=[0], half_widths=lambda: width)
+    found.estimate, found.start = (SimpleNamespace(theta=t) for t in (change, 0.0 * change))
 
     def upper(error):
         sizes = sizes_by_effect(found, slope, size_of, np.array([error]))
@@ -326,7 +325,8 @@ def test_a_bound_does_not_hide_the_models_own_error(found_drag):
     """The error is the change of the fit with coarser inputs, here a little too much drag."""
     found, model = found_drag.search, copy(found_drag.source.model)
     windows = of_rollouts(found.last).windows
-    coarser = windows._replace(row_vel_w=0.995 * np.asarray(windows.row_vel_w))
+    slower = windows.row._replace(vel_w=0.995 * np.asarray(windows.row.vel_w))
+    coarser = windows._replace(row=slower)
     source = replace(found_drag.source, model=model, coarser=coarser, coarser_share=1.0)
     sizes = source.sizes(found)
     assert sizes != found_drag.source.sizes(found)
