@@ -27,9 +27,10 @@ from suite.diagnose.sources.views import by_views
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.actuators import TestedEffect, integrator_of
 
-SourceMaker = Callable[[DiagnosisInput], SourceSet | None]
-"""Function that makes sources from the input; None if it makes none."""
-SOURCES: dict[str, SourceMaker] = {"rollouts": by_rollouts, "views": by_views}
+SOURCES: dict[str, Callable[[DiagnosisInput], SourceSet | None]] = {
+    "rollouts": by_rollouts,
+    "views": by_views,
+}
 """Functions that make the sources of evidence, by name; the first that makes any counts."""
 
 
@@ -68,8 +69,8 @@ def diagnose(
         raise ValueError(f"by = {by!r}; allowed: {', '.join(('auto', *SOURCES))}")
     chosen = by != "auto"
     given = DiagnosisInput(logs, vehicle, references, drive, integrator, say, limits, chosen)
-    makers = [make for name, make in SOURCES.items() if by in ("auto", name)]
-    result = _diagnose(given, makers, seed)
+    names = [name for name in SOURCES if by in ("auto", name)]
+    result = _diagnose(given, names, seed)
     main = result.main
     # A delay of half a step between pose and rates is how MuJoCo integrates, not a fault. If that
     # explains the named effects, repeat the diagnosis with its integrator.
@@ -77,7 +78,7 @@ def diagnose(
     rollouts = rollouts_of(main)
     if rollouts and is_continuous and rollouts.explained_by_steps(main.search):
         say("pose and rates differ by half a step: repeating with MuJoCo's Euler steps")
-        euler = _diagnose(replace(given, integrator="euler", chosen=True), makers[:1], seed)
+        euler = _diagnose(replace(given, integrator="euler", chosen=True), names[:1], seed)
         if not pose_delays(euler.main.search):
             words = (
                 "MuJoCo's Euler steps explain half a step between pose and rates, so the model "
@@ -87,10 +88,10 @@ def diagnose(
     return replace(result, seconds=time.monotonic() - start_s)
 
 
-def _diagnose(given: DiagnosisInput, makers: Sequence[SourceMaker], seed: int) -> Diagnosis:
-    """Return the diagnosis by the sources that `makers` make."""
+def _diagnose(given: DiagnosisInput, by: Sequence[str], seed: int) -> Diagnosis:
+    """Return the diagnosis with the first sources of those named in `by`."""
     warnings = list[str]()
-    for flights in filter(None, (make(given) for make in makers)):
+    for flights in filter(None, (SOURCES[name](given) for name in by)):
         warnings += flights.warnings
         if flights.sources:
             break
@@ -188,8 +189,7 @@ def main_of(findings: Sequence[Finding]) -> Finding:
 
 def tested_in(findings: Sequence[Finding], flights: SourceSet) -> tuple[TestedEffect, ...]:
     """Return the effects that separate tests named: random wind and rotor lag."""
-    winds = [one.remaining.wind for one in findings]
-    return (*(wind for wind in winds if wind is not None), *flights.tested)
+    return (*filter(None, (one.remaining.wind for one in findings)), *flights.tested)
 
 
 def verdict_on(findings: Sequence[Finding], named: bool, limits: Thresholds) -> Verdict:

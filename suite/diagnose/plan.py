@@ -125,12 +125,10 @@ OTHERWISE = "fly faster, with changes of thrust, speed, heading and height"
 
 @dataclass(frozen=True)
 class Separation:
-    """Two effects, flights that do not separate them, and flights that do."""
+    """The names of two effects, advice for people, and flights that separate them or do not."""
 
     pair: tuple[str, str]
-    """Names of the two effects."""
     words: str
-    """Advice for people."""
     blurred: tuple[Trajectory, ...]
     """Flights on which either effect explains the data."""
     separating: tuple[Trajectory, ...]

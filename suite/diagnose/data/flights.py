@@ -57,17 +57,15 @@ class ViewFlights:
 
     views: tuple[View, ...]
     """The views that all flights allow."""
-    names: tuple[str, ...]
-    """Names of the F flights."""
+    logs: tuple[FlightLog, ...]
+    """The F logs that have a usable stretch, as they were given."""
     smoothed: dict[str, list[SmoothedFlight]]
     """The F flights with their mean accelerations, by name of the view."""
     floor: dict[str, np.ndarray]
     """(3,) noise of a mean acceleration, by name of the view; from that of velocity or rates."""
     source: str
     """Where the rotor speeds come from, in words."""
-    kept: tuple[int, ...] = ()
-    """Numbers of the logs from which these flights are. The other logs have no usable stretch."""
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...]
     """What was left out and why, in words."""
 
 
@@ -86,7 +84,7 @@ def ready(
         ValueError: if rotor speeds of a log are unknown, if the logs allow no view, or if no log
             has a usable stretch.
     """
-    logs, notes = with_fewer_rows(logs, limits)
+    given, (logs, notes) = logs, with_fewer_rows(logs, limits)
     rotors = [acting_rotors(log, vehicle, limits) for log in logs]
     true_logs = [true_log(log, vehicle.effects) for log in logs]
     complete = [completed(log) for log in posed(true_logs)]
@@ -124,10 +122,9 @@ def ready(
         raise ValueError(f"{', '.join(log.name for log in logs)}: {without}")
     notes += [f"{log.name}: {without}" for k, log in enumerate(logs) if k not in kept]
     parts = {name: [flights[k] for k in kept] for name, flights in parts.items()}
-    names = tuple(logs[k].name for k in kept)
     for view in second:
-        lengths = [len(flight.form.middle_s) for flight in parts[view.name]]
-        empty = [name for name, length in zip(names, lengths, strict=True) if not length]
+        flights = zip(kept, parts[view.name], strict=True)
+        empty = [logs[k].name for k, flight in flights if not len(flight.form.middle_s)]
         if empty:
             notes.append(
                 f"{view.name}: not examined, as {', '.join(empty)} has no {view.width_s:g} s "
@@ -137,11 +134,10 @@ def ready(
             del parts[view.name]
     return ViewFlights(
         tuple(views),
-        names,
+        tuple(given[k] for k in kept),
         parts,
         {view.name: _floor(view, parts[view.name], [complete[k] for k in kept]) for view in views},
         " and ".join(sorted({rotors[k].source for k in kept})),
-        tuple(kept),
         tuple(notes),
     )
 
@@ -177,7 +173,8 @@ def _floor(view: View, flights: Sequence[SmoothedFlight], logs: Sequence[FlightL
     power = []
     for flight, log in zip(flights, logs, strict=True):
         imu_acc_w = flight.rows.imu_acc_w if view.in_world else None
-        path = flight.rows.vel_w if view.in_world else flight.rows.rate_b
+        motion = flight.rows.motion
+        path = motion.vel_w if view.in_world else motion.rate_b
         good = np.asarray(flight.rows.good)
         own = good & np.isfinite(log.vel_w if view.in_world else log.rate_b).all(axis=1)
         series = np.asarray(path if imu_acc_w is None else imu_acc_w)[own]

@@ -6,13 +6,12 @@ Held-out flights test whether the named effects explain flights that no fit has 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from suite.diagnose.data.flights import ViewFlights
-from suite.diagnose.data.view import smoothed
+from suite.diagnose.data.view import SmoothedFlight, smoothed
 from suite.diagnose.data.windows import LENGTH_S
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
@@ -53,28 +52,33 @@ def choose_held_out(
     return ~np.isin(flight, held), [logs[int(k)].name for k in sorted(held)]
 
 
+SmoothedFlights = dict[str, list[SmoothedFlight]]
+"""Flights by name of the view."""
+
+
 def parted(
     flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRESHOLDS
-) -> tuple[ViewFlights, ViewFlights]:
-    """Return the fitted flights and the held-out ones; a single flight is split in time.
+) -> tuple[SmoothedFlights, SmoothedFlights, list[str], list[str]]:
+    """Return fitted flights, held-out flights, names of the latter, and notes in words.
 
-    `held` are the numbers of the flights to hold out. A second view is left out, with a note, if a
-    part of it is too short.
+    `held` are the numbers of the flights to hold out. A single flight is split in time. A second
+    view is left out, with a note, if a part of it is too short.
 
     Raises:
         ValueError: if a part of the first view is too short.
     """
-    fitted = [k for k in range(len(flights.names)) if k not in held]
+    names, notes = [log.name for log in flights.logs], list(flights.notes)
+    fitted = [k for k in range(len(names)) if k not in held]
     fitted_part, held_part = (
         {name: [part[k] for k in numbers] for name, part in flights.smoothed.items()}
         for numbers in (fitted, held)
     )
-    names = [flights.names[k] for k in held]
-    if len(flights.names) == 1:
+    held_names = [names[k] for k in held]
+    if len(names) == 1:
         # The share is of the time in flight, since a log may begin or end on the ground.
         flown_s = flights.smoothed[flights.views[0].name][0].form.middle_s
         until_s = float(np.quantile(flown_s, limits.lone_fitted_share))
-        names = [f"{flights.names[0]} from {until_s:.1f} s"]
+        held_names = [f"{names[0]} from {until_s:.1f} s"]
         for view in flights.views:
             (single,) = flights.smoothed[view.name]
             early = single.rows.time_s <= until_s
@@ -82,7 +86,6 @@ def parted(
                 rows = single.rows._replace(good=np.asarray(single.rows.good) & chosen)
                 split = smoothed(view, rows, limits)._replace(reliability=single.reliability)
                 part[view.name] = [split]
-    notes, views = list(flights.notes), list(flights.views)
     for number, view in enumerate(flights.views):
         for what, part in (("to fit", fitted_part), ("held out", held_part)):
             flown_s = sum(len(one.form.middle_s) for one in part[view.name]) * view.spacing_s
@@ -93,14 +96,8 @@ def parted(
                 "needed: fly longer"
             )
             if number == 0:
-                raise ValueError(f"{', '.join(flights.names)}: {need}")
+                raise ValueError(f"{', '.join(names)}: {need}")
             notes.append(f"{view.name}: not examined, {need}")
-            views.remove(view)
             del fitted_part[view.name], held_part[view.name]
             break
-    both = replace(flights, views=tuple(views), notes=tuple(notes))
-    fitted_names = tuple(flights.names[k] for k in fitted)
-    return (
-        replace(both, names=fitted_names, smoothed=fitted_part),
-        replace(both, names=tuple(names), smoothed=held_part),
-    )
+    return fitted_part, held_part, held_names, notes

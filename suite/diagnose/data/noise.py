@@ -50,7 +50,6 @@ class Linearisation(NamedTuple):
     offset: np.ndarray
     """(W, F) correction of each window's start numbers with which the residuals were computed."""
     windows: FlightWindows
-    """The windows."""
 
 
 class Noise(NamedTuple):
@@ -290,10 +289,8 @@ def rotor_noise(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> floa
     changes of the speeds that are too fast for it count as noise; hence an upper limit.
     """
     rotors = SLICES["rotor speed"]
-    speeds = np.zeros(np.asarray(windows.valid).shape)
-    speeds[..., rotors] = windows.row_rotor_speed
-    valid = np.zeros(speeds.shape, dtype=bool)
-    valid[..., rotors] = windows.rotor_valid
+    others = ((0, 0), (0, 0), (rotors.start, 0))  # the channels before the rotor speeds
+    speeds, valid = (np.pad(x, others) for x in (windows.row_rotor_speed, windows.rotor_valid))
     sigma = noise_of(speeds, windows._replace(valid=valid), limits.rotor_noise_rows, limits)
     return float(np.sqrt((sigma[rotors] ** 2).mean()))
 

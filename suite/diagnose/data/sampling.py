@@ -52,17 +52,15 @@ def on_every_row(log: FlightLog, limits: Thresholds = THRESHOLDS) -> FlightLog:
     return replace(log, **filled) if filled else log
 
 
-def without_slow_rotors(
-    logs: Sequence[FlightLog], limits: Thresholds = THRESHOLDS
-) -> tuple[list[FlightLog], list[str]]:
+def without_slow_rotors(logs: Sequence[FlightLog]) -> tuple[list[FlightLog], list[str]]:
     """Return `logs` without rotor speeds whose rows are further apart than a hole, and notes."""
-    usable, notes = [], []
+    usable, notes, hole_s = [], [], THRESHOLDS.longest_hole_s
     for log in logs:
         spacing_s = 0.0 if log.rotor_speed is None else own_spacing_s(log.time_s, log.rotor_speed)
-        if spacing_s > limits.longest_hole_s:
+        if spacing_s > hole_s:
             notes.append(
                 f"{log.name}: rotor speeds at {1.0 / spacing_s:.2g} Hz are left out; at least "
-                f"{1.0 / limits.longest_hole_s:.3g} Hz show what the rotors did between two rows"
+                f"{1.0 / hole_s:.3g} Hz show what the rotors did between two rows"
             )
             log = replace(log, rotor_speed=None)
         usable.append(log)

@@ -152,21 +152,22 @@ def rotors_at(
     A firmware's rate loop changes its commands all the time, by filtered derivatives of rates.
     There a spline is more accurate.
     """
-    columns = []
+    columns, is_firmware = [], has_firmware_loop(vehicle)
+    lag_s = max(vehicle.rotors.time_constant, 1e-4)
     for column in speed.T:
         own_rows = np.flatnonzero(np.isfinite(column))[::stride]
-        if has_firmware_loop(vehicle):
-            columns.append(CubicSpline(time_s[own_rows], column[own_rows])(at_s))
+        own_s = time_s[own_rows]
+        if is_firmware:
+            columns.append(CubicSpline(own_s, column[own_rows])(at_s))
             continue
-        row = np.clip(
-            np.searchsorted(time_s[own_rows], at_s, side="right") - 1, 0, len(own_rows) - 2
-        )
+        row = np.clip(np.searchsorted(own_s, at_s, side="right") - 1, 0, len(own_rows) - 2)
         before, after = own_rows[row], own_rows[row + 1]
         span_s, since_s = time_s[after] - time_s[before], at_s - time_s[before]
-        lag_s = max(vehicle.rotors.time_constant, 1e-4)
         share = (1.0 - np.exp(-since_s / lag_s)) / (1.0 - np.exp(-span_s / lag_s))
         columns.append(column[before] + share * (column[after] - column[before]))
     speed_at = np.stack(columns, axis=1)
+    if is_firmware:
+        return speed_at
     if rows_show_torque(vehicle, spacing_s):
         return with_hidden_torque(speed_at, vehicle, stride * spacing_s)
     return with_hidden_torque(speed_at, vehicle, spacing_s) if stride > 1 else speed_at
@@ -200,8 +201,6 @@ def rows_show_torque(vehicle: Vehicle, step_s: float) -> bool:
 
 def with_hidden_torque(speed: np.ndarray, vehicle: Vehicle, step_s: float) -> np.ndarray:
     """Return rotor speeds (S, 4) with the torque that rows `step_s` [s] apart do not show."""
-    if has_firmware_loop(vehicle):
-        return speed
     mixer, share = rotor_mixer(vehicle), torque_between_rows(vehicle, step_s)
     added = np.linalg.inv(mixer) @ (np.append(0.0, share)[:, None] * mixer)
     return speed + (speed - speed.mean(axis=0)) @ added.T

@@ -18,6 +18,7 @@ from scipy import sparse
 from eval.effects.interface import GRAVITY
 from eval.importers.rows import nearest
 from eval.logs.flight_log import FlightLog
+from eval.quadrotor.plant import Motion
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.inertial import InertialLog, specific_force_w
 from suite.diagnose.data.sampling import voltage_drop
@@ -30,14 +31,8 @@ class FlightRows(NamedTuple):
 
     time_s: Array
     """(N,) time from the first row of the flight [s]."""
-    pos_w: Array
-    """(N, 3) position [m]."""
-    rot_w: Array
-    """(N, 3, 3) attitude, body to world."""
-    vel_w: Array
-    """(N, 3) velocity [m/s]."""
-    rate_b: Array
-    """(N, 3) body rates [rad/s]."""
+    motion: Motion
+    """(N, ...) measured state."""
     rotor_speed: Array
     """(N, 4) rotor speeds [rad/s]."""
     voltage_drop: Array
@@ -53,7 +48,7 @@ class FlightRows(NamedTuple):
     @property
     def vel_b(self) -> Array:
         """(N, 3) velocity in body axes [m/s]."""
-        return (np.swapaxes(self.rot_w, 1, 2) @ self.vel_w[..., None])[..., 0]
+        return (np.swapaxes(self.motion.rot_w, 1, 2) @ self.motion.vel_w[..., None])[..., 0]
 
 
 def rows_of(
@@ -76,10 +71,7 @@ def rows_of(
     pos_w, vel_w, rate_b, speed = (np.nan_to_num(signal) for signal in signals)
     return FlightRows(
         log.time_s - log.time_s[0],
-        pos_w,
-        np.where(np.isfinite(rot_w), rot_w, np.eye(3)),
-        vel_w,
-        rate_b,
+        Motion(pos_w, np.where(np.isfinite(rot_w), rot_w, np.eye(3)), vel_w, rate_b),
         speed,
         voltage_drop(log, log.time_s),
         good,
@@ -174,7 +166,7 @@ def smoothed(view: View, rows: FlightRows, limits: Thresholds = THRESHOLDS) -> S
     form = weak_form(rows.time_s, rows.good, view.width_s, limits.longest_hole_s)
     if view.in_world and rows.imu_acc_w is not None:
         return SmoothedFlight(rows, form, form.mean @ rows.imu_acc_w)
-    measured = form.change @ (rows.vel_w if view.in_world else rows.rate_b)
+    measured = form.change @ (rows.motion.vel_w if view.in_world else rows.motion.rate_b)
     return SmoothedFlight(rows, form, measured)
 
 

@@ -10,11 +10,13 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
-from eval.effects.interface import GRAVITY
+from eval.effects.interface import GRAVITY, Sample
 from eval.effects.log_faults import pose_delay
 from eval.logs.flight_log import FlightLog
+from eval.quadrotor.plant import Motion
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.sampling import (
     interpolate,
@@ -106,26 +108,12 @@ class FlightWindows(NamedTuple):
     """(W, S, 4) measured rotor speeds in the middle of each step [rad/s]; zeros without any."""
     voltage_drop: Array
     """(W, S) fall of the battery voltage since the log's start [V]; zeros without a voltage."""
-    pos_w: Array
-    """(W, 3) measured position at the start [m]."""
-    rot_w: Array
-    """(W, 3, 3) measured attitude at the start, body to world."""
-    vel_w: Array
-    """(W, 3) measured velocity at the start [m/s]."""
-    rate_b: Array
-    """(W, 3) measured body rates at the start [rad/s]."""
+    start: Motion
+    """(W, ...) measured state at the start."""
     row_s: Array
     """(W, N) times of the measured rows [s]."""
-    row_pos_w: Array
-    """(W, N, 3) measured position [m]; like the next fields, 0 where nothing was measured."""
-    row_rot_w: Array
-    """(W, N, 3, 3) measured attitude, body to world."""
-    row_vel_w: Array
-    """(W, N, 3) measured velocity [m/s]."""
-    row_rate_b: Array
-    """(W, N, 3) measured body rates [rad/s]."""
-    row_acc_b: Array
-    """(W, N, 3) measured specific force (acceleration minus gravity) [m/s^2]."""
+    row: Sample
+    """(W, N, ...) measured signals; like the rotor speeds, 0 where nothing was measured."""
     row_rotor_speed: Array
     """(W, N, 4) measured rotor speeds [rad/s]."""
     valid: Array
@@ -167,14 +155,16 @@ def cut(
     """
     starts, warnings = list[tuple[int, int]](), list[str]()  # (flight, row) each
     states = [on_every_row(log, limits) for log in logs]
-    for number, (log, state) in enumerate(zip(logs, states, strict=True)):
-        if number not in (range(len(logs)) if only is None else only):
-            continue
+    spacings_s = dict[int, float]()
+    for number in range(len(logs)) if only is None else only:
+        log, state = logs[number], states[number]
         rotors = state.rotor_speed if rotor_input else None
         flown = ~near_ground(state, vehicle, rotors, limits, lasting=True)
         # Each input has rows of its own: a rotor speed, or the commands and the loop's rates.
         table = log.rotor_speed if rotor_input else log.command
         assert table is not None
+        if rotor_input:
+            spacings_s[number] = own_spacing_s(log.time_s, table)
         parts = [column[:, None] for column in table.T] if rotor_input else [table, log.rate_b]
         inputs = [*(np.isfinite(part).all(axis=1) for part in parts), flown]
         rows = _start_rows(log, state.whole & flown, inputs, since_s, stride_s, limits)
@@ -194,17 +184,11 @@ def cut(
     held = 1 if fewer_commands is None else 2
     inputs = [_input_of(logs[number], row, vehicle, longest_s, held) for number, row in starts]
     like, stride = coarser or fewer_commands, 1 if coarser is None else 2
-    spacings_s = [
-        own_spacing_s(log.time_s, log.rotor_speed)
-        if rotor_input and log.rotor_speed is not None
-        else None
-        for log in logs
-    ]
     windows = [
-        _window(logs[number], states[number], number, row, vehicle, spacings_s[number], one, stride)
-        for (number, row), one in zip(starts, _of_one_shape(inputs, like), strict=True)
+        _window(logs[k], states[k], k, row, vehicle, spacings_s.get(k), one, stride)
+        for (k, row), one in zip(starts, _of_one_shape(inputs, like), strict=True)
     ]
-    return FlightWindows(*(np.stack(field) for field in zip(*windows, strict=True))), warnings
+    return jax.tree.map(lambda *field: np.stack(field), *windows), warnings
 
 
 def take(data: Any, chosen: Array) -> Any:
@@ -212,11 +196,7 @@ def take(data: Any, chosen: Array) -> Any:
 
     They are chosen by indices or by (W,) bool. A field may be None, or such a tuple itself.
     """
-    if data is None:
-        return None
-    if not isinstance(data, tuple):
-        return np.asarray(data)[chosen]
-    return type(data)(*(take(field, chosen) for field in data))
+    return jax.tree.map(lambda field: np.asarray(field)[chosen], data)
 
 
 def _start_rows(
@@ -386,12 +366,12 @@ def _window(
         interpolate(sample_s, time_s, log.rate_b),
         speed,
         voltage_drop(log, middle_s),
-        state.pos_w[row],
-        quat_to_rot(state.quat_wxyz[row]),
-        state.vel_w[row],
-        state.rate_b[row],
+        Motion(
+            state.pos_w[row], quat_to_rot(state.quat_wxyz[row]), state.vel_w[row], state.rate_b[row]
+        ),
         padded(time_s[rows] - begin_s),
-        *(padded(values) for values in measured),
+        Sample(*(padded(values) for values in measured[:5])),
+        padded(measured[5]),
         valid=padded(np.concatenate(valid, axis=1)),
         rotor_valid=padded(rotor_valid),
         start_rotor_error=np.asarray(rotor_error),

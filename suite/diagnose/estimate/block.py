@@ -75,13 +75,8 @@ class NormalEquations(NamedTuple):
     """(B,) r'r, the squared error in units of the noise variance."""
     flight: np.ndarray | None = None
     """(B,) number of each stretch's flight."""
-    along: tuple[int, ...] | None = None
-    """Place of each column's parameter in the vector; None where column k is along parameter k."""
-
-    @property
-    def numbers(self) -> tuple[int, ...]:
-        """Place of each column's parameter in the vector."""
-        return tuple(range(self.gradient.shape[1])) if self.along is None else self.along
+    along: tuple[int, ...] = ()
+    """Place of each column's parameter in the vector."""
 
     def columns_of(self, candidate: Candidate) -> list[int]:
         """Return the columns of the parameters of `candidate`.
@@ -89,10 +84,9 @@ class NormalEquations(NamedTuple):
         Of a parameter with two columns, a composite (several effects as one hypothesis) uses the
         second one, which is computed as if the other effects were there.
         """
-        numbers = self.numbers
-        place = {number: column for column, number in enumerate(numbers)}
+        place = {number: column for column, number in enumerate(self.along)}
         if not candidate.parts:
-            place |= {number: numbers.index(number) for number in candidate.indices}
+            place |= {number: self.along.index(number) for number in candidate.indices}
         return [place[number] for number in candidate.indices]
 
     def take(self, columns: Sequence[int]) -> NormalEquations:
@@ -101,12 +95,12 @@ class NormalEquations(NamedTuple):
         return self._replace(
             hessian=self.hessian[:, chosen][:, :, chosen],
             gradient=self.gradient[:, chosen],
-            along=tuple(self.numbers[k] for k in chosen),
+            along=tuple(self.along[k] for k in chosen),
         )
 
     def along_numbers(self, indices: Sequence[int]) -> NormalEquations:
         """Return the equations along the parameters at `indices` of the vector, in that order."""
-        return self.take([self.numbers.index(number) for number in indices])
+        return self.take([self.along.index(number) for number in indices])
 
     def sums(self, inside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return J'J (K, K) and J'r (K,), summed over all stretches or over those `inside`."""
@@ -127,10 +121,13 @@ def normal_equations(
     slope: np.ndarray,
     residual: np.ndarray,
     flight: np.ndarray | None = None,
-    along: tuple[int, ...] | None = None,
+    along: tuple[int, ...] = (),
 ) -> NormalEquations:
-    """Return the normal equations of `slope` (B, M, K) and `residual` (B, M)."""
-    transposed = np.swapaxes(slope, 1, 2)
+    """Return the normal equations of `slope` (B, M, K) and `residual` (B, M).
+
+    Without `along`, column k is along parameter k.
+    """
+    transposed, along = np.swapaxes(slope, 1, 2), along or tuple(range(slope.shape[2]))
     gradient = (transposed @ residual[..., None])[..., 0]
     return NormalEquations(transposed @ slope, gradient, (residual**2).sum(axis=1), flight, along)
 

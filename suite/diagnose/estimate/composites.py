@@ -16,18 +16,17 @@ from suite.diagnose.estimate.parameters import (
     JOIN,
     Candidate,
     ParameterSpace,
+    effects_in,
     indices_of,
     parameter_of,
 )
 
 
 class Composite(NamedTuple):
-    """Effects that are tested as one hypothesis."""
+    """Effects that are tested as one hypothesis: their names, and a description for people."""
 
     parts: tuple[str, ...]
-    """Names of the effects."""
     about: str
-    """Description for people."""
     carried: str | None = None
     """Name of the effect that only acts through the others (carried by them); None where each acts
     on its own."""
@@ -39,7 +38,6 @@ COMPOSITES = (
     Composite((WIND, "quadratic_drag"), PASSED_ON, carried=WIND),
     Composite(("mass_offset", "com_offset"), "a payload: its mass, and where it sits"),
 )
-"""All composites."""
 LEAST_USUAL = 0.3
 """Smallest drag with which a fit of a composite begins, as a share of a drag's usual size."""
 
@@ -57,7 +55,8 @@ def composites(among: Sequence[Candidate]) -> list[Candidate]:
 
 def acts_through(candidate: Candidate) -> bool:
     """Return whether `candidate`, or a part of it, only acts through other effects."""
-    return any(one.carried in candidate.effects for one in COMPOSITES if one.carried)
+    names = effects_in(candidate.name)
+    return any(one.carried in names for one in COMPOSITES if one.carried)
 
 
 def carried(among: Sequence[Candidate]) -> list[Candidate]:

@@ -1,12 +1,12 @@
-"""Fits parameters by Gauss-Newton with bounds and step halving, and computes 95 % intervals.
+"""Computes Gauss-Newton steps with bounds, and 95 % intervals.
 
-All functions work on blocks and their normal equations (`estimate/block.py`). J is the Jacobian of
-the model and r the residual; chi-square is the squared error over the noise variance.
+All functions work on normal equations (`estimate/block.py`). J is the Jacobian of the model and r
+the residual; chi-square is the squared error over the noise variance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,9 +14,8 @@ from scipy.optimize import lsq_linear
 from scipy.stats import chi2
 from scipy.stats import t as student
 
-from suite.diagnose.estimate.block import Block, Estimate, NormalEquations
+from suite.diagnose.estimate.block import NormalEquations
 from suite.diagnose.estimate.parameters import ParameterSpace
-from suite.diagnose.thresholds import Thresholds
 
 
 def solve(
@@ -61,7 +60,7 @@ def gauss_newton_step(
     which stretches are fitted; all are if not given.
     """
     hessian, gradient = equations.sums(inside)
-    indices = np.array(equations.numbers, dtype=int)
+    indices = np.array(equations.along, dtype=int)
     low, high, scale = (space.array(name)[indices] for name in ("low", "high", "step"))
     change = solve(hessian, gradient, low - theta[indices], high - theta[indices], scale)
     return change, float(2 * gradient @ change - change @ hessian @ change)
@@ -77,55 +76,6 @@ def chi2_fall(
     return gauss_newton_step(fitted, theta, space)[1]
 
 
-def fit(
-    linearise: Callable[[Estimate, Sequence[int]], Block],
-    space: ParameterSpace,
-    limits: Thresholds,
-    start: Estimate,
-    indices: Sequence[int],
-    rounds: int | None = None,
-    known: Block | None = None,
-) -> tuple[Estimate, Block]:
-    """Fit the parameters at `indices` and the nuisance parameters of every stretch, from `start`.
-
-    `linearise` returns the block at an estimate, with slopes at least along `indices`. At most
-    `rounds` steps are taken, by default those of `limits`. `known` is the block at `start`, if it
-    was computed before.
-
-    Returns:
-        The best estimate, and the block at this estimate.
-    """
-    places = np.array(indices, dtype=int)
-    low, high = space.array("low")[places], space.array("high")[places]
-    best, block = start, known or linearise(start, indices)
-    for steps_done in range(limits.fit_rounds if rounds is None else rounds):
-        equations = block.equations.along_numbers(indices)
-        change, expected_fall = gauss_newton_step(equations, best.theta, space)
-        # The nuisance parameters are corrected at least once.
-        if expected_fall < limits.converged and (steps_done or not block.free.shape[1]):
-            break
-        columns = [block.along.index(index) for index in indices]
-        free_change = block.free - block.free_slope[..., columns] @ change
-        # Halve the step until chi-square falls; give up below the smallest step.
-        share, chi2_before = 1.0, float(equations.chi2.sum())
-        while share > LEAST_STEP:
-            theta = best.theta.copy()
-            theta[places] = np.clip(theta[places] + share * change, low, high)
-            free = best.free + share * free_change if free_change.size else best.free
-            trial = Estimate(theta, free)
-            trial_block = linearise(trial, indices)
-            chi2 = float((trial_block.residual**2).sum())
-            if np.isfinite(chi2) and chi2 <= chi2_before + 1e-6:
-                break
-            share /= 2.0
-        else:
-            break
-        best, block = trial, trial_block
-    return best, block
-
-
-LEAST_STEP = 0.1
-"""Steps of the fit are halved down to this share."""
 Z95 = 1.96
 """Half-width of a normal 95 % interval, in standard deviations."""
 TINY = 1e-12

@@ -60,11 +60,6 @@ class Candidate:
     """The effects of a composite as candidates; () for a single effect."""
 
     @property
-    def effects(self) -> tuple[str, ...]:
-        """Names of the candidate's effects."""
-        return effects_in(self.name)
-
-    @property
     def singles(self) -> tuple[Candidate, ...]:
         """One candidate for each effect: the parts of a composite, or the candidate itself."""
         return self.parts or (self,)
@@ -239,8 +234,7 @@ def usual_first(
 
     Plausible ones come first, then single effects, then the order of the catalogue.
     """
-    effects = candidate.effects
-    far = bool(implausible(space, theta, candidate))
+    effects, far = effects_in(candidate.name), bool(implausible(space, theta, candidate))
     return far, len(effects), min(list(EFFECTS).index(name) for name in effects)
 
 

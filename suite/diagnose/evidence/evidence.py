@@ -1,9 +1,9 @@
 """Base class of evidence: the interface between residuals of flights and the search for effects.
 
 Evidence is the differences between simulation and flights, divided by their noise. Each kind of it
-is one subclass: the errors of rollouts (simulated stretches of 1 s), or those of force or torque. A
-subclass linearises its residuals (see `estimate/block.py`) and estimates their noise; the other
-methods have defaults.
+is one subclass: the errors of rollouts (simulated stretches of 1 s), those of force or torque, or
+those that `suite identify` fits. A subclass linearises its residuals (see `estimate/block.py`) and
+estimates their noise; the other methods have defaults.
 """
 
 from __future__ import annotations
@@ -16,13 +16,15 @@ from typing import NamedTuple
 import numpy as np
 
 from suite.diagnose.estimate.block import Block, Estimate
-from suite.diagnose.estimate.gauss_newton import fit, intervals95
+from suite.diagnose.estimate.gauss_newton import gauss_newton_step, intervals95
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
 from suite.diagnose.estimate.permutation import CandidateScore, folds_of, permutation_test
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 LEAST_ERROR = 1e-9
 """Lower limit of a squared error in a denominator, in units of the noise variance."""
+LEAST_STEP = 0.1
+"""Steps of a fit are halved down to this share."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +32,6 @@ class Evidence(ABC):
     """Whitened residuals (in units of independent noise), and how the parameters change them."""
 
     limits: Thresholds = THRESHOLDS
-    """Thresholds of all steps of the diagnosis."""
     misfit_is_noise: bool = False
     """Whether even the best model is wrong, so that its whole residual counts as noise."""
 
@@ -65,9 +66,41 @@ class Evidence(ABC):
         rounds: int | None = None,
         known: Block | None = None,
     ) -> Evaluation:
-        """Evaluate this evidence at the fit of the parameters at `indices`; see `fit`."""
-        best = fit(self.linearise, self.space, self.limits, start, indices, rounds, known)
-        return Evaluation(self, *best)
+        """Fit the parameters at `indices` and the nuisance parameters of every stretch.
+
+        At most `rounds` Gauss-Newton steps are taken from `start`, by default those of the limits.
+        `known` is the block at `start`, if it was computed before.
+
+        Returns:
+            This evidence, evaluated at the best estimate.
+        """
+        limits, space, places = self.limits, self.space, np.array(indices, dtype=int)
+        low, high = space.array("low")[places], space.array("high")[places]
+        best, block = start, known or self.linearise(start, indices)
+        for steps_done in range(limits.fit_rounds if rounds is None else rounds):
+            equations = block.equations.along_numbers(indices)
+            change, expected_fall = gauss_newton_step(equations, best.theta, space)
+            # The nuisance parameters are corrected at least once.
+            if expected_fall < limits.converged and (steps_done or not block.free.shape[1]):
+                break
+            columns = [block.along.index(index) for index in indices]
+            free_change = block.free - block.free_slope[..., columns] @ change
+            # Halve the step until chi-square falls; give up below the smallest step.
+            share, chi2_before = 1.0, float(equations.chi2.sum())
+            while share > LEAST_STEP:
+                theta = best.theta.copy()
+                theta[places] = np.clip(theta[places] + share * change, low, high)
+                free = best.free + share * free_change if free_change.size else best.free
+                trial = Estimate(theta, free)
+                trial_block = self.linearise(trial, indices)
+                chi2 = float((trial_block.residual**2).sum())
+                if np.isfinite(chi2) and chi2 <= chi2_before + 1e-6:
+                    break
+                share /= 2.0
+            else:
+                break
+            best, block = trial, trial_block
+        return Evaluation(self, best, block)
 
     @property
     def flights_differ_p(self) -> float:
@@ -88,7 +121,7 @@ class Evidence(ABC):
         on the flights gets no score.
         """
         equations = current.block.equations
-        along = list(equations.numbers)
+        along = list(equations.along)
         scale, theta = self.space.array("step")[along], current.at.theta
         low, high = ((self.space.array(end) - theta)[along] / scale for end in ("low", "high"))
         hessian, gradient = equations.hessian * np.outer(scale, scale), equations.gradient * scale

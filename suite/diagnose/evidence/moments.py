@@ -21,7 +21,7 @@ import numpy as np
 
 from eval.effects.interface import Array
 from eval.quadrotor.forces import wind_and_flow, wrench_on
-from eval.quadrotor.plant import Motion, Plant, accelerations, assemble
+from eval.quadrotor.plant import Plant, accelerations, assemble
 from eval.quadrotor.rotors import steady
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.steps import LONGEST_S
@@ -34,8 +34,6 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 CHUNK = 1024
 """Number of rows in one call of the compiled model."""
-IMU_ACC = FlightRows._fields.index("imu_acc_w")
-"""Place of the first field of `FlightRows` that is not an input of the model."""
 LEAST_CORRELATION = 0.05
 """Smaller autocorrelations count as 0."""
 
@@ -60,7 +58,8 @@ class ForceModel:
         They are the linear acceleration in world axes [m/s^2], and the angular one in body axes
         [rad/s^2]. The slopes are along the parameters at `indices`, or along all with None.
         """
-        none, inputs = np.zeros((len(rows.time_s), 0)), FlightRows(*rows[:IMU_ACC])
+        inputs = rows._replace(imu_acc_w=None, pose_slope_b=None)
+        none = np.zeros((len(rows.time_s), 0))
         return linearised(self._compiled, self._vehicle, theta, none, inputs, indices, CHUNK)
 
 
@@ -82,15 +81,9 @@ def accelerations_on(plant: Plant, rows: FlightRows, voltage: bool) -> tuple[Arr
     The first is in world axes [m/s^2], the second in body axes [rad/s^2]. `voltage` says whether
     the rows have a battery voltage. For numpy and JAX.
     """
-    motion, rotors = motion_of(rows), steady(rows.rotor_speed)
-    voltage_drop = rows.voltage_drop if voltage else None
-    _, flow = wind_and_flow(plant, {}, motion, rotors, rows.time_s, voltage_drop=voltage_drop)
-    return accelerations(plant, motion, wrench_on(plant, rotors, flow))
-
-
-def motion_of(rows: FlightRows) -> Motion:
-    """Return the motion (N, ...) on `rows`."""
-    return Motion(rows.pos_w, rows.rot_w, rows.vel_w, rows.rate_b)
+    rotors, voltage_drop = steady(rows.rotor_speed), rows.voltage_drop if voltage else None
+    _, flow = wind_and_flow(plant, {}, rows.motion, rotors, rows.time_s, voltage_drop=voltage_drop)
+    return accelerations(plant, rows.motion, wrench_on(plant, rotors, flow))
 
 
 class ViewData(NamedTuple):

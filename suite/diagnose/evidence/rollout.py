@@ -66,9 +66,7 @@ def fly_windows(
         lambda field: jnp.swapaxes(field, 0, 1),
         (spans, _acting_commands(windows, plant.constants.delay)),
     )
-    rate_b = jnp.asarray(windows.rate_b)
-    logged = Sample(windows.pos_w, windows.rot_w, windows.vel_w, rate_b, jnp.zeros_like(rate_b))
-    start = to_true(values, logged)
+    start = to_true(values, Sample(*windows.start, jnp.zeros_like(windows.start.rate_b)))
     motion = Motion(
         start.pos_w + offset[:, :3],
         jnp.matmul(start.rot_w, exp_rot(offset[:, 3:6])),
@@ -115,7 +113,8 @@ def difference(
     rate_b, force_b = _interpolated(track.rate_b, now), _interpolated(forces, now)
     logged = to_logged(values, Sample(*_pose(track, pose, integrator), rate_b, force_b))
     # The attitude's error is the vector of the rotation between both attitudes, for small angles.
-    rotation = jnp.matmul(jnp.swapaxes(windows.row_rot_w, -1, -2), logged.rot_w)
+    row = windows.row
+    rotation = jnp.matmul(jnp.swapaxes(row.rot_w, -1, -2), logged.rot_w)
     attitude = 0.5 * jnp.stack(
         [
             rotation[..., 2, 1] - rotation[..., 1, 2],
@@ -125,11 +124,11 @@ def difference(
         axis=-1,
     )
     errors = [
-        logged.pos_w - windows.row_pos_w,
+        logged.pos_w - row.pos_w,
         attitude,
-        logged.vel_w - windows.row_vel_w,
-        logged.rate_b - windows.row_rate_b,
-        logged.acc_b - windows.row_acc_b,
+        logged.vel_w - row.vel_w,
+        logged.rate_b - row.rate_b,
+        logged.acc_b - row.acc_b,
         _interpolated(speeds, now) - windows.row_rotor_speed,
     ]
     error = jnp.concatenate(errors, axis=-1)

@@ -122,14 +122,15 @@ def start_estimate(
     theta = model.space.array("start") if theta is None else theta
     delay_s = pose_delay(model.space.effects(theta))
     offset = np.zeros((len(windows.flight), model.free))
-    offset[:, :3] = delay_s * windows.vel_w
-    offset[:, 3:6] = delay_s * windows.rate_b
+    offset[:, :3] = delay_s * windows.start.vel_w
+    offset[:, 3:6] = delay_s * windows.start.rate_b
     has_vel = np.asarray(windows.valid)[:, :, SLICES["velocity"].start]
     row_rank = np.minimum(ACC_ROW, has_vel.sum(axis=1))[:, None]
     row = (has_vel & (np.cumsum(has_vel, axis=1) == row_rank)).argmax(axis=1)
     window = np.arange(len(row))
     span_s = np.asarray(windows.row_s)[window, row][:, None]
-    acc_w = (np.asarray(windows.row_vel_w)[window, row] - windows.vel_w) / np.maximum(span_s, 1e-3)
+    gained_w = np.asarray(windows.row.vel_w)[window, row] - windows.start.vel_w
+    acc_w = gained_w / np.maximum(span_s, 1e-3)
     offset[:, 6:9] = delay_s * np.where(has_vel.any(axis=1, keepdims=True), acc_w, 0.0)
     return Estimate(theta, offset)
 
@@ -165,7 +166,7 @@ def trusted(
     `residual` (W, N, 19) is measured - simulated.
     """
     error = np.abs(residual)
-    height = np.maximum(np.asarray(windows.row_pos_w)[..., 2], 0.0)
+    height = np.maximum(np.asarray(windows.row.pos_w)[..., 2], 0.0)
     far = (error[..., SLICES["position"]].max(axis=-1) > limits.trusted_m) | (
         error[..., SLICES["attitude"]].max(axis=-1) > limits.trusted_rad
     )

@@ -95,7 +95,7 @@ class ViewEvidence(Evidence):
         )
         residual, pose_slope = flight.measured - value, np.zeros((count, 3, 0))
         if view.in_world:
-            to_body = np.swapaxes(flight.rows.rot_w[flight.form.middle_row], 1, 2)
+            to_body = np.swapaxes(flight.rows.motion.rot_w[flight.form.middle_row], 1, 2)
             residual, value = ((to_body @ part[..., None])[..., 0] for part in (residual, value))
             slope = to_body @ slope
             if flight.rows.pose_slope_b is not None:

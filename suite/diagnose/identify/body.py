@@ -141,7 +141,7 @@ def _force_windows(flight: FlightGrid, drive: str) -> Windows:
     rows, form = flight.rows(attitude_of_path=True), flight.form(FORCE_WIDTH_S, needs)
     axes = slice(0, 3)
     if attitude == LEANING:  # only along the thrust, and only slow flight
-        speed = np.linalg.norm(rows.vel_w, axis=1)
+        speed = np.linalg.norm(rows.motion.vel_w, axis=1)
         slow, axes = form.mean @ speed < SLOW_M_S, slice(2, 3)
         form = form.take(slow)
     to_acceleration = form.mean if motion == IMU_ACC else form.change

@@ -21,7 +21,7 @@ from eval.vehicles.vehicle_check import check_vehicle
 from suite.diagnose.data.sampling import follow_lag, hold
 from suite.diagnose.data.steps import LONGEST_S
 from suite.diagnose.data.view import FlightRows
-from suite.diagnose.evidence.moments import accelerations_on, motion_of
+from suite.diagnose.evidence.moments import accelerations_on
 from suite.diagnose.identify.grid import STEP_S, FlightGrid
 
 DRIVES = {
@@ -107,9 +107,12 @@ class DrivenVehicle:
 
         It keeps those effects of the start that only depend on the state (`by_state`). Only
         measured rotor speeds identify the thrust coefficient. The number `yaw` is the logarithm of
-        yaw torque over inertia about z, relative to the start.
+        yaw torque over inertia about z, relative to the start. `inertia_x` and `inertia_y` are
+        logarithms of ratios to the start, and `inertia_z` is relative to the mean of these two.
         """
-        log_thrust, log_inertia = numbers.get("thrust", 0.0), log_inertia_ratio(numbers)
+        log_thrust = numbers.get("thrust", 0.0)
+        x, y, z = (numbers.get(f"inertia_{axis}", 0.0) for axis in "xyz")
+        log_inertia = np.array([x, y, 0.5 * (x + y) + z])
         start, rotors, scale = self.start, self.start.rotors, float(np.exp(log_thrust))
         effects = {n: v for n, v in start.effects.items() if EFFECTS[n].by_state}
         drag = (float(numbers.get(f"drag_{a}", d)) for a, d in zip("xyz", self.drag, strict=True))
@@ -154,7 +157,7 @@ class DrivenVehicle:
                 commanded = after_delay_and_lag(flight.signals["torque_cmd_b"], numbers)
                 torque_b = np.nan_to_num(commanded)
                 wrench = Wrench(np.zeros_like(torque_b), torque_b)
-                _, turn_b = accelerations(plant, motion_of(rows), wrench)
+                _, turn_b = accelerations(plant, rows.motion, wrench)
             return acc_w, turn_b
 
         return accelerations_of
@@ -198,15 +201,6 @@ def driven_vehicle(
     if vehicle.motors is None or not (keep_motors or motors.voltage_exponent):
         motors = replace(motors, voltage=usual_volts)
     return DrivenVehicle(replace(vehicle, motors=motors), drive, command, usual_volts)
-
-
-def log_inertia_ratio(numbers: Mapping[str, float]) -> np.ndarray:
-    """Return the logarithms (3,) of the ratios of the inertia to the start's.
-
-    The number `inertia_z` is relative to the mean of the other two.
-    """
-    x, y, z = (numbers.get(f"inertia_{axis}", 0.0) for axis in "xyz")
-    return np.array([x, y, 0.5 * (x + y) + z])
 
 
 def possible_inertia(inertia: ArrayLike) -> np.ndarray:

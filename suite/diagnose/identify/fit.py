@@ -19,8 +19,8 @@ import numpy as np
 from eval.judging.statistics import Interval
 from suite.diagnose.estimate.block import Block, Estimate, without_nuisance
 from suite.diagnose.estimate.gauss_newton import Z95, intervals95
-from suite.diagnose.estimate.gauss_newton import fit as fit_numbers
 from suite.diagnose.estimate.parameters import FittedNumber, ParameterSpace
+from suite.diagnose.evidence.evidence import Evaluation, Evidence
 from suite.diagnose.thresholds import THRESHOLDS
 
 HUBER = 2.5
@@ -49,9 +49,7 @@ class Unknown(NamedTuple):
     start: float
     """Value from which the fit starts; a number that is not identifiable keeps it."""
     low: float
-    """Lower bound."""
     high: float
-    """Upper bound."""
     max_half_width: float
     """Largest half-width of the 95 % interval with which the number counts as identified."""
     step: float
@@ -143,8 +141,8 @@ class Fitted:
 
 
 @dataclass(frozen=True)
-class ResidualEvidence:
-    """Residuals of flights as input of the Gauss-Newton fit (`estimate/gauss_newton.py`)."""
+class ResidualEvidence(Evidence):
+    """Residuals of flights as evidence on the numbers."""
 
     residuals: Residuals
     unknowns: tuple[Unknown, ...]
@@ -184,8 +182,12 @@ class ResidualEvidence:
         weights = (np.minimum(1.0, HUBER / one) / sigma**2 for one in scaled)
         return replace(self, weights=tuple(np.nan_to_num(weight) for weight in weights))
 
+    def estimate_noise(self, at: Estimate) -> Evaluation:
+        """Evaluate this evidence with the weights at `at`; see `Evidence`."""
+        return self.weighed(at).relinearise(at)
+
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
-        """Return whitened residuals and slopes along the numbers at `indices`, or along all.
+        """Return whitened residuals and slopes along the numbers at `indices`; see `Evidence`.
 
         Slopes are finite differences, with a step away from an upper limit.
         """
@@ -240,7 +242,7 @@ def fit(
         NoWholeWindow: if the residuals have no window.
     """
     not_identified = list(held)
-    evidence = ResidualEvidence(residuals, tuple(unknowns), fixed, noise)
+    evidence = ResidualEvidence(residuals, tuple(unknowns), fixed, noise, limits=LIMITS)
     at = Estimate(np.array([unknown.start for unknown in unknowns]))
     if not sum(len(rows.value) for rows in evidence.rows(at.theta)):
         raise NoWholeWindow("no window of these flights has all signals that this fit compares")
@@ -250,11 +252,11 @@ def fit(
         # Fit the free numbers; each round has new weights.
         for _ in range(ROUNDS if free else 0):
             before, evidence = at, evidence.weighed(at)
-            at, _ = fit_numbers(evidence.linearise, evidence.space, LIMITS, at, free)
+            at = evidence.fitted(at, free).at
             if (at.theta == before.theta).all():
                 break
         # Reset the number with the widest interval to its start, until all intervals are narrow.
-        covariance = _covariance(evidence.weighed(at), at, free, known)
+        covariance = _covariance(evidence, at, free, known)
         half = Z95 * np.sqrt(np.diag(covariance))
         ratio = [half[k] / unknowns[k].max_half_width for k in free]
         if not free or max(ratio) <= 1.0:
@@ -311,7 +313,7 @@ def _covariance(
         covariance[np.ix_(fixed, fixed)] = known.covariance
         return covariance
     others = [k for k in range(total) if k not in fixed]
-    equations = evidence.linearise(at).equations
+    equations = evidence.estimate_noise(at).block.equations
     prior = np.array([0.0 if k in free else 1.0 / unknowns[k].max_half_width ** 2 for k in others])
     intervals = intervals95(equations.take(others), DIFFER_P, True, LEAST_NOISE_SHARE, prior)
     # A number that is not fitted has at most its prior uncertainty.

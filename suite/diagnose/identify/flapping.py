@@ -29,7 +29,6 @@ from suite.diagnose.search.evaluation import SearchResult
 from suite.diagnose.search.search import search
 
 FLAPPING = "blade_flapping"
-"""Name of the effect."""
 
 
 def flapping_of(

@@ -17,6 +17,7 @@ from scipy.ndimage import uniform_filter1d
 from eval.importers.rows import held
 from eval.importers.signals import Signal
 from eval.logs.flight_log import FlightLog
+from eval.quadrotor.plant import Motion
 from suite.diagnose.data.flights import leaning, turning_of
 from suite.diagnose.data.inertial import InertialLog, specific_force_w
 from suite.diagnose.data.noise import noise_like
@@ -92,10 +93,9 @@ class FlightGrid(NamedTuple):
         attitude = signals.get("rot_w", signals.get(LEANING) if attitude_of_path else None)
         if attitude is None:  # without an attitude the velocity in body axes is unknown
             attitude, vel_w = np.broadcast_to(np.eye(3), (count, 3, 3)), zeros
-        pos_w, rot_w, vel_w, rate_b = map(np.nan_to_num, (pos_w, attitude, vel_w, rate_b))
+        motion = Motion(*map(np.nan_to_num, (pos_w, attitude, vel_w, rate_b)))
         volts = signals.get("voltage", np.zeros(count))
-        drop = volts[0] - volts
-        return FlightRows(self.time_s, pos_w, rot_w, vel_w, rate_b, no_speed, drop, good)
+        return FlightRows(self.time_s, motion, no_speed, volts[0] - volts, good)
 
 
 def grid_of(log: FlightLog) -> FlightGrid:

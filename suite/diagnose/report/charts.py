@@ -89,12 +89,13 @@ def _rollout(window: FlightWindows, residual: np.ndarray) -> tuple[States, np.nd
     sine = np.linalg.norm(attitude_b, axis=1, keepdims=True)
     angle = np.arcsin(np.clip(sine, 0.0, 1.0))
     rotation_b = -attitude_b * angle / np.maximum(sine, 1e-12)
+    row = take(window.row, rows)
     states = States(
         window.start_s + np.asarray(window.row_s)[rows],
-        np.asarray(window.row_pos_w)[rows] - pos_w,
-        rot_to_quat(np.asarray(window.row_rot_w)[rows] @ exp_rot(rotation_b)),
-        np.asarray(window.row_vel_w)[rows] - vel_w,
-        np.asarray(window.row_rate_b)[rows] - rate_b,
+        row.pos_w - pos_w,
+        rot_to_quat(row.rot_w @ exp_rot(rotation_b)),
+        row.vel_w - vel_w,
+        row.rate_b - rate_b,
     )
     pos, vel, rate = (np.linalg.norm(part, axis=1) for part in (pos_w, vel_w, rate_b))
     return states, np.stack([pos, vel, np.rad2deg(angle[:, 0]), rate], axis=1)

@@ -133,9 +133,9 @@ def effects_json(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     come last.
     """
     searched = [
-        _effect(finding, name, names)
+        _effect(finding, name, [named for named in finding.names if named.candidate.name == name])
         for finding in diagnosis.findings
-        for name, names in finding.by_effect().items()
+        for name in dict.fromkeys(named.candidate.name for named in finding.names)
     ]
     keys = ("name", "parameters", "gap_removed", "p_value", "view")
     tested = [

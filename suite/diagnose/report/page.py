@@ -22,12 +22,7 @@ from suite.diagnose.report.sections import (
     residual_section,
     rivals_section,
 )
-from suite.diagnose.report.summary import (
-    components,
-    figure,
-    next_steps,
-    superscripts,
-)
+from suite.diagnose.report.summary import components, figure, next_steps, superscripts
 from suite.diagnose.sources.rollout_source import Rollouts, rollouts_of
 from tracks.common.grid import Cell, Grid, table, table_of
 

@@ -101,7 +101,7 @@ def fit_with(start: Evaluation, others: Sequence[int], candidate: Candidate) -> 
     """Fit `candidate` together with the parameters at `others`, from the estimate of `start`."""
     evidence, limits, estimate = start.evidence, start.evidence.limits, start.at
     indices = sorted({*others, *candidate.indices})
-    numbers = start.block.equations.numbers  # those of inactive parameters have two columns
+    numbers = start.block.equations.along  # those of inactive parameters have two columns
     inactive = [n for k, n in enumerate(numbers) if n in numbers[:k] and n in candidate.indices]
     if not candidate.parts or not inactive:
         rounds = limits.bilinear_rounds if acts_through(candidate) else None
@@ -123,7 +123,7 @@ def linear_change(
     fitted = equations.take(sorted({*others, *equations.columns_of(candidate)}))
     step, _ = gauss_newton_step(fitted, theta, start.evidence.space)
     change, information = np.zeros_like(theta), np.zeros_like(theta)
-    indices = list(fitted.numbers)
+    indices = list(fitted.along)
     change[indices], information[indices] = step, np.diag(fitted.sums()[0])
     return change, information
 
@@ -172,11 +172,6 @@ class SearchResult:
     def indices(self) -> list[int]:
         """Places of the named effects' parameters in the vector of all."""
         return fitted_by(self.named)
-
-    @property
-    def moved(self) -> np.ndarray:
-        """(K,) change of the named effects' parameters since the start."""
-        return (self.estimate.theta - self.start.theta)[self.indices]
 
     def half_widths(self) -> np.ndarray:
         """Return the half-widths (K,) of the 95 % intervals of the named effects' parameters."""

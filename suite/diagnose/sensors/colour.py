@@ -106,16 +106,11 @@ class Colour(NamedTuple):
 
     def mean_variance(self, duration_s: float) -> float:
         """Return the variance of the mean over `duration_s`, divided by that of the noise."""
-        processes = ((self.fast, self.fast_s), (1.0 - self.fast, self.lasts_s))
-        return sum(share * _mean_variance(max(t, TINY_S) / duration_s) for share, t in processes)
-
-
-def _mean_variance(ratio: float) -> float:
-    """Return the variance of the mean of one process, divided by that of the process.
-
-    `ratio` is the correlation time of the process divided by the duration.
-    """
-    return 2.0 * ratio * (1.0 - ratio * (1.0 - float(np.exp(-1.0 / ratio))))
+        total = 0.0
+        for share, time_s in ((self.fast, self.fast_s), (1.0 - self.fast, self.lasts_s)):
+            ratio = max(time_s, TINY_S) / duration_s
+            total += share * (2.0 * ratio * (1.0 - ratio * (1.0 - float(np.exp(-1.0 / ratio)))))
+        return total
 
 
 class _Variograms(NamedTuple):

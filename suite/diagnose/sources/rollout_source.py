@@ -111,13 +111,6 @@ class RolloutSource(Source):
     coarser_share: float = 0.5
     """Share of an effect's change under `coarser` that counts as the model's numerical error."""
 
-    def cut(self, stride_s: float, only: Sequence[int] | None = None) -> FlightWindows:
-        """Return windows that begin every `stride_s` [s], of all flights or those in `only`."""
-        settings = (self.rotor_input, stride_s, self.limits, self.model.integrator)
-        windows, _ = cut(self.logs, self.vehicle, *settings, only=only)
-        assert windows is not None  # the diagnosis has cut them before
-        return windows
-
     def gap(self, found: SearchResult, theta: np.ndarray) -> Gap:
         """Return the gap on the held-out flights, see `Source`."""
         linear = from_true_starts(self.model, theta, self.held)
@@ -296,7 +289,10 @@ class RolloutSource(Source):
         something is named also with the fitted ones. Both start from the state that fits the better
         model (`start_correction`).
         """
-        windows = self.cut(LENGTH_S, np.unique(self.held.flight)[:SHOWN].tolist())
+        settings = (self.rotor_input, LENGTH_S, self.limits, self.model.integrator)
+        shown = np.unique(self.held.flight)[:SHOWN].tolist()
+        windows, _ = cut(self.logs, self.vehicle, *settings, only=shown)
+        assert windows is not None  # the diagnosis has cut them before
         windows = take(windows, np.asarray(windows.start_s) >= self.since_s - ROUNDING_S)
         noise, best = of_rollouts(found.last).noise, found.estimate.theta
         correction = start_correction(self.model, best, windows, noise, self.limits)
@@ -314,9 +310,8 @@ class RolloutSource(Source):
         rows = np.asarray(windows.flight) == windows.flight[0]
         groups = ("position", "velocity", "rates")
         channels = np.concatenate([np.r_[SLICES[group]] for group in groups])
-        measured = np.concatenate(
-            [windows.row_pos_w, windows.row_vel_w, windows.row_rate_b], axis=-1
-        )[rows]
+        row = take(windows.row, rows)
+        measured = np.concatenate([row.pos_w, row.vel_w, row.rate_b], axis=-1)
         is_logged = np.asarray(windows.valid)[rows][..., channels]
         errors = {label: values[rows][..., channels] for label, values in simulated.items()}
         # The axis with the largest error of the vehicle file's model, relative to the noise.

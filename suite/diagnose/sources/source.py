@@ -203,7 +203,8 @@ def sizes_by_effect(
     a number of standard errors to its upper limit. The model's own numerical error may change the
     parameters by `model_error` (K,); this is subtracted before the upper end is computed.
     """
-    entries, width, change = found.last.evidence.space.entries, found.half_widths(), found.moved
+    entries, width = found.last.evidence.space.entries, found.half_widths()
+    change = (found.estimate.theta - found.start.theta)[found.indices]
     certain = less_error(change, model_error)
     error, sizes = np.broadcast_to(model_error, change.shape), {}
     effects = np.array([entries[index].effect for index in found.indices])
@@ -282,16 +283,6 @@ class Finding:
     def theta(self) -> np.ndarray:
         """(P,) all parameters, as fitted."""
         return self.search.estimate.theta
-
-    def by_effect(self) -> dict[str, list[NamedEffect]]:
-        """Return the named effects, grouped by the effect's name in the catalogue.
-
-        A group has several entries if the effect was named for several motors.
-        """
-        groups: dict[str, list[NamedEffect]] = {}
-        for named in self.names:
-            groups.setdefault(named.candidate.name, []).append(named)
-        return groups
 
     def removed(self, names: Sequence[NamedEffect]) -> float:
         """Return the share of the gap that `names` remove when they are added last.

@@ -8,12 +8,11 @@ model could explain, and whether structure remains beyond the named effects.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.data.view import FlightRows, SmoothedFlight, View
+from suite.diagnose.data.view import SmoothedFlight, View
 from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.evidence.evidence import validation_groups
 from suite.diagnose.evidence.moments import centred, means_of
@@ -28,7 +27,7 @@ from suite.diagnose.sources.source import (
     sizes_by_effect,
 )
 from suite.diagnose.verdict.disturbances import residual_swing
-from suite.diagnose.verdict.gap import Channel, EffectSize, Gap, rms_length, view_size
+from suite.diagnose.verdict.gap import Channel, EffectSize, Gap, rms_length
 
 STRETCH_S = 10.0
 """Length of the stretch in a chart [s]."""
@@ -81,7 +80,13 @@ class ViewSource(Source):
         block = found.last.block
         assert isinstance(block, ViewBlock)
         slope = block.data.slope[..., [block.along.index(index) for index in found.indices]]
-        return sizes_by_effect(found, slope, partial(view_size, in_world=self.view.in_world))
+        return sizes_by_effect(
+            found, slope, lambda shift, z=0.0: self.size_of(rms_length(shift, z))
+        )
+
+    def size_of(self, rms: float) -> EffectSize:
+        """Return the size of an effect that changes mean accelerations by `rms` [view's unit]."""
+        return EffectSize(rms, 0.0, None) if self.view.in_world else EffectSize(0.0, rms, None)
 
     def remaining(self, found: SearchResult, gaps: tuple[Gap, Gap], seed: int) -> Remaining:
         """Return the error that a black box explains beyond the named effects, see `Source`.
@@ -92,8 +97,7 @@ class ViewSource(Source):
         by_axis = shares.beyond if found.named else shares.explainable
         share, beyond = shares.total(by_axis), shares.total(shares.beyond)
         # The error has structure if a black box explains a relevant part of it.
-        rms = float(np.sqrt(share * shares.variance.sum()))
-        size = EffectSize(rms, 0.0, None) if self.view.in_world else EffectSize(0.0, rms, None)
+        size = self.size_of(float(np.sqrt(share * shares.variance.sum())))
         structured = size.relevant(self.limits) and share > self.limits.view_left_share
         axis = max(self.view.axes, key=lambda k: float(shares.beyond[k] * shares.variance[k]))
         where = (
@@ -240,11 +244,6 @@ RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 """Ridge weights that are tried, relative to the weight of the data."""
 
 
-def inputs_of(flight: SmoothedFlight) -> np.ndarray:
-    """Return the inputs (M, K) of the black box for one flight, averaged over its windows."""
-    return flight.form.mean @ _features(flight.rows)
-
-
 def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> np.ndarray:
     """Return the weights (K, 3) with which `inputs` (M, K) explain `error` (M, 3) best.
 
@@ -286,16 +285,20 @@ PATTERNS = np.array([[1, 1, 1, 1], [-1, -1, 1, 1], [-1, 1, 1, -1], [1, -1, 1, -1
 """Sums and differences of the four rotors' thrusts: collective thrust, roll, pitch and yaw."""
 
 
-def _features(rows: FlightRows) -> np.ndarray:
-    """Return the black box's inputs (N, K) on every row: signals and their pairwise products."""
-    vel_b = rows.vel_b
+def inputs_of(flight: SmoothedFlight) -> np.ndarray:
+    """Return the inputs (M, K) of the black box for one flight: signals and their products.
+
+    They are the means over the windows of the products on each row.
+    """
+    rows, vel_b = flight.rows, flight.rows.vel_b
     thrust = rows.rotor_speed**2
     thrust = thrust / np.maximum(thrust.mean(), 1e-9)
     mixed = thrust @ PATTERNS.T / 4.0
     # The height matters near the ground only.
-    nearness_to_ground = 1.0 / (1.0 + np.maximum(rows.pos_w[:, 2:], 0.0))
+    nearness_to_ground = 1.0 / (1.0 + np.maximum(rows.motion.pos_w[:, 2:], 0.0))
     drop = rows.voltage_drop[:, None]
-    signals = np.concatenate([vel_b, rows.rate_b, mixed, nearness_to_ground, drop], axis=1)
+    signals = np.concatenate([vel_b, rows.motion.rate_b, mixed, nearness_to_ground, drop], axis=1)
     row, column = np.triu_indices(signals.shape[1])
     speed = np.linalg.norm(vel_b, axis=1, keepdims=True)
-    return np.concatenate([signals, signals[:, row] * signals[:, column], speed * vel_b], axis=1)
+    products = [signals, signals[:, row] * signals[:, column], speed * vel_b]
+    return flight.form.mean @ np.concatenate(products, axis=1)

@@ -58,8 +58,7 @@ def by_views(given: DiagnosisInput) -> SourceSet:
     # Smooth the flights, and set up the model and the effects that the search tries.
     vehicle, limits, references = given.vehicle, given.limits, given.references
     flights = ready(given.logs, vehicle, limits, given.references)
-    logs = [given.logs[k] for k in flights.kept]
-    space = make_space(vehicle)
+    logs, space = flights.logs, make_space(vehicle)
     voltage = all(log.voltage is not None for log in [*logs, *references])
     model = ForceModel(vehicle, space, voltage)
     allowed, not_shown = candidates(space, voltage, ()), list[str]()
@@ -85,18 +84,18 @@ def by_views(given: DiagnosisInput) -> SourceSet:
     start_s = np.zeros(len(information))
     is_fitted, _ = choose_held_out(logs, block.flight, start_s, information, limits)
     held_numbers = sorted({*block.flight.tolist()} - {*block.flight[is_fitted].tolist()})
-    fitted, held = parted(flights, held_numbers, limits)
+    fitted, held, held_names, notes = parted(flights, held_numbers, limits)
     # Of partial logs or a single flight to fit, only the means of flights are compared.
     untested = list[str]()
     if references and any(log.partial for log in [*logs, *references]):
         untested = [UNTESTED.format("some logs are partial")]
-    elif references and len(next(iter(fitted.smoothed.values()))) < 2:
+    elif references and len(next(iter(fitted.values()))) < 2:
         untested = [UNTESTED.format("this needs 3 new flights or more, as one is held out")]
     # Make one source for each view.
     sources = []
-    for name in fitted.smoothed:
+    for name in fitted:
         one = evidence[name]
-        to_fit, held_out = (replace(one, flights=part.smoothed[name]) for part in (fitted, held))
+        to_fit, held_out = (replace(one, flights=part[name]) for part in (fitted, held))
         view, unit = one.view, "m/s^2" if one.view.in_world else "rad/s^2"
         shared: dict[str, Any] = {
             "name": name,
@@ -125,9 +124,9 @@ def by_views(given: DiagnosisInput) -> SourceSet:
     lag = None if references else find_rotor_lag(logs, vehicle, limits)
     return SourceSet(
         tuple(sources),
-        held.names,
+        held_names,
         flights.source,
-        (*held.notes, *not_shown, *left_out, *untested),
+        (*notes, *not_shown, *left_out, *untested),
         (lag,) if lag else (),
         spread.words(len(references)) if spread else (),
     )
@@ -261,9 +260,9 @@ def references_of(
     if not given.references:
         return {}, None, ()
     before = ready(given.references, given.vehicle, given.limits, given.logs)
-    if len(before.names) < 2:
+    if len(before.logs) < 2:
         words = (
-            f"--reference has {len(before.names)} flight; at least 2 are needed, better 3, to "
+            f"--reference has {len(before.logs)} flight; at least 2 are needed, better 3, to "
             "estimate how flights of one vehicle differ"
         )
         raise ValueError("; ".join([words, *before.notes]))

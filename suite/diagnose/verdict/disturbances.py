@@ -139,7 +139,7 @@ def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None
     grid_size = int(grid_index[-1]) + 1
     if grid_size * step_s * BAND_HZ[0] < 1.0 or len(middle_s) < LEAST_FILLED * grid_size:
         return None
-    rot_w = np.asarray(flight.rows.rot_w)[flight.form.middle_row]
+    rot_w = np.asarray(flight.rows.motion.rot_w)[flight.form.middle_row]
     residual_w = (rot_w @ residual_b[..., None])[..., 0][:, :2]
     yaw = np.arctan2(rot_w[:, 1, 0], rot_w[:, 0, 0])
     time = np.linspace(-1.0, 1.0, len(middle_s))

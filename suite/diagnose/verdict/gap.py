@@ -25,14 +25,7 @@ import numpy as np
 
 from suite.diagnose.data.noise import Linearisation, Noise
 from suite.diagnose.data.whitening import block_of, make_whitening, rotor_spread, slow_energy
-from suite.diagnose.data.windows import (
-    LENGTH_S,
-    SLICES,
-    STATE,
-    STATE_GROUPS,
-    FlightWindows,
-    take,
-)
+from suite.diagnose.data.windows import LENGTH_S, SLICES, STATE, STATE_GROUPS, FlightWindows, take
 from suite.diagnose.estimate.gauss_newton import Z95
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
@@ -260,16 +253,6 @@ def rollout_size(shift: np.ndarray, windows: FlightWindows, z: float = 0.0) -> E
     if has_acc.any():
         force = max(force, rms_length(shift[has_acc][:, SLICES["accelerometer"]], z))
     return EffectSize(force, growth("rates", TORQUE_S, 1), growth("position", 1.0, 2))
-
-
-def view_size(shift: np.ndarray, in_world: bool, z: float = 0.0) -> EffectSize:
-    """Return the size of an effect that shifts a view's mean accelerations by `shift` (M, 3).
-
-    A view is a part of the dynamics: here the force (with `in_world` true) or the torque. For `z`
-    see `rms_length`.
-    """
-    rms = rms_length(shift, z)
-    return EffectSize(rms, 0.0, None) if in_world else EffectSize(0.0, rms, None)
 
 
 def upper_size(

@@ -51,8 +51,7 @@ def with_held_commands(
     rms = _rms(difference, linear, noise, whitening)
     residual = _rms(linear.residual, linear, noise, whitening)
     shares = residual / np.maximum(rms, 1e-12)
-    by_group = dict(zip(SLICES, shares, strict=True))
-    fast = (by_group["rates"], by_group["rotor speed"])
+    fast = [s for n, s in zip(SLICES, shares, strict=True) if n in ("rates", "rotor speed")]
     share = min((share for share in fast if share > 0.0), default=0.0)
     if share < limits.held_share:
         return None

@@ -26,7 +26,7 @@ from eval.quadrotor.model import BODY, add_quadrotor, rotor_name
 from eval.quadrotor.plant import make_plant
 from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.diagnose.data.steps import step_s
-from suite.diagnose.data.windows import SLICES, FlightWindows, cut
+from suite.diagnose.data.windows import SLICES, FlightWindows, cut, take
 from suite.diagnose.estimate.block import NormalEquations
 from suite.diagnose.estimate.parameters import ParameterSpace, make_space
 
@@ -221,12 +221,10 @@ def _with_parameters(base: Any, task: Task, values: np.ndarray) -> Any:
 
 def _start_state(model: Any, windows: Any, w: int) -> np.ndarray:
     """Return the measured state at the start of window `w`, in the form of `mujoco.sysid`."""
-    quat = np.empty(4)
-    mujoco.mju_mat2Quat(quat, np.asarray(windows.rot_w[w]).ravel())
-    pose = np.concatenate([windows.pos_w[w], quat])
-    return sysid.create_initial_state(
-        model, pose, np.concatenate([windows.vel_w[w], windows.rate_b[w]])
-    )
+    quat, start = np.empty(4), take(windows.start, w)
+    mujoco.mju_mat2Quat(quat, start.rot_w.ravel())
+    pose, turning = np.concatenate([start.pos_w, quat]), [start.vel_w, start.rate_b]
+    return sysid.create_initial_state(model, pose, np.concatenate(turning))
 
 
 def _thrusts(task: Task, w: int, dt: float) -> Any:
@@ -240,12 +238,11 @@ def _thrusts(task: Task, w: int, dt: float) -> Any:
 
 def _measurements(task: Task, w: int) -> Any:
     """Return the measured states of window `w`; missing values are NaN."""
-    windows = task.windows
+    windows, row = task.windows, take(task.windows.row, w)
     quats = np.empty((len(windows.row_s[w]), 4))
-    for quat, rot_w in zip(quats, windows.row_rot_w[w], strict=True):
-        mujoco.mju_mat2Quat(quat, np.asarray(rot_w).ravel())
-    rows = [windows.row_pos_w[w], quats, windows.row_vel_w[w], windows.row_rate_b[w]]
-    values = np.concatenate(rows, axis=1)
+    for quat, rot_w in zip(quats, row.rot_w, strict=True):
+        mujoco.mju_mat2Quat(quat, rot_w.ravel())
+    values = np.concatenate([row.pos_w, quats, row.vel_w, row.rate_b], axis=1)
     is_seen = np.asarray(windows.valid[w])[:, :12]
     # `seen` has 12 columns and `values` 13: the three angles are a quaternion of four numbers.
     values[~is_seen[:, [0, 1, 2, 3, 3, 3, 3, 6, 7, 8, 9, 10, 11]]] = np.nan

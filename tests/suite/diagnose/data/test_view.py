@@ -155,10 +155,9 @@ def test_the_noise_of_a_slow_signal_is_that_of_its_own_rows(pair):
 
 @pytest.mark.parametrize("ground_s", [(0.0, 0.0), (0.0, 6.0), (30.0, 0.0)])
 def test_of_a_single_flight_the_end_of_what_flew_is_held_out(pair, ground_s):
-    fitted, held = parted(ready([on_the_ground(pair[0], *ground_s)], VEHICLE), [])
-    (words,) = held.names
+    *parts, (words,), _ = parted(ready([on_the_ground(pair[0], *ground_s)], VEHICLE), [])
     for name in (FORCE.name, TORQUE.name):
-        first, last = (part.smoothed[name][0].form.middle_s for part in (fitted, held))
+        first, last = (part[name][0].form.middle_s for part in parts)
         assert first.max() < last.min()
         share = len(first) / (len(first) + len(last))
         assert share == pytest.approx(THRESHOLDS.lone_fitted_share, abs=0.1)
@@ -171,9 +170,8 @@ def test_a_second_must_be_held_out_or_the_flight_is_refused_or_a_second_view_lef
     with pytest.raises(ValueError, match="s of usable flight held out, at least 1 s"):
         parted(ready([short], VEHICLE), [])
     without = replace(longer, about={"partial": ["quat", "rate"]})
-    fitted, held = parted(ready([without], VEHICLE), [])
-    assert set(fitted.smoothed) == set(held.smoothed) == {FORCE.name}
-    (note,) = held.notes
+    fitted, held, _, (note,) = parted(ready([without], VEHICLE), [])
+    assert set(fitted) == set(held) == {FORCE.name}
     assert note.startswith("torque: not examined, ") and "held out, at least 1 s" in note
 
 
@@ -181,7 +179,7 @@ def test_a_log_without_a_stretch_is_left_out_and_slow_ones_are_diagnosed_by_thei
     good, other = pair
     bad = replace(other, name="all holes", rotor_speed=np.full_like(other.rotor_speed, np.nan))
     found = ready([bad, good], VEHICLE)
-    assert found.names == (good.name,) and found.kept == (1,)
+    assert found.logs == (good,)
     assert [len(part) for part in found.smoothed.values()] == [1, 1]
     assert found.notes == ("all holes: no stretch of 0.2 s in flight without a hole",)
     with pytest.raises(ValueError, match="all holes: no stretch"):

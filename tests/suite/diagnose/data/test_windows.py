@@ -90,7 +90,7 @@ def test_windows_take_each_signal_by_its_own_rows(log, row, every, accuracy):
     assert windows is not None and not warnings
     seen = windows.valid.sum(axis=1)
     assert (seen[:, SLICES["rates"]] <= 101 // every + 1).all() and (seen[:, 0] > 90).all()
-    assert np.isfinite(windows.rate_b).all() and np.isfinite(windows.burn_in_rate_b).all()
+    assert np.isfinite(windows.start.rate_b).all() and np.isfinite(windows.burn_in_rate_b).all()
     # Rotor speeds have their own rows, whatever those of the rates are.
     assert windows.rotor_valid.sum(axis=1).min() > 90
     assert rotor_noise(windows) == pytest.approx(NOISE["motor"], rel=0.5)
@@ -190,13 +190,15 @@ def test_windows_hold_the_rows_and_commands_of_their_time(log):
     assert windows.edge_s.shape[1] == burn_in + STEPS[0] + 1
     assert np.diff(windows.edge_s).min() >= 0.0
     row = int(np.searchsorted(log.time_s, windows.start_s[1] - 1e-9))
-    np.testing.assert_array_equal(windows.pos_w[1], log.pos_w[row])
-    np.testing.assert_array_equal(windows.row_pos_w[1][7], log.pos_w[row + 7])
+    np.testing.assert_array_equal(windows.start.pos_w[1], log.pos_w[row])
+    np.testing.assert_array_equal(windows.row.pos_w[1][7], log.pos_w[row + 7])
     now = int(np.searchsorted(windows.command_s[1], -1e-9))
     assert windows.command[1, now, 0] == log.thrust_cmd[row]
     held = np.diff(windows.command_s[1, now : now + 2]) * windows.command[1, now]
     np.testing.assert_allclose(np.diff(windows.command_sum[1, now : now + 2], axis=0)[0], held)
-    np.testing.assert_array_equal(take(windows, windows.start_s > 1.0).pos_w, windows.pos_w[1:])
+    np.testing.assert_array_equal(
+        take(windows, windows.start_s > 1.0).start.pos_w, windows.start.pos_w[1:]
+    )
 
 
 def test_a_pose_from_before_the_start_is_not_compared(log):

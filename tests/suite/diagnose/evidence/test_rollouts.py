@@ -78,7 +78,8 @@ def test_rollouts_begin_at_the_file_and_the_measured_states_of_the_windows(log):
 @pytest.fixture(scope="module")
 def linearised(flown):
     """Return the model of the shared diagnosis, its windows, and their slopes along everything."""
-    model, windows = flown.model, flown.cut(1.0)
+    model, (windows, _) = flown.model, cut(flown.logs, flown.vehicle, False)
+    assert windows is not None
     begin = rollouts.start_estimate(model, windows)
     return model, windows, model.linearise(begin, windows)
 

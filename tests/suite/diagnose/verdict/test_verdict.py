@@ -16,6 +16,7 @@ from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.examine import confirmed, relevant_part
 from suite.diagnose.sources.rollout_source import of_rollouts, structure_where
 from suite.diagnose.sources.source import TOGETHER, TOO_SMALL, Remaining, sizes_by_effect
+from suite.diagnose.sources.view_source import ViewSource
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict import gap as gaps
 from suite.diagnose.verdict import residual_structure as structure
@@ -219,8 +220,10 @@ def test_a_bias_of_the_accelerometer_counts_as_a_force_and_a_views_size_is_in_it
     assert size_of(moved).force == pytest.approx(0.06)
     assert gaps.rollout_size(moved, windows(without=("accelerometer",))).force == 0.0
     moved = np.tile([0.3, 0.0, 0.4], (5, 1))
-    assert gaps.view_size(moved, True) == gaps.EffectSize(pytest.approx(0.5), 0.0, None)
-    assert gaps.view_size(moved, False) == gaps.EffectSize(0.0, pytest.approx(0.5), None)
+    views: list[Any] = [SimpleNamespace(view=SimpleNamespace(in_world=w)) for w in (True, False)]
+    force, torque = (ViewSource.size_of(view, gaps.rms_length(moved)) for view in views)
+    assert force == gaps.EffectSize(pytest.approx(0.5), 0.0, None)
+    assert torque == gaps.EffectSize(0.0, pytest.approx(0.5), None)
 
 
 def size_of(moved, z=0.0):
@@ -243,9 +246,8 @@ def test_an_effect_that_the_models_own_error_may_be_has_no_size_for_certain():
     space = SimpleNamespace(entries=[SimpleNamespace(effect="clock_offset")])
     named = [SimpleNamespace(candidate=SimpleNamespace(name="clock_offset"))]
     last = SimpleNamespace(evidence=SimpleNamespace(space=space))
-    found: Any = SimpleNamespace(
-        named=named, last=last, indices=[0], moved=change, half_widths=lambda: width
-    )
+    found: Any = SimpleNamespace(named=named, last=last, indices=[0], half_widths=lambda: width)
+    found.estimate, found.start = (SimpleNamespace(theta=t) for t in (change, 0.0 * change))
 
     def upper(error):
         sizes = sizes_by_effect(found, slope, size_of, np.array([error]))
@@ -323,7 +325,8 @@ def test_a_bound_does_not_hide_the_models_own_error(found_drag):
     """The error is the change of the fit with coarser inputs, here a little too much drag."""
     found, model = found_drag.search, copy(found_drag.source.model)
     windows = of_rollouts(found.last).windows
-    coarser = windows._replace(row_vel_w=0.995 * np.asarray(windows.row_vel_w))
+    slower = windows.row._replace(vel_w=0.995 * np.asarray(windows.row.vel_w))
+    coarser = windows._replace(row=slower)
     source = replace(found_drag.source, model=model, coarser=coarser, coarser_share=1.0)
     sizes = source.sizes(found)
     assert sizes != found_drag.source.sizes(found)
