@@ -180,7 +180,7 @@ def assemble(
             "neither a thrust and rate command nor motor speeds nor motor commands could be read; "
             f"--partial keeps the other signals{lines}"
         )
-        raise FlightLogError(recording.name, None, None, reason)
+        raise FlightLogError(recording.name, reason)
     about = {
         "source": format,
         **{key: value for key, value in recording.about.items() if key != "partial"},
@@ -228,7 +228,7 @@ def _require_signals(recording: Recording, partial: bool, findings: list[Finding
         why = "".join(f" ({f.evidence})" for f in findings if f.signal in missing)
         hint = "" if missing == ["gyro"] else "; --pose FILE adds position and attitude"
         reason = f"holds no {' and no '.join(missing)}{why}{hint}; --partial keeps what is there"
-        raise FlightLogError(recording.name, None, None, reason)
+        raise FlightLogError(recording.name, reason)
 
 
 def _notes_on_rates(recording: Recording, time_s: np.ndarray) -> list[Finding]:

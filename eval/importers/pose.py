@@ -93,15 +93,14 @@ def with_pose(
     pose = with_readings(pose, tuple(r for r in options.read if r[0] in OF_POSE))
     for name, text in (("pos", "position"), ("quat", "attitude")):
         if name not in pose.signals:
-            reason = f"holds no {text}; name its columns with --pose-map"
-            raise FlightLogError(str(options.pose), None, None, reason)
+            raise FlightLogError(options.pose, f"holds no {text}; name its columns with --pose-map")
     if "rate" not in recording.signals:
-        raise FlightLogError(recording.name, None, None, "holds no gyro to align a pose with")
+        raise FlightLogError(recording.name, "holds no gyro to align a pose with")
     pose, time_findings = _in_seconds(pose)
     for source, samples in ((pose, pose.signals["quat"]), (recording, recording.signals["rate"])):
         if (length_s := samples.time_s[-1] - samples.time_s[0]) > LONG_S:
             reason = f"lasts {length_s:.4g} s, more than {LONG_S:g} s; name its unit of time, or "
-            raise FlightLogError(source.name, "time", None, reason + "cut it")
+            raise FlightLogError(source.name, reason + "cut it", "time")
     quat, alignment, attitude_findings = _align_pose(pose, recording, options.fix)
     rotation_deg = alignment.rotation_deg
     text = (
@@ -207,7 +206,7 @@ def _align_pose(
             f"{unchanged.correlation:.2f} (drift {1e6 * unchanged.drift:.0f} ppm). Are both of "
             "the same flight, is time in seconds, and does the body rotate enough?"
         )
-        raise FlightLogError(pose.name, None, None, reason)
+        raise FlightLogError(pose.name, reason)
     return quat, unchanged, []
 
 
@@ -223,7 +222,7 @@ def align(quat: Signal, rate: Signal, name: str, mirrored: bool = False) -> Alig
     """
     centre_s, pose_rate_b = _pose_rates(quat)
     if len(centre_s) < MIN_SAMPLES:
-        raise FlightLogError(name, None, None, "too few poses to align the clocks by")
+        raise FlightLogError(name, "too few poses to align the clocks by")
     offset = _coarse_offset(centre_s, pose_rate_b, rate, name)
     shared = (centre_s + offset > rate.time_s[0]) & (centre_s + offset < rate.time_s[-1])
     # During the fit, the offset is that in the middle of the flight.
@@ -308,7 +307,7 @@ def _coarse_offset(centre_s: np.ndarray, pose_rate_b: np.ndarray, rate: Signal, 
     pose_grid, log_grid = (np.arange(t[0], t[-1], GRID_S) for t in (centre_s, rate.time_s))
     min_overlap = int(OVERLAP_S / GRID_S)
     if min(len(pose_grid), len(log_grid)) < min_overlap:
-        raise FlightLogError(name, None, None, f"less than {OVERLAP_S:g} s to align clocks by")
+        raise FlightLogError(name, f"less than {OVERLAP_S:g} s to align clocks by")
     pose = np.interp(pose_grid, centre_s, np.linalg.norm(pose_rate_b, axis=1))
     # The vector is averaged before its magnitude, because averaged magnitudes keep the noise.
     log = np.linalg.norm(averaged(rate.time_s, rate.value, log_grid, SPAN_S), axis=1)

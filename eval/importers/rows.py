@@ -119,7 +119,7 @@ def row_times(
                 f"{' and '.join(present)} are {step:.3g} s apart, which makes {rows:,} rows; "
                 f"at most {MOST_ROWS:,}: is its clock damaged, or its unit another one?"
             )
-            raise FlightLogError(recording.name, "time", None, reason)
+            raise FlightLogError(recording.name, reason, "time")
         share = np.arange(parts) / parts
         between = times[:-1, None] + share * np.diff(times)[:, None]
         # No rows are added within a gap.
@@ -151,7 +151,7 @@ def row_times(
                 for name, s in zip(present, needed, strict=True)
             )
             reason = f"{' and '.join(present)} have no common time ({spans})"
-        raise FlightLogError(recording.name, "time", None, reason)
+        raise FlightLogError(recording.name, reason, "time")
     return time_s
 
 

@@ -82,7 +82,7 @@ def make_signal(
     largest = max(np.abs(time_s).max(), np.abs(value).max(initial=0.0))
     if largest > LARGEST:
         reason = f"holds numbers up to {largest:.3g}, allowed are {LARGEST:g}; log or copy it again"
-        raise FlightLogError(file, name, None, reason)
+        raise FlightLogError(file, reason, name)
     # Keep a sample only if it is later than all samples before it.
     forward = np.ones(len(time_s), dtype=bool)
     forward[1:] = time_s[1:] - np.maximum.accumulate(time_s)[:-1] > LEAST_STEP
@@ -97,7 +97,7 @@ def make_signal(
             advice = "sort the rows by time, and check which column is the time"
         reason = f"time does not increase in {backwards} of {len(time_s)} samples of {name!r}; "
         reason += advice
-        raise FlightLogError(file, "time", row, reason)
+        raise FlightLogError(file, reason, "time", row)
     note = f"{backwards} samples of {name!r} whose time does not increase are left out"
     finding = Finding("note", "time", note) if backwards else None
     return Signal(time_s[forward], value[forward]), finding
