@@ -79,10 +79,8 @@ class Alignment:
         return float(np.rad2deg(np.linalg.norm(rotation_vector(rot_to_quat(self.rotation)))))
 
 
-def with_pose(
-    recording: Recording, options: ImportOptions
-) -> tuple[Recording, tuple[Finding, ...]]:
-    """Return `recording` with position and attitude of the file `options.pose`, and findings.
+def with_pose(recording: Recording, options: ImportOptions) -> Recording:
+    """Return `recording` with position and attitude of the file `options.pose`, and its findings.
 
     Raises:
         FlightLogError: where the files cannot be aligned, or one lacks the signals for it.
@@ -96,7 +94,7 @@ def with_pose(
             raise FlightLogError(options.pose, f"holds no {text}; name its columns with --pose-map")
     if "rate" not in recording.signals:
         raise FlightLogError(recording.name, "holds no gyro to align a pose with")
-    pose, time_findings = _in_seconds(pose)
+    pose = _in_seconds(pose)
     for source, samples in ((pose, pose.signals["quat"]), (recording, recording.signals["rate"])):
         if (length_s := samples.time_s[-1] - samples.time_s[0]) > LONG_S:
             reason = f"lasts {length_s:.4g} s, more than {LONG_S:g} s; name its unit of time, or "
@@ -108,7 +106,7 @@ def with_pose(
         f"from the log's and runs {1e6 * alignment.drift:+.0f} ppm off; "
         f"rates correlate by {alignment.correlation:.3f}"
     )
-    findings = [*pose.findings, *time_findings]
+    findings = [*pose.findings]
     if left_out := [name for name in OTHER_WORLD if name in recording.signals]:
         note = f"{' and '.join(left_out)} of the log are in another world frame: left out"
         findings.append(Finding("note", "pose", note))
@@ -134,7 +132,7 @@ def with_pose(
     elif rotation_deg > 1.0:
         text = f"its body is rotated by {rotation_deg:.1f} deg against the gyro; not corrected"
         findings.append(Finding("note", "pose axes", text))
-    return joined, tuple(findings)
+    return joined.noting(*findings)
 
 
 def _join(recording: Recording, pose: Recording, quat: Signal, alignment: Alignment) -> Recording:
@@ -157,7 +155,7 @@ def _has_wrong_sign(recording: Recording) -> bool:
     return better and fits.best.quat in ANGLES
 
 
-def _in_seconds(pose: Recording) -> tuple[Recording, list[Finding]]:
+def _in_seconds(pose: Recording) -> Recording:
     """Return the pose with its time in seconds, in the unit that gives a usual camera rate."""
     time_s = pose.signals["quat"].time_s
     step, length = median_step(time_s), time_s[-1] - time_s[0]
@@ -165,10 +163,10 @@ def _in_seconds(pose: Recording) -> tuple[Recording, list[Finding]]:
     units = [unit for unit, factor in TIMES.items() if length * factor >= OVERLAP_S] or list(TIMES)
     unit = min(units, key=lambda name: abs(np.log(step * TIMES[name] / USUAL_STEP_S)))
     if unit == "s":
-        return pose, []
+        return pose
     text = f"rows are {step:.4g} apart, so time is in {unit}"
-    finding = Finding("corrected", "pose time", text, "time_unit")
-    return with_readings(pose, (("time", unit),)), [finding]
+    noted = pose.noting(Finding("corrected", "pose time", text, "time_unit"))
+    return with_readings(noted, (("time", unit),))
 
 
 def _align_pose(

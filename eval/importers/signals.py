@@ -50,7 +50,7 @@ class Recording:
     signals: Mapping[str, Signal]
     """Signals by name; the module's docstring lists the names."""
     findings: tuple[Finding, ...] = ()
-    """Results of the checks while reading."""
+    """Results of the checks so far."""
     motor_side: tuple[tuple[float, float], ...] | None = None
     """Positions of the file's motors 1 to 4, (x forward, y left), in any length unit; None: the
     motors have the vehicle's order."""
@@ -58,6 +58,10 @@ class Recording:
     """Metadata of the file: firmware, airframe, start."""
     has_seconds: bool = False
     """Whether the format defines the unit of time; otherwise the import checks it."""
+
+    def noting(self, *findings: Finding) -> Recording:
+        """Return the recording with more findings."""
+        return replace(self, findings=(*self.findings, *findings))
 
 
 def make_signal(
