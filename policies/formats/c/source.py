@@ -160,7 +160,6 @@ def _values(
         "JSON": _c_string(label),
         "MACS": multiply_adds(spec),
         "WEIGHT_BYTES": constant_bytes(checkpoint, layers),
-        "HIDDEN": padded(spec.hidden_size),
         "FIRST": first,
         "SECOND": second,
         "EXTRA_STATE": f"    short bytes[{third}];\n" if layers else "",
