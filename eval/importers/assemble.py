@@ -84,7 +84,6 @@ def assemble(
     Raises:
         FlightLogError: where a required signal is missing or breaks a rule.
     """
-    findings = list(recording.findings)
     # An order of motors refers to the vehicle's order, so it is applied after `order_motors`.
     orders = tuple(
         (signal, steps) for signal, steps in options.read if signal in MOTORS and "," in steps
@@ -103,46 +102,33 @@ def assemble(
             context,
             options.fix,
         )
-        findings += of_time
-        recording = with_readings(recording, readings)  # rows need the time in seconds
+        # Rows need the time in seconds.
+        recording = with_readings(recording.noting(*of_time), readings)
     origin_s = min((samples.time_s[0] for samples in recording.signals.values()), default=0.0)
     if options.pose is not None:
         from eval.importers.pose import with_pose
 
-        recording, more_findings = with_pose(recording, options)
-        findings += more_findings
-        recording = with_readings(recording, later)
-    for signal, steps in options.read:
-        if signal not in ("time", *recording.signals) and steps != "drop":
-            text = f"--read {signal}={steps} is not used: the log has no {signal}"
-            findings.append(Finding("note", "file", text))
-    findings += _unused_options(recording.signals, format, options)
-    _require_signals(recording, options.partial, findings)
-    recording, more_findings = check_evenness(recording, options.fix)
-    findings += more_findings
+        recording = with_readings(with_pose(recording, options), later)
+    recording = recording.noting(*_unused_options(recording.signals, format, options))
+    _require_signals(recording, options.partial)
+    recording = check_evenness(recording, options.fix)
     if options.fix:
-        recording, more_findings = without_lost(recording)
-        findings += more_findings
-    new, more_findings = without_repeats(recording)
+        recording = without_lost(recording)
+    new = without_repeats(recording)
     if options.fix:
         recording = new
-        findings += more_findings
     # Checks of the frames of position, attitude and gyro.
     checked = without_far(new)
     coarse = rows_at(checked, row_times(checked))
     copied = _copied(checked.signals)
-    findings += copied
     more_findings, readings, _ = run_checks(coarse, POSE, context, options.fix, copied)
-    findings += more_findings
+    recording = recording.noting(*copied, *more_findings)
     if options.fix:
-        recording = with_readings(recording, readings)
-        recording, more_findings = clean(recording)
-        findings += more_findings
+        recording = clean(with_readings(recording, readings))
     if {"quat", "rate"} <= recording.signals.keys() and options.pose is None and not copied:
-        recording, more_findings = check_delay(recording, options.fix)
-        findings += more_findings
+        recording = check_delay(recording, options.fix)
     # Cut the time on the ground, and resample to common rows.
-    flight_span_s = (-np.inf, np.inf)
+    findings, flight_span_s = list(recording.findings), (-np.inf, np.inf)
     if options.trim:
         flight_span_s, more_findings = airborne(recording)
         findings += more_findings
@@ -184,7 +170,7 @@ def assemble(
             "neither a thrust and rate command nor motor speeds nor motor commands could be read; "
             f"--partial keeps the other signals{lines}"
         )
-        raise FlightLogError(recording.name, None, None, reason)
+        raise FlightLogError(recording.name, reason)
     about = {
         "source": format,
         **{key: value for key, value in recording.about.items() if key != "partial"},
@@ -210,7 +196,12 @@ def _copied(signals: Mapping[str, Signal]) -> list[Finding]:
 
 
 def _unused_options(signals: Collection[str], format: str, options: ImportOptions) -> list[Finding]:
-    """Return a note on each number of `options` that a log with these signals does not need."""
+    """Return a note on each of the `options` that a log with these signals does not need."""
+    findings = [
+        Finding("note", "file", f"--read {name}={steps} is not used: the log has no {name}")
+        for name, steps in options.read
+        if name not in ("time", *signals) and steps != "drop"
+    ]
     has_throttle = "throttle" in signals and "cmd_thrust" not in signals
     has_erpm = format == "betaflight" and "motor" in signals
     numbers = (
@@ -218,21 +209,21 @@ def _unused_options(signals: Collection[str], format: str, options: ImportOption
         ("--full-thrust", options.full_thrust, has_throttle, "normalised thrust only"),
         ("--motor-poles", options.motor_poles, has_erpm, "Betaflight's eRPM"),
     )
-    return [
+    return findings + [
         Finding("note", "file", f"{flag} is not used: it is for a log with {what}")
         for flag, number, is_used, what in numbers
         if number is not None and not is_used
     ]
 
 
-def _require_signals(recording: Recording, partial: bool, findings: list[Finding]) -> None:
+def _require_signals(recording: Recording, partial: bool) -> None:
     """Reject a recording without position, attitude or gyro; a partial log needs one of them."""
     missing = [SIGNAL_TEXTS[name] for name in NEEDED if name not in recording.signals]
     if missing and not (partial and len(missing) < len(NEEDED)):
-        why = "".join(f" ({f.evidence})" for f in findings if f.signal in missing)
+        why = "".join(f" ({f.evidence})" for f in recording.findings if f.signal in missing)
         hint = "" if missing == ["gyro"] else "; --pose FILE adds position and attitude"
         reason = f"holds no {' and no '.join(missing)}{why}{hint}; --partial keeps what is there"
-        raise FlightLogError(recording.name, None, None, reason)
+        raise FlightLogError(recording.name, reason)
 
 
 def _notes_on_rates(recording: Recording, time_s: np.ndarray) -> list[Finding]:

@@ -20,6 +20,7 @@ from eval.logs.faults.clocks.stamps import MEASURED, even_stamps, finding_of, me
 from eval.logs.faults.drive.commands import has_both_signs
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.position import MEDIAN_SAMPLES, jumps_of
+from eval.logs.faults.relation import interpolate
 from eval.logs.faults.sensors import is_coarse, lost_samples
 from eval.logs.velocity import velocity_from_position
 
@@ -50,8 +51,8 @@ POWER = {
 """Signals that measure the motors' effort -> exponent with which each gives the thrust."""
 
 
-def clean(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Return the recording (time in s) without impossible samples, and the findings."""
+def clean(recording: Recording) -> Recording:
+    """Return the recording (time in s) without impossible samples."""
     signals, findings = dict(recording.signals), []
     if "quat" in signals and len(signals["quat"].time_s) > MEDIAN_SAMPLES:
         signals["quat"], more_findings = _without_interpolated(signals["quat"])
@@ -62,7 +63,7 @@ def clean(recording: Recording) -> tuple[Recording, list[Finding]]:
         if "vel" in signals and len(signals["vel"].time_s) > MEDIAN_SAMPLES:
             signals["vel"], more_findings = _without_glitches(signals["vel"], signals["pos"])
             findings += more_findings
-    return replace(recording, signals=signals), findings
+    return replace(recording, signals=signals).noting(*findings)
 
 
 def _select(samples: Signal, good: np.ndarray) -> Signal:
@@ -78,8 +79,8 @@ def _keep(
             signals[name] = _select(signals[name], good)
 
 
-def check_evenness(recording: Recording, fix: bool) -> tuple[Recording, list[Finding]]:
-    """Return the recording with jittery stamps spaced evenly, and the findings.
+def check_evenness(recording: Recording, fix: bool) -> Recording:
+    """Return the recording with jittery stamps spaced evenly, and with the findings.
 
     Without `fix` the jitter is only reported.
     """
@@ -94,10 +95,10 @@ def check_evenness(recording: Recording, fix: bool) -> tuple[Recording, list[Fin
         names = ", ".join(n for n in together if not n.startswith(KEPT))
         findings.append(finding_of(time_s, even_s, names, todo))
         signals |= {n: Signal(even_s, value) for n, value in values.items()}
-    return (replace(recording, signals=signals) if fix else recording), findings
+    return (replace(recording, signals=signals) if fix else recording).noting(*findings)
 
 
-def without_repeats(recording: Recording) -> tuple[Recording, list[Finding]]:
+def without_repeats(recording: Recording) -> Recording:
     """Return the recording without repeated poses, and the signals logged at the same times."""
     signals = dict(recording.signals)
     for name in ("quat", "pos"):
@@ -111,9 +112,9 @@ def without_repeats(recording: Recording) -> tuple[Recording, list[Finding]]:
             continue
         _keep(signals, OF_POSE, samples, is_new)
         text = f"{100 * share:.0f} % of the poses repeat the one before: left out"
-        finding = Finding("corrected", TEXTS[name], text)
-        return replace(recording, signals=signals), [finding]
-    return recording, []
+        noted = recording.noting(Finding("corrected", TEXTS[name], text))
+        return replace(noted, signals=signals)
+    return recording
 
 
 def without_far(recording: Recording) -> Recording:
@@ -125,12 +126,12 @@ def without_far(recording: Recording) -> Recording:
     return replace(recording, signals=signals)
 
 
-def without_lost(recording: Recording) -> tuple[Recording, list[Finding]]:
+def without_lost(recording: Recording) -> Recording:
     """Return the recording without poses that stand still while the gyro turns: tracking is lost.
 
     On the ground a pose may repeat; without a gyro none counts as lost.
     """
-    signals, findings, rate = dict(recording.signals), [], recording.signals.get("rate")
+    signals, rate = dict(recording.signals), recording.signals.get("rate")
     for name in TEXTS:
         samples = signals.get(name)
         if rate is None or samples is None or len(samples.time_s) <= MEDIAN_SAMPLES:
@@ -141,8 +142,8 @@ def without_lost(recording: Recording) -> tuple[Recording, list[Finding]]:
         if is_lost.any():
             _keep(signals, (name, "vel"), samples, ~is_lost)
             text = f"{is_lost.sum()} samples stand still while the gyro turns (lost): left out"
-            findings.append(Finding("corrected", TEXTS[name], text))
-    return replace(recording, signals=signals), findings
+            recording = recording.noting(Finding("corrected", TEXTS[name], text))
+    return replace(recording, signals=signals)
 
 
 def _moves(samples: Signal) -> bool:
@@ -182,7 +183,7 @@ def _without_jumps(pos: Signal) -> tuple[Signal, list[Finding]]:
 def _without_glitches(vel: Signal, pos: Signal) -> tuple[Signal, list[Finding]]:
     """Remove velocities that contradict the path; a velocity in another frame is kept."""
     path = velocity_from_position(pos.time_s, pos.value)
-    slope = np.stack([np.interp(vel.time_s, pos.time_s, column) for column in path.T], axis=1)
+    slope = interpolate(vel.time_s, pos.time_s, path)
     error = vel.value - slope
     deviation = np.abs(error - np.nanmedian(error, axis=0))  # no slope at a lone position
     error_sd = MAD_TO_SD * np.nanmedian(deviation, axis=0)
@@ -202,8 +203,8 @@ def _without_glitches(vel: Signal, pos: Signal) -> tuple[Signal, list[Finding]]:
     return _select(vel, ~bad), [Finding("corrected", "velocity", text)]
 
 
-def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Finding]]:
-    """Return the recording with pose and gyro shifted to one clock, and the findings.
+def check_delay(recording: Recording, fix: bool) -> Recording:
+    """Return the recording with pose and gyro shifted to one clock, and findings on their delay.
 
     The recording has times in s, rates in rad/s and a flight log's frames; it must have quat and
     rate. Without `fix` the delay is only reported.
@@ -211,7 +212,7 @@ def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Findin
     quat, rate = recording.signals["quat"], recording.signals["rate"]
     fit = delay_of(quat.time_s, quat.value, rate.time_s, rate.value)
     if fit is None:
-        return recording, []
+        return recording
     delay, findings = fit.delay_s, fit.rotation_findings()
     is_late = abs(delay) > max(LEAST_S, SURE * fit.error_s)
     moved = fit.moved(recording.signals) if is_late else OF_POSE
@@ -231,8 +232,9 @@ def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Findin
         findings.append(Finding(status, subject, text, *about))
     else:
         findings.append(Finding("ok", subject, figures))
+    recording = recording.noting(*findings)
     if not fix or not (is_late or fit.drifts):
-        return recording, findings
+        return recording
     drift = fit.drift if fit.drifts else 0.0
     signals = dict(recording.signals)
     for name in {*OF_POSE, *moved} & signals.keys():
@@ -242,7 +244,7 @@ def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Findin
         if name in moved:
             time_s = time_s - (delay if name in OF_POSE else -delay)
         signals[name] = Signal(time_s, value)
-    return replace(recording, signals=signals), findings
+    return replace(recording, signals=signals)
 
 
 def airborne(recording: Recording) -> tuple[tuple[float, float], list[Finding]]:

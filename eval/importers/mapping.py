@@ -71,11 +71,11 @@ def recording_of(
             if mapping.optional or signal == "time":
                 continue
             missing_column = next(c for c in alternatives[0].names if find((c,)) is None)
-            raise FlightLogError(name, missing_column, None, missing(missing_column))
+            raise FlightLogError(name, missing(missing_column), missing_column)
         if options.source and column.source not in ("", options.source):
             if signal == "pos":
                 reason = f"has no position of the {options.source}; it has --source {column.source}"
-                raise FlightLogError(name, None, None, reason)
+                raise FlightLogError(name, reason)
             text = f"{signal} is of the {column.source}; there is none of the {options.source}"
             findings.append(Finding("note", "file", text))
         used_columns[signal], parts[signal] = column, _in_log_unit(part, column, name)
@@ -103,7 +103,7 @@ def recording_of(
     for column in mapping.keep:
         part = find((column,))
         if part is None and not mapping.optional:
-            raise FlightLogError(name, column, None, missing(column))
+            raise FlightLogError(name, missing(column), column)
         if part is not None:
             time_s, value = part
             width = value.shape[1]  # a column of lists becomes one column per number
@@ -175,7 +175,7 @@ def _in_log_unit(part: Part, column: Column, name: str) -> Part:
     if value.shape[1] != len(column.factor):
         wanted = f"give {len(column.factor)} columns, or one whose cells hold as many"
         reason = f"{value.shape[1]} a row for a signal of {len(column.factor)} numbers; {wanted}"
-        raise FlightLogError(name, column.names[0], None, reason)
+        raise FlightLogError(name, reason, column.names[0])
     value = value * np.asarray(column.factor)
     if column.mixer:
         value = value @ MIXERS[column.mixer].T

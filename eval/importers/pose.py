@@ -79,10 +79,8 @@ class Alignment:
         return float(np.rad2deg(np.linalg.norm(rotation_vector(rot_to_quat(self.rotation)))))
 
 
-def with_pose(
-    recording: Recording, options: ImportOptions
-) -> tuple[Recording, tuple[Finding, ...]]:
-    """Return `recording` with position and attitude of the file `options.pose`, and findings.
+def with_pose(recording: Recording, options: ImportOptions) -> Recording:
+    """Return `recording` with position and attitude of the file `options.pose`, and its findings.
 
     Raises:
         FlightLogError: where the files cannot be aligned, or one lacks the signals for it.
@@ -93,15 +91,14 @@ def with_pose(
     pose = with_readings(pose, tuple(r for r in options.read if r[0] in OF_POSE))
     for name, text in (("pos", "position"), ("quat", "attitude")):
         if name not in pose.signals:
-            reason = f"holds no {text}; name its columns with --pose-map"
-            raise FlightLogError(str(options.pose), None, None, reason)
+            raise FlightLogError(options.pose, f"holds no {text}; name its columns with --pose-map")
     if "rate" not in recording.signals:
-        raise FlightLogError(recording.name, None, None, "holds no gyro to align a pose with")
-    pose, time_findings = _in_seconds(pose)
+        raise FlightLogError(recording.name, "holds no gyro to align a pose with")
+    pose = _in_seconds(pose)
     for source, samples in ((pose, pose.signals["quat"]), (recording, recording.signals["rate"])):
         if (length_s := samples.time_s[-1] - samples.time_s[0]) > LONG_S:
             reason = f"lasts {length_s:.4g} s, more than {LONG_S:g} s; name its unit of time, or "
-            raise FlightLogError(source.name, "time", None, reason + "cut it")
+            raise FlightLogError(source.name, reason + "cut it", "time")
     quat, alignment, attitude_findings = _align_pose(pose, recording, options.fix)
     rotation_deg = alignment.rotation_deg
     text = (
@@ -109,7 +106,7 @@ def with_pose(
         f"from the log's and runs {1e6 * alignment.drift:+.0f} ppm off; "
         f"rates correlate by {alignment.correlation:.3f}"
     )
-    findings = [*pose.findings, *time_findings]
+    findings = [*pose.findings]
     if left_out := [name for name in OTHER_WORLD if name in recording.signals]:
         note = f"{' and '.join(left_out)} of the log are in another world frame: left out"
         findings.append(Finding("note", "pose", note))
@@ -135,7 +132,7 @@ def with_pose(
     elif rotation_deg > 1.0:
         text = f"its body is rotated by {rotation_deg:.1f} deg against the gyro; not corrected"
         findings.append(Finding("note", "pose axes", text))
-    return joined, tuple(findings)
+    return joined.noting(*findings)
 
 
 def _join(recording: Recording, pose: Recording, quat: Signal, alignment: Alignment) -> Recording:
@@ -158,7 +155,7 @@ def _has_wrong_sign(recording: Recording) -> bool:
     return better and fits.best.quat in ANGLES
 
 
-def _in_seconds(pose: Recording) -> tuple[Recording, list[Finding]]:
+def _in_seconds(pose: Recording) -> Recording:
     """Return the pose with its time in seconds, in the unit that gives a usual camera rate."""
     time_s = pose.signals["quat"].time_s
     step, length = median_step(time_s), time_s[-1] - time_s[0]
@@ -166,10 +163,10 @@ def _in_seconds(pose: Recording) -> tuple[Recording, list[Finding]]:
     units = [unit for unit, factor in TIMES.items() if length * factor >= OVERLAP_S] or list(TIMES)
     unit = min(units, key=lambda name: abs(np.log(step * TIMES[name] / USUAL_STEP_S)))
     if unit == "s":
-        return pose, []
+        return pose
     text = f"rows are {step:.4g} apart, so time is in {unit}"
-    finding = Finding("corrected", "pose time", text, "time_unit")
-    return with_readings(pose, (("time", unit),)), [finding]
+    noted = pose.noting(Finding("corrected", "pose time", text, "time_unit"))
+    return with_readings(noted, (("time", unit),))
 
 
 def _align_pose(
@@ -207,7 +204,7 @@ def _align_pose(
             f"{unchanged.correlation:.2f} (drift {1e6 * unchanged.drift:.0f} ppm). Are both of "
             "the same flight, is time in seconds, and does the body rotate enough?"
         )
-        raise FlightLogError(pose.name, None, None, reason)
+        raise FlightLogError(pose.name, reason)
     return quat, unchanged, []
 
 
@@ -223,7 +220,7 @@ def align(quat: Signal, rate: Signal, name: str, mirrored: bool = False) -> Alig
     """
     centre_s, pose_rate_b = _pose_rates(quat)
     if len(centre_s) < MIN_SAMPLES:
-        raise FlightLogError(name, None, None, "too few poses to align the clocks by")
+        raise FlightLogError(name, "too few poses to align the clocks by")
     offset = _coarse_offset(centre_s, pose_rate_b, rate, name)
     shared = (centre_s + offset > rate.time_s[0]) & (centre_s + offset < rate.time_s[-1])
     # During the fit, the offset is that in the middle of the flight.
@@ -308,7 +305,7 @@ def _coarse_offset(centre_s: np.ndarray, pose_rate_b: np.ndarray, rate: Signal, 
     pose_grid, log_grid = (np.arange(t[0], t[-1], GRID_S) for t in (centre_s, rate.time_s))
     min_overlap = int(OVERLAP_S / GRID_S)
     if min(len(pose_grid), len(log_grid)) < min_overlap:
-        raise FlightLogError(name, None, None, f"less than {OVERLAP_S:g} s to align clocks by")
+        raise FlightLogError(name, f"less than {OVERLAP_S:g} s to align clocks by")
     pose = np.interp(pose_grid, centre_s, np.linalg.norm(pose_rate_b, axis=1))
     # The vector is averaged before its magnitude, because averaged magnitudes keep the noise.
     log = np.linalg.norm(averaged(rate.time_s, rate.value, log_grid, SPAN_S), axis=1)

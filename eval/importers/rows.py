@@ -16,6 +16,7 @@ import numpy as np
 from eval.importers.frames import conjugate, rotate
 from eval.importers.signals import NEEDED, Recording, Signal, median_step
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.relation import interpolate
 from eval.logs.files import MOST_ROWS
 
 LEAST_HZ = 20.0
@@ -119,7 +120,7 @@ def row_times(
                 f"{' and '.join(present)} are {step:.3g} s apart, which makes {rows:,} rows; "
                 f"at most {MOST_ROWS:,}: is its clock damaged, or its unit another one?"
             )
-            raise FlightLogError(recording.name, "time", None, reason)
+            raise FlightLogError(recording.name, reason, "time")
         share = np.arange(parts) / parts
         between = times[:-1, None] + share * np.diff(times)[:, None]
         # No rows are added within a gap.
@@ -151,7 +152,7 @@ def row_times(
                 for name, s in zip(present, needed, strict=True)
             )
             reason = f"{' and '.join(present)} have no common time ({spans})"
-        raise FlightLogError(recording.name, "time", None, reason)
+        raise FlightLogError(recording.name, reason, "time")
     return time_s
 
 
@@ -214,7 +215,7 @@ def measured(samples: Signal, time_s: np.ndarray, smooth: bool) -> np.ndarray:
         elif not smooth and step < FASTER * row_step and len(t) > 1:
             out[rows] = smoothed(t, v, time_s[rows], row_step)
         else:
-            out[rows] = _linear(t, v, time_s[rows])
+            out[rows] = interpolate(time_s[rows], t, v)
     return out
 
 
@@ -279,10 +280,6 @@ def continuous(quat_wxyz: np.ndarray) -> np.ndarray:
     return quat_wxyz * sign[:, None]
 
 
-def _linear(t: np.ndarray, v: np.ndarray, query_s: np.ndarray) -> np.ndarray:
-    return np.stack([np.interp(query_s, t, column) for column in v.T], axis=1)
-
-
 def smoothed(t: np.ndarray, v: np.ndarray, query_s: np.ndarray, width_s: float) -> np.ndarray:
     """Return samples smoothed by a local parabola (Savitzky and Golay 1964).
 
@@ -308,7 +305,7 @@ def smoothed(t: np.ndarray, v: np.ndarray, query_s: np.ndarray, width_s: float) 
         powers = np.where((offset < count)[:, None], u[:, None] ** np.arange(5), 0.0)
         moments += powers
         right_side += powers[:, :3, None] * v[k][:, None, :]
-    out = _linear(t, v, query_s)
+    out = interpolate(query_s, t, v)
     enough = np.flatnonzero(count >= 3)
     normal = moments[enough][:, np.arange(3)[:, None] + np.arange(3)]
     out[enough] = np.linalg.solve(normal, right_side[enough])[:, 0]
@@ -342,4 +339,4 @@ def averaged(t: np.ndarray, v: np.ndarray, query_s: np.ndarray, width_s: float) 
     # A window of no width, at an end of the samples, takes the value itself.
     width = np.where(half > 0, 2.0 * half, 1.0)[:, None]
     mean = (integral(query_s + half) - integral(query_s - half)) / width
-    return np.where(half[:, None] > 0, mean, _linear(t, v, query_s))
+    return np.where(half[:, None] > 0, mean, interpolate(query_s, t, v))

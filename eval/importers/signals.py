@@ -50,7 +50,7 @@ class Recording:
     signals: Mapping[str, Signal]
     """Signals by name; the module's docstring lists the names."""
     findings: tuple[Finding, ...] = ()
-    """Results of the checks while reading."""
+    """Results of the checks so far."""
     motor_side: tuple[tuple[float, float], ...] | None = None
     """Positions of the file's motors 1 to 4, (x forward, y left), in any length unit; None: the
     motors have the vehicle's order."""
@@ -58,6 +58,10 @@ class Recording:
     """Metadata of the file: firmware, airframe, start."""
     has_seconds: bool = False
     """Whether the format defines the unit of time; otherwise the import checks it."""
+
+    def noting(self, *findings: Finding) -> Recording:
+        """Return the recording with more findings."""
+        return replace(self, findings=(*self.findings, *findings))
 
 
 def make_signal(
@@ -82,7 +86,7 @@ def make_signal(
     largest = max(np.abs(time_s).max(), np.abs(value).max(initial=0.0))
     if largest > LARGEST:
         reason = f"holds numbers up to {largest:.3g}, allowed are {LARGEST:g}; log or copy it again"
-        raise FlightLogError(file, name, None, reason)
+        raise FlightLogError(file, reason, name)
     # Keep a sample only if it is later than all samples before it.
     forward = np.ones(len(time_s), dtype=bool)
     forward[1:] = time_s[1:] - np.maximum.accumulate(time_s)[:-1] > LEAST_STEP
@@ -97,7 +101,7 @@ def make_signal(
             advice = "sort the rows by time, and check which column is the time"
         reason = f"time does not increase in {backwards} of {len(time_s)} samples of {name!r}; "
         reason += advice
-        raise FlightLogError(file, "time", row, reason)
+        raise FlightLogError(file, reason, "time", row)
     note = f"{backwards} samples of {name!r} whose time does not increase are left out"
     finding = Finding("note", "time", note) if backwards else None
     return Signal(time_s[forward], value[forward]), finding

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -78,15 +79,18 @@ _OTHER_NAMES = {
 class FlightLogError(ValueError):
     """A flight log is refused; names the file, the column, the row and the reason."""
 
-    def __init__(self, name: str, column: str | None, row: int | None, reason: str) -> None:
+    def __init__(
+        self, name: str | Path, reason: str, column: str | None = None, row: int | None = None
+    ) -> None:
         """Keep the parts and join them to one line; `row` is counted from 1."""
-        self.name, self.column, self.row, self.reason = name, column, row, reason
+        self.name, self.reason, self.column, self.row = str(name), reason, column, row
         where = [part for part in (column and f"column {column}", row and f"row {row}") if part]
-        super().__init__(": ".join([name, ", ".join(where), reason] if where else [name, reason]))
+        parts = [self.name, ", ".join(where), reason] if where else [self.name, reason]
+        super().__init__(": ".join(parts))
 
     def __reduce__(self) -> tuple[type[FlightLogError], tuple[object, ...]]:
         """Return the parts for pickling."""
-        return type(self), (self.name, self.column, self.row, self.reason)
+        return type(self), (self.name, self.reason, self.column, self.row)
 
 
 def quoted(error: Exception) -> str:
@@ -118,13 +122,13 @@ def check_columns(
         _refuse_where(np.abs(data) > LARGEST, name, column, data, "too large for any unit")
     empty = [column for column, data in values.items() if np.isnan(data).all()]
     if missing := [column for group in needed for column in GROUPS[group] if column in empty]:
-        raise FlightLogError(name, missing[0], 1, "missing in every row")
+        raise FlightLogError(name, "missing in every row", missing[0], 1)
     present = [group for group in present if not set(GROUPS[group]) & set(empty)]
     if not partial:
         _refuse_half_a_command(present, columns, name)
         _need_a_command(present, columns, name, empty)
     elif present == ["time"]:
-        raise FlightLogError(name, None, None, "holds a time and nothing else that is known")
+        raise FlightLogError(name, "holds a time and nothing else that is known")
 
     rows = np.isfinite(values["time"])
     row_number = np.flatnonzero(rows) + 1
@@ -152,11 +156,9 @@ def _present_groups(
         if not missing:
             present.append(group)
         elif group in needed or len(missing) < len(members):
-            raise FlightLogError(
-                name, missing[0], None, "missing" + _did_you_mean(missing[0], columns)
-            )
+            raise FlightLogError(name, "missing" + _did_you_mean(missing[0], columns), missing[0])
     if not len(columns["time"]):
-        raise FlightLogError(name, None, None, "no rows; at least 1 s of flight is needed")
+        raise FlightLogError(name, "no rows; at least 1 s of flight is needed")
     return present
 
 
@@ -173,7 +175,7 @@ def _refuse_half_a_command(
             column = GROUPS[others[0]][0]
             state = "missing in every row" if column in columns else "missing"
             reason = f"{state}; {GROUPS[one][0]} needs it{_did_you_mean(column, columns)}"
-            raise FlightLogError(name, column, None, reason)
+            raise FlightLogError(name, reason, column)
 
 
 def _need_a_command(
@@ -188,7 +190,7 @@ def _need_a_command(
             "neither cmd_thrust with cmd_rate_x, _y, _z (or cmd_torque_x, _y, _z) "
             "nor motor_1 to motor_4 nor pwm_1 to pwm_4 is there"
         )
-        raise FlightLogError(name, None, None, reason + hint)
+        raise FlightLogError(name, reason + hint)
 
 
 def _did_you_mean(column: str, columns: Mapping[str, np.ndarray]) -> str:
@@ -212,7 +214,7 @@ def as_numbers(values: np.ndarray, column: str, name: str) -> np.ndarray:
         return values.astype(np.float64)
     if values.dtype.kind in "Mm":
         reason = f"a date or a span ({values.dtype}); write it as a number in the column's unit"
-        raise FlightLogError(name, column, None, reason)
+        raise FlightLogError(name, reason, column)
     numbers = np.full(len(values), np.nan)
     for k, value in enumerate(values):
         text = value.strip() if isinstance(value, str) else value
@@ -221,8 +223,7 @@ def as_numbers(values: np.ndarray, column: str, name: str) -> np.ndarray:
                 numbers[k] = float(text)
         except (TypeError, ValueError):
             hint = "; if this row has the units, delete it" if k == 0 else ""
-            reason = f"{value!r} is not a number{hint}"
-            raise FlightLogError(name, column, k + 1, reason) from None
+            raise FlightLogError(name, f"{value!r} is not a number{hint}", column, k + 1) from None
     return numbers
 
 
@@ -231,11 +232,11 @@ def _check_time(time: np.ndarray, row_number: np.ndarray, name: str) -> None:
     if len(back):
         k = back[0] + 1
         reason = f"{time[k]:.9g} s does not come after {time[k - 1]:.9g} s; time must increase"
-        raise FlightLogError(name, "time", int(row_number[k]), reason)
+        raise FlightLogError(name, reason, "time", int(row_number[k]))
     if (duration := time[-1] - time[0]) < DURATION_MIN:
         reason = f"{duration:.3g} s of flight; at least {DURATION_MIN:g} s is needed"
         reason += "; `time` should be in seconds" if duration < 0.1 * DURATION_MIN else ""
-        raise FlightLogError(name, "time", int(row_number[-1]), reason)
+        raise FlightLogError(name, reason, "time", int(row_number[-1]))
 
 
 def _check_limits(kept: Mapping[str, np.ndarray], name: str, row_number: np.ndarray) -> None:
@@ -251,7 +252,7 @@ def _check_quaternion(kept: Mapping[str, np.ndarray], row_number: np.ndarray, na
     bad = np.flatnonzero(np.abs(norm - 1) > QUATERNION_TOLERANCE)
     if len(bad):
         reason = f"a quaternion of norm {norm[bad[0]]:.6g}; within 5 % of 1 is allowed"
-        raise FlightLogError(name, "quat_w", int(row_number[bad[0]]), reason)
+        raise FlightLogError(name, reason, "quat_w", int(row_number[bad[0]]))
 
 
 def _refuse_where(
@@ -266,4 +267,4 @@ def _refuse_where(
     if len(where):
         k = where[0]
         row = k + 1 if row_number is None else row_number[k]
-        raise FlightLogError(name, column, int(row), f"{values[k]:g}, {reason}")
+        raise FlightLogError(name, f"{values[k]:g}, {reason}", column, int(row))

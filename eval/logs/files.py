@@ -61,13 +61,9 @@ def read_columns(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[st
     if head.startswith(PARQUET_MAGIC):
         return _read_parquet(path)
     if path.suffix.lower() in (".parquet", ".pq"):
-        raise FlightLogError(
-            str(path), None, None, "not a Parquet file (or cut at its start); copy it again"
-        )
+        raise FlightLogError(path, "not a Parquet file (or cut at its start); copy it again")
     if b"\0" in head:
-        raise FlightLogError(
-            str(path), None, None, "neither a Parquet file nor CSV; suite import reads others"
-        )
+        raise FlightLogError(path, "neither a Parquet file nor CSV; suite import reads others")
     return _read_csv(path)
 
 
@@ -80,9 +76,9 @@ def write_columns(path: Path, columns: Mapping[str, np.ndarray], text: str) -> P
     """
     kind = path.suffix.lower()
     if kind not in (".parquet", ".csv"):
-        raise FlightLogError(str(path), None, None, "the ending must be .parquet or .csv")
+        raise FlightLogError(path, "the ending must be .parquet or .csv")
     if METADATA in columns:
-        raise FlightLogError(str(path), METADATA, None, "this name is kept for the metadata")
+        raise FlightLogError(path, "this name is kept for the metadata", METADATA)
     table = pa.table({name: pa.array(values) for name, values in columns.items()})
     with replacing_file(path) as temporary:
         if kind == ".parquet":
@@ -112,7 +108,7 @@ def _read_parquet(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[s
     except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError) as error:
         first = str(error).splitlines()[0]
         reason = f"a corrupt Parquet file ({first}); copy or record it again"
-        raise FlightLogError(str(path), None, None, reason) from None
+        raise FlightLogError(path, reason) from None
     text = metadata.get(METADATA.encode())
     decoded = None if text is None else text.decode(errors="replace")
     return _arrays(table, path), decoded, warnings
@@ -123,10 +119,10 @@ def _wanted(path: Path, file: Any) -> tuple[list[str], list[str]]:
     rows, names, schema = file.metadata.num_rows, file.schema_arrow.names, file.schema_arrow
     for name in names:
         if names.count(name) > 1:
-            raise FlightLogError(str(path), name, None, "this column is there twice")
+            raise FlightLogError(path, "this column is there twice", name)
     nested = {name for name in names if pa.types.is_nested(schema.field(name).type)}
     if known := sorted(nested & KNOWN):
-        raise FlightLogError(str(path), known[0], None, "its cells hold lists; give a number each")
+        raise FlightLogError(path, "its cells hold lists; give a number each", known[0])
     wanted = [name for name in names if name not in nested]
     if rows * len(wanted) > MOST_CELLS:
         wanted = [name for name in wanted if name in KNOWN]
@@ -168,9 +164,9 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]
             table = parse(pa.string())  # so that `check_columns` can name the first bad value
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         if "Empty CSV" in str(error):
-            raise FlightLogError(str(path), None, None, "a header, but no rows") from None
+            raise FlightLogError(path, "a header, but no rows") from None
         first = str(error).splitlines()[0]
-        raise FlightLogError(str(path), None, None, f"not readable as CSV ({first})") from None
+        raise FlightLogError(path, f"not readable as CSV ({first})") from None
     warnings = []
     if before:
         warnings.append(f"{path}: the {before} lines before the header are left out")
@@ -179,10 +175,10 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]
         row = bad.number - 1 - before
         reason = f"{bad.actual_columns} values where the header has {bad.expected_columns} columns"
         if row < last:
-            raise FlightLogError(str(path), None, row, reason)
+            raise FlightLogError(path, reason, None, row)
         warnings.append(f"{path}: row {row}, the last, is left out: {reason}")
     if not table.num_rows:
-        raise FlightLogError(str(path), None, None, "a header, but no whole rows")
+        raise FlightLogError(path, "a header, but no whole rows")
     columns = _arrays(table, path)
     text = columns.pop(METADATA, np.array([None]))[0]
     return columns, text if isinstance(text, str) else None, warnings
@@ -198,7 +194,7 @@ def _check_size(path: Path, rows: int, columns: int) -> None:
         reason = f"{size}; at most {MOST_CELLS:,} cells: leave columns out, {reason}"
     else:
         return
-    raise FlightLogError(str(path), None, None, reason)
+    raise FlightLogError(path, reason)
 
 
 def _check_text(path: Path, columns: int) -> None:
@@ -212,7 +208,7 @@ def _check_text(path: Path, columns: int) -> None:
                 lines += part.count(b"\n")
         decode(b"", True)
     except UnicodeDecodeError:
-        raise FlightLogError(str(path), None, None, NOT_CSV) from None
+        raise FlightLogError(path, NOT_CSV) from None
     _check_size(path, lines, columns)
 
 
@@ -223,15 +219,15 @@ def _csv_header(path: Path) -> tuple[list[str], int]:
         with path.open(encoding="utf-8-sig", newline="") as file:
             lines = [row for row, _ in zip(csv.reader(file), range(MOST_BEFORE), strict=False)]
     except (UnicodeDecodeError, csv.Error):
-        raise FlightLogError(str(path), None, None, NOT_CSV) from None
+        raise FlightLogError(path, NOT_CSV) from None
     finally:
         csv.field_size_limit(usual_limit)
     names = [name.strip() for name in lines[0]] if lines else []
     if len(names) == 1 and any(mark in names[0] for mark in OTHER_MARKS):
-        raise FlightLogError(str(path), None, None, NO_COMMAS)
+        raise FlightLogError(path, NO_COMMAS)
     for start, advice in OTHERS.items():
         if names and names[0] == start:
-            raise FlightLogError(str(path), None, None, advice)
+            raise FlightLogError(path, advice)
     before = _lines_before(lines)
     return [name.strip() for name in lines[before]] if lines else [], before
 
@@ -268,7 +264,7 @@ def _arrays(table: pa.Table, path: Path) -> dict[str, np.ndarray]:
         if not name:
             continue  # commas at the end of the lines
         if name in columns:
-            raise FlightLogError(str(path), name, None, "this column is there twice")
+            raise FlightLogError(path, "this column is there twice", name)
         if pa.types.is_null(column.type) or pa.types.is_decimal(column.type):
             column = column.cast(pa.float64())
         if pa.types.is_dictionary(column.type):
@@ -292,13 +288,12 @@ def read_head(path: Path) -> bytes:
             head = file.read(8192)
         refuse_other_kinds(head, str(path))
     except OSError as error:
-        reason = f"cannot be read: {error.strerror or error}"
-        raise FlightLogError(str(path), None, None, reason) from None
+        raise FlightLogError(path, f"cannot be read: {error.strerror or error}") from None
     except InputError as error:
         reason = str(error).removeprefix(f"{path}: ")
-        raise FlightLogError(str(path), None, None, reason) from None
+        raise FlightLogError(path, reason) from None
     if not head:
-        raise FlightLogError(str(path), None, None, "the file is empty; record or copy it again")
+        raise FlightLogError(path, "the file is empty; record or copy it again")
     return head
 
 

@@ -264,7 +264,7 @@ def columns_from_log(log: FlightLog) -> dict[str, np.ndarray]:
     for column, values in columns.items():
         if len(values) != len(log.time_s):
             reason = f"{len(values)} values, but `time` has {len(log.time_s)}"
-            raise FlightLogError(log.name, column, None, reason)
+            raise FlightLogError(log.name, reason, column)
     return columns
 
 
@@ -296,7 +296,7 @@ def read_flight(path: str | Path, partial: bool = False, limits: bool = True) ->
     log = log_from_columns(columns, about, str(path), limits)
     if log.partial and not partial:
         reason = f"a partial log, without {', '.join(log.partial)}; this command needs whole ones"
-        raise FlightLogError(str(path), None, None, reason)
+        raise FlightLogError(path, reason)
     return replace(log, warnings=(*warnings, *log.warnings))
 
 
@@ -346,7 +346,7 @@ def read_flights(
     if not flights:
         reasons = refused or ["no file was given"]
         between = "\n" if len(reasons) > 1 else ": "
-        raise FlightLogError("flights", None, None, between.join(["none can be used", *reasons]))
+        raise FlightLogError("flights", between.join(["none can be used", *reasons]))
     return flights, warnings
 
 

@@ -161,13 +161,11 @@ def check_finite(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
         PolicyError: naming the file, the array and how many of its values are not finite.
     """
     for name, value in arrays.items():
-        if np.issubdtype(value.dtype, np.inexact):
-            nonfinite = int(value.size - np.isfinite(value).sum())
-            if nonfinite:
-                raise PolicyError(
-                    f"{path}: {name!r} has {nonfinite} of {value.size} values that are NaN or "
-                    "infinite; use an earlier checkpoint of that run"
-                )
+        if nonfinite := int(value.size - np.isfinite(value).sum()):
+            raise PolicyError(
+                f"{path}: {name!r} has {nonfinite} of {value.size} values that are NaN or "
+                "infinite; use an earlier checkpoint of that run"
+            )
 
 
 def check_shapes(

@@ -105,11 +105,9 @@ def export_module(
     from policies.block_policy import random_block
     from policies.formats.onnx_file import load_onnx
 
-    spec = (
-        trained_under
-        if isinstance(trained_under, PolicySpec)
-        else contract.spec_of(trained_under, str(path))
-    )
+    spec = trained_under
+    if not isinstance(spec, PolicySpec):
+        spec = contract.spec_of(spec, str(path))
     policy_contract = contract.contract_of(spec, memory or ())
     sizes = [(spec.state_size,), spec.image_shape, *([memory] if memory else [])]
     names = INPUTS[: len(sizes)]

@@ -8,12 +8,9 @@ This protects against errors, not against attacks: torch files and C can run any
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import json
-import os
-import select
 import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -37,8 +34,6 @@ MEMORY_BYTES = 4 * 2**30
 """Largest address space of the process, in addition to that of the engine [bytes]."""
 ANSWER_BYTES = 2**28
 """Size of the largest answer [bytes]."""
-PIPE_BYTES = 2**20
-"""Size of the pipes, the largest that Linux allows every user [bytes]."""
 GRACE_S = 5.0
 """Time after a limit at which the process ends itself, in case its parent has ended [s]."""
 SERVER = Path(__file__).with_name("model_server.py")
@@ -95,20 +90,18 @@ class ModelProcess:
 
     def _start(self) -> dict[str, Any]:
         """Start the process, load the model there and return its description."""
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", str(SERVER)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            bufsize=0,
-            # Ctrl-C reaches all processes of a session; this process decides when the model ends.
-            start_new_session=True,
-        )
-        self._end = weakref.finalize(self, end_process, self._process)
-        for pipe in (self._process.stdin, self._process.stdout):
-            assert pipe is not None
-            os.set_blocking(pipe.fileno(), False)
-            _widen(pipe.fileno())
+        # A socket instead of pipes, because it has timeouts.
+        self._socket, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", str(SERVER)],
+                stdin=theirs,
+                stdout=theirs,
+                stderr=subprocess.DEVNULL,
+                # Ctrl-C reaches all processes of a session; this process decides when it ends.
+                start_new_session=True,
+            )
+        self._end = weakref.finalize(self, _end, self._process, self._socket)
         limits = {
             "memory_bytes": MEMORY_BYTES,
             "load_s": LOAD_S + GRACE_S,
@@ -154,13 +147,14 @@ class ModelProcess:
         text = json.dumps(header).encode()
         try:
             for part in (struct.pack("<I", len(text)) + text, *data):
-                self._write(memoryview(part), until)
+                self._socket.settimeout(_remaining_s(until))
+                self._socket.sendall(part)
             (length,) = struct.unpack("<I", self._read(4, until))
             answer = json.loads(self._read(length, until))
             return answer, self._read(data_bytes(answer), until)
         except TimeoutError:
             reason = f"it was not {done} within {limit_s:g} s"
-        except (BrokenPipeError, EOFError, ValueError, MemoryError):
+        except (ConnectionError, EOFError, ValueError, MemoryError):
             reason = _how_it_ended(self._process)
         self._end()
         raise NoAnswer(
@@ -169,51 +163,31 @@ class ModelProcess:
             "again"
         )
 
-    def _write(self, data: memoryview, until: float) -> None:
-        """Write bytes to the process, or raise a TimeoutError at the time `until`."""
-        pipe = self._process.stdin
-        assert pipe is not None
-        while data:
-            _wait(pipe.fileno(), select.POLLOUT, until)
-            try:
-                data = data[os.write(pipe.fileno(), data) :]
-            except BlockingIOError:
-                continue
-
     def _read(self, count: int, until: float) -> bytearray:
         """Read `count` bytes from the process, or raise a TimeoutError at the time `until`."""
-        pipe = self._process.stdout
-        assert pipe is not None
         if not 0 <= count <= ANSWER_BYTES:
             raise ValueError(f"an answer of {count} bytes")
         data = bytearray(count)
         view = memoryview(data)
         while view:
-            _wait(pipe.fileno(), select.POLLIN, until)
-            try:
-                got = os.readv(pipe.fileno(), [view])
-            except BlockingIOError:
-                continue
-            if not got:
+            self._socket.settimeout(_remaining_s(until))
+            if not (got := self._socket.recv_into(view)):
                 raise EOFError
             view = view[got:]
         return data
 
 
-def _widen(handle: int) -> None:
-    """Enlarge a pipe for a whole block of rows, where possible; small pieces are slow."""
-    if hasattr(fcntl, "F_SETPIPE_SZ"):
-        with contextlib.suppress(OSError):
-            fcntl.fcntl(handle, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+def _end(process: subprocess.Popen[bytes], connection: socket.socket) -> None:
+    """End the process and the connection to it."""
+    end_process(process)
+    connection.close()
 
 
-def _wait(handle: int, event: int, until: float) -> None:
-    """Wait until a pipe is ready for `event`; raise a TimeoutError at the time `until`."""
-    poll = select.poll()
-    poll.register(handle, event)
-    remaining_s = until - time.monotonic()
-    if remaining_s <= 0 or not poll.poll(remaining_s * 1000):
+def _remaining_s(until: float) -> float:
+    """Return the time to `until` [s], or raise a TimeoutError if it is over."""
+    if (remaining_s := until - time.monotonic()) <= 0.0:
         raise TimeoutError
+    return remaining_s
 
 
 def _how_it_ended(process: subprocess.Popen[bytes]) -> str:

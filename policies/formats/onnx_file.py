@@ -14,10 +14,10 @@ import onnx.inliner
 
 from policies.block_policy import BlockPolicy
 from policies.formats.model_process import ModelProcess
-from policies.formats.program_inputs import INPUTS, check_inputs, check_memory, program_policy
+from policies.formats.program_inputs import described_policy, read_model
 from policies.formats.spec_json import extract
 from policies.spec import PolicyError
-from tracks.input.reading import MODEL_BYTES, InputError, read_bytes, reason
+from tracks.input.reading import MODEL_BYTES
 
 _STANDARD = ("", "ai.onnx")
 """Names of the domain of standard operators."""
@@ -41,12 +41,7 @@ def load_onnx(path: Path) -> BlockPolicy:
                 f"{path}: {value.name!r} is {value.kind}, expected tensor(float); export it as "
                 "float32, such as by model.float() in PyTorch"
             )
-    shapes = {value.name: value.shape for value in loaded.inputs}
-    order = sorted(shapes, key=(*INPUTS, *shapes).index)
-    ordered = {name: shapes[name] for name in order}
-    block, hidden_shape = check_inputs(ordered, metadata.spec, str(path))
-    check_memory(metadata, hidden_shape, str(path))
-    return program_policy(loaded, path, metadata, hidden_shape, block)
+    return described_policy(loaded, path, metadata)
 
 
 def read_checked(path: Path) -> onnx.ModelProto:
@@ -129,12 +124,9 @@ def files_of(path: Path) -> list[Path]:
 
 def _graph_of(path: Path) -> onnx.ModelProto:
     """Return the model of a file, without its external data and unchecked."""
+    data = read_model(path)
     try:
-        return onnx.load_model_from_string(read_bytes(path, MODEL_BYTES))
-    except OSError as error:
-        raise PolicyError(f"{path}: cannot be read ({reason(error)}); check the file") from None
-    except InputError as error:
-        raise PolicyError(str(error)) from None
+        return onnx.load_model_from_string(data)
     except Exception as error:  # protobuf's DecodeError; the suite does not depend on protobuf
         raise PolicyError(
             f"{path}: not a complete ONNX file ({_first_line(error)}); export it again"

@@ -78,34 +78,25 @@ def load_policy_checkpoint(folder: Path) -> PolicyCheckpoint:
     """Read a policy's checkpoint.
 
     Raises:
-        PolicyError: where it is damaged, of another kind, not finite, or its arrays do not have
-            the shapes of its spec.
+        PolicyError: where it is damaged, of another kind, not finite, its arrays do not have the
+            shapes of its spec, or the suite's network does not support such an image.
     """
+    from policies.networks import network
+
     stored = load_arrays(folder, kind=POLICY)
     if "spec" not in stored.config:
         raise PolicyError(f"{folder / CONFIG}: key 'spec' is missing; copy the whole folder again")
     spec = spec_from_json(stored.config["spec"], f"{folder / CONFIG}: spec")
-    check_shapes(folder / WEIGHTS, stored.arrays, expected_shapes(spec, str(folder / CONFIG)))
+    try:
+        check_network(spec)
+    except ValueError as error:
+        raise PolicyError(f"{folder / CONFIG}: {error}") from None
+    check_shapes(folder / WEIGHTS, stored.arrays, _shapes(network.init, spec))
     if contract.KEY in stored.config:
         where, expected = f"{folder / CONFIG}: {contract.KEY}", contract.contract_of(spec)
         stored_contract = contract.read_contract(stored.config[contract.KEY], where)
         contract.refuse_differences(stored_contract, expected, where, "the spec in the same file")
     return PolicyCheckpoint(stored.arrays, spec, stored.config)
-
-
-def expected_shapes(spec: PolicySpec, where: str) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the network's parameters for a spec.
-
-    Raises:
-        PolicyError: where the suite's network does not support such an image or such channels.
-    """
-    from policies.networks import network
-
-    try:
-        check_network(spec)
-    except ValueError as error:
-        raise PolicyError(f"{where}: {error}") from None
-    return _shapes(network.init, spec)
 
 
 def load_delta(folder: Path) -> Stored:

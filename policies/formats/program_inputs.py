@@ -1,12 +1,8 @@
-"""Check the inputs of a policy file that was made outside the suite, and make its policy.
-
-The checks are those of names, shapes and memory.
-"""
+"""Check the inputs of a policy file that was made outside the suite, and make its policy."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +12,7 @@ from policies.block_policy import BLOCK, BlockPolicy, verify_rows
 from policies.formats.model_process import ModelProcess
 from policies.formats.spec_json import KEY, PolicyMetadata
 from policies.spec import EXTRAS, Note, PolicyError, PolicySpec
+from tracks.input.reading import MODEL_BYTES, InputError, read_bytes, reason
 
 INPUTS = ("state", "image", "hidden")
 """Names of a program's inputs, in order; a policy without memory omits the last."""
@@ -23,6 +20,20 @@ BLOCK_MOST = 4096
 """Largest batch size of a model whose batch size is fixed."""
 HIDDEN_MOST = 2**16
 """Largest number of numbers in the recurrent state of one row."""
+
+
+def read_model(path: Path) -> bytes:
+    """Return the contents of a model's file.
+
+    Raises:
+        PolicyError: where it cannot be read, or is too large.
+    """
+    try:
+        return read_bytes(path, MODEL_BYTES)
+    except InputError as error:
+        raise PolicyError(str(error)) from None
+    except OSError as error:
+        raise PolicyError(f"{path}: cannot be read ({reason(error)}); check the file") from None
 
 
 def check_inputs(
@@ -68,31 +79,23 @@ def check_inputs(
     return block, tuple(hidden)
 
 
-def check_memory(metadata: PolicyMetadata, hidden_shape: tuple[int, ...], where: str) -> None:
-    """Refuse a hidden state whose shape differs from the contract.
+def described_policy(loaded: ModelProcess, path: Path, metadata: PolicyMetadata) -> BlockPolicy:
+    """Return the policy of a loaded program that describes the shapes of its inputs.
 
     Raises:
-        PolicyError: naming both shapes.
+        PolicyError: where inputs or outputs are not those of a policy, or its hidden state is not
+            the one of its contract.
     """
-    shape = metadata.contract.memory if metadata.contract else None
-    if shape is not None and tuple(shape) != (hidden_shape if hidden_shape != (0,) else ()):
+    shapes = {port.name: port.shape for port in loaded.inputs}
+    order = sorted(shapes, key=(*INPUTS, *shapes).index)
+    block, hidden_shape = check_inputs({n: shapes[n] for n in order}, metadata.spec, str(path))
+    memory = metadata.contract.memory if metadata.contract else None
+    if memory is not None and tuple(memory) != (hidden_shape if hidden_shape != (0,) else ()):
         raise PolicyError(
-            f"{where}: its contract says a memory of shape {list(shape)}, its input 'hidden' has "
+            f"{path}: its contract says a memory of shape {list(memory)}, its input 'hidden' has "
             f"{list(hidden_shape)}; export the policy again with its own contract"
         )
-
-
-def dropped_inputs(names: Iterable[str], where: str) -> tuple[Note, ...]:
-    """Return notes on inputs that an exporter has dropped because the program does not use them."""
-    missing = [name for name in INPUTS[:2] if name not in names]
-    return tuple(
-        Note(
-            "dropped_input",
-            f"{where}: has no input {name!r}: exporters drop unused inputs; it is flown without it",
-            f"if it should use it, use {name} in forward() and export again",
-        )
-        for name in missing
-    )
+    return program_policy(loaded, path, metadata, hidden_shape, block)
 
 
 def program_policy(
@@ -125,7 +128,16 @@ def program_policy(
         action, *next_hidden = outputs
         return action, next_hidden[0] if has_memory else hidden
 
-    notes = (*metadata.notes, *dropped_inputs(names, str(path)))
+    dropped = tuple(
+        Note(
+            "dropped_input",
+            f"{path}: has no input {name!r}: exporters drop unused inputs; it is flown without it",
+            f"if it should use it, use {name} in forward() and export again",
+        )
+        for name in INPUTS[:2]
+        if name not in names
+    )
+    notes = (*metadata.notes, *dropped)
     policy = BlockPolicy(path.name, metadata.spec, model, hidden_shape, block, block, notes)
     return verify_rows(policy, str(path))
 

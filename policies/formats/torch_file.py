@@ -18,14 +18,13 @@ from policies.block_policy import BlockPolicy
 from policies.formats.model_process import ModelProcess
 from policies.formats.program_inputs import (
     INPUTS,
-    check_inputs,
-    check_memory,
+    described_policy,
     inputs_message,
     program_policy,
+    read_model,
 )
 from policies.formats.spec_json import KEY, extract
 from policies.spec import NeedsTrust, PolicyError
-from tracks.input.reading import MODEL_BYTES, InputError, read_bytes, reason
 
 
 def load_program(path: Path, trust: bool = False) -> BlockPolicy:
@@ -37,11 +36,8 @@ def load_program(path: Path, trust: bool = False) -> BlockPolicy:
     """
     loaded = _loaded(path, "program", "a torch exported program", trust)
     metadata = extract(loaded.labels, str(path))
-    shapes = {port.name: port.shape for port in loaded.inputs}
-    _check_names(path, tuple(shapes))
-    block, hidden_shape = check_inputs(shapes, metadata.spec, str(path))
-    check_memory(metadata, hidden_shape, str(path))
-    return program_policy(loaded, path, metadata, hidden_shape, block)
+    _check_names(path, loaded)
+    return described_policy(loaded, path, metadata)
 
 
 def load_script(path: Path, trust: bool = False) -> BlockPolicy:
@@ -53,8 +49,7 @@ def load_script(path: Path, trust: bool = False) -> BlockPolicy:
     """
     loaded = _loaded(path, "script", "TorchScript", trust)
     metadata = extract(loaded.labels, str(path))
-    names = tuple(port.name for port in loaded.inputs)
-    _check_names(path, names)
+    names = _check_names(path, loaded)
     hidden_shape = (metadata.spec.hidden_size,) if names == INPUTS else (0,)
     return program_policy(loaded, path, metadata, hidden_shape)
 
@@ -67,12 +62,7 @@ def _loaded(path: Path, kind: str, words: str, trust: bool) -> ModelProcess:
             "the author, pass --trust; as .onnx, a policy can be shared without trust "
             "(torch.onnx.export; suite export for a policy of the suite)"
         )
-    try:
-        data = read_bytes(path, MODEL_BYTES)
-    except InputError as error:
-        raise PolicyError(str(error)) from None
-    except OSError as error:
-        raise PolicyError(f"{path}: cannot be read ({reason(error)}); check the file") from None
+    data = read_model(path)
     if kind == "script" and _is_weights(data):
         raise PolicyError(
             f"{path}: this file contains weights without a program (a state_dict or a pickled "
@@ -81,9 +71,12 @@ def _loaded(path: Path, kind: str, words: str, trust: bool) -> ModelProcess:
     return ModelProcess(data, str(path), kind, (KEY, contract.KEY))
 
 
-def _check_names(path: Path, names: tuple[str, ...]) -> None:
+def _check_names(path: Path, loaded: ModelProcess) -> tuple[str, ...]:
+    """Return the names of a program's inputs; refuse others than a policy's."""
+    names = tuple(port.name for port in loaded.inputs)
     if names not in (INPUTS, INPUTS[:2]):
         raise PolicyError(inputs_message(str(path), names))
+    return names
 
 
 def _is_weights(data: bytes) -> bool:

@@ -78,4 +78,4 @@ def detect(path: Path, options: ImportOptions) -> str:
         except ValueError as error:
             reason = str(error)
             break
-    raise FlightLogError(str(path), None, None, reason)
+    raise FlightLogError(path, reason)

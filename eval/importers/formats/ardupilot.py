@@ -135,7 +135,7 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
     try:
         from pymavlink.DFReader import DFReader_binary
     except ImportError:
-        raise FlightLogError(str(path), None, None, MISSING) from None
+        raise FlightLogError(path, MISSING) from None
 
     class NoEmptyMessages(DFReader_binary):
         """Reader that rejects a message of no length, which pymavlink would read for ever."""
@@ -167,7 +167,7 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
         messages = {name: _columns(rows, name) for name, rows in table.items() if rows}
     except Exception as error:  # a damaged file can cause any exception in the reader
         reason = f"an ArduPilot log that cannot be read ({quoted(error)})"
-        raise FlightLogError(str(path), None, None, reason) from None
+        raise FlightLogError(path, reason) from None
     parameters = {name: value for name, value in parameters.items() if np.isfinite(value)}
     return messages, parameters, {"firmware": texts[0]} if texts else {}, findings
 

@@ -117,12 +117,11 @@ class Blackbox:
         for name in names:
             if name not in self.units:
                 reason = "missing; was the file made by blackbox_decode?"
-                raise FlightLogError(self.name, name, None, reason)
+                raise FlightLogError(self.name, reason, name)
             column, unit = self.units[name]
             if unit not in factor:
                 known = ", ".join(repr(u) for u in factor if u)
-                reason = f"has the unit {unit!r}; known are {known}"
-                raise FlightLogError(self.name, column, None, reason)
+                raise FlightLogError(self.name, f"has the unit {unit!r}; known are {known}", column)
             values = np.asarray(self.columns[column])
             if name == "time":
                 # Frames that could not be decoded have an X as their time.
@@ -213,8 +212,7 @@ def _motors(box: Blackbox, poles: int, findings: list[Finding]) -> dict[str, np.
     if not set(columns) >= set("0123"):
         return {}
     if poles < 2 or poles % 2:
-        reason = f"motor_poles is {poles}; it must be even, 2 or more"
-        raise FlightLogError(box.name, None, None, reason)
+        raise FlightLogError(box.name, f"motor_poles is {poles}; it must be even, 2 or more")
     raw = [numbers(box.columns, columns[k], box.name) for k in "0123"]
     turns_per_s = np.stack(raw, axis=1) * 100.0 / (poles / 2) / 60.0
     text = f"rotor speeds from eRPM of motors with {poles} poles (--motor-poles)"
@@ -233,7 +231,7 @@ def decode(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], list[Find
     try:
         from betaflight_chirp_core import decoder
     except ImportError:
-        raise FlightLogError(str(path), None, None, MISSING) from None
+        raise FlightLogError(path, MISSING) from None
     raw = path.read_bytes()
     findings = []
     try:
@@ -255,7 +253,7 @@ def decode(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], list[Find
         return _in_units(columns, parser.sys_config), parser.sys_config, findings
     except Exception as error:  # a damaged file can cause any exception in the decoder
         reason = f"a Blackbox log that cannot be decoded ({quoted(error)})"
-        raise FlightLogError(str(path), None, None, reason) from None
+        raise FlightLogError(path, reason) from None
 
 
 def _in_units(columns: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, np.ndarray]:

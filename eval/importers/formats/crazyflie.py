@@ -67,7 +67,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
             damaged header.
     """
     if not detect(read_head(path), options):
-        raise FlightLogError(str(path), None, None, "not a uSD deck log (its first byte is not BC)")
+        raise FlightLogError(path, "not a uSD deck log (its first byte is not BC)")
     events, findings = decode(path.read_bytes(), str(path))
     for event in events.values():
         if PACKED in event:
@@ -105,7 +105,7 @@ def decode(data: bytes, name: str) -> tuple[dict[str, dict[str, np.ndarray]], li
         if isinstance(error, FlightLogError):
             raise
         reason = f"a uSD deck log whose header is broken ({error}); copy it again"
-        raise FlightLogError(name, None, None, reason) from None
+        raise FlightLogError(name, reason) from None
     findings = []
     complete = len(data) > start + 4 and crc32(data[:-4]) == struct.unpack("<I", data[-4:])[0]
     if not complete:
@@ -146,7 +146,7 @@ def decode(data: bytes, name: str) -> tuple[dict[str, dict[str, np.ndarray]], li
         events[kind.name] = {v: table[v].astype(np.float64) for v in kind.variables}
         events[kind.name]["timestamp"] = table["timestamp"].astype(np.float64) * unit_s
     if not any(len(event["timestamp"]) for event in events.values()):
-        raise FlightLogError(name, None, None, "has a header and no event: nothing was logged")
+        raise FlightLogError(name, "has a header and no event: nothing was logged")
     return events, findings
 
 
@@ -176,8 +176,7 @@ def _header(data: bytes, name: str) -> tuple[int, dict[int, Kind], int]:
     """Return the version, the event kinds by their numbers, and the offset of the first event."""
     version, count = struct.unpack_from("<HH", data, 1)
     if version not in (1, 2):
-        reason = f"a uSD deck log of version {version}; 1 and 2 can be read"
-        raise FlightLogError(name, None, None, reason)
+        raise FlightLogError(name, f"a uSD deck log of version {version}; 1 and 2 can be read")
     offset = 5
     kinds = {}
     for _ in range(count):

@@ -65,7 +65,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
         ValueError: for a mapping file that cannot be used.
     """
     if not detect(read_head(path), options):
-        raise FlightLogError(str(path), None, None, "not an MCAP file (its first bytes differ)")
+        raise FlightLogError(path, "not an MCAP file (its first bytes differ)")
     topic_of, motor_side = _choices(options.map)
     recorded = _messages(path)
     chosen: dict[str, list[Stamped]] = {}
@@ -78,7 +78,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
         if topic not in topics:
             types = " or ".join(KINDS[kind])
             reason = f"topic {topic!r} has no {types}; topics with it: {', '.join(topics)}"
-            raise FlightLogError(str(path), None, None, reason)
+            raise FlightLogError(path, reason)
         if len(topics) > 1 and kind not in topic_of:
             text = f"{kind} from {topic}; also there: {', '.join(sorted(topics.keys() - {topic}))}"
             findings.append(Finding("note", "topics", text + ". Choose with [topics] in --map"))
@@ -86,7 +86,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
     missing = sorted(topic_of.keys() - chosen.keys())
     if missing:
         reason = f"the file has no topic {topic_of[missing[0]]!r}, which the mapping names"
-        raise FlightLogError(str(path), None, None, reason)
+        raise FlightLogError(path, reason)
     messages = _on_one_clock(chosen, findings)
     signals, more_findings = _signals(messages, str(path))
     findings += _motor_count(messages)
@@ -119,7 +119,7 @@ def _messages(path: Path) -> dict[tuple[str, str], list[Stamped]]:
         from mcap_ros2.decoder import DecoderFactory
     except ModuleNotFoundError as error:
         reason = f"the package {error.name!r} is missing; run pip install 'diffracing-suite[mcap]'"
-        raise FlightLogError(str(path), None, None, reason) from None
+        raise FlightLogError(path, reason) from None
     kind_of = {type_: kind for kind, types in KINDS.items() for type_ in types}
     recorded: dict[tuple[str, str], list[Stamped]] = {}
     factory = DecoderFactory()
@@ -136,11 +136,10 @@ def _messages(path: Path) -> dict[tuple[str, str], list[Stamped]]:
                 stamps = (_stamp(decoded), message.log_time)
                 recorded.setdefault((kind, channel.topic), []).append((*stamps, decoded))
     except Exception as error:
-        reason = f"an MCAP file that cannot be read ({quoted(error)})"
-        raise FlightLogError(str(path), None, None, reason) from None
+        raise FlightLogError(path, f"an MCAP file that cannot be read ({quoted(error)})") from None
     if not recorded:
         types = ", ".join(kind_of)
-        raise FlightLogError(str(path), None, None, f"holds no ROS 2 message of {types}")
+        raise FlightLogError(path, f"holds no ROS 2 message of {types}")
     return recorded
 
 
@@ -192,7 +191,7 @@ def _signals(
         except (AttributeError, TypeError, ValueError, OverflowError) as error:
             types = " or ".join(KINDS[kind])
             reason = f"messages differ from the definition of {types} ({error}); log them again"
-            raise FlightLogError(name, signal, None, reason) from None
+            raise FlightLogError(name, reason, signal) from None
         parts[signal] = (time_s, rows)
 
     def pose(message: Any) -> Any:

@@ -60,7 +60,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
         FlightLogError: where the file is not a ULog file, or too damaged to read.
     """
     if not detect(read_head(path), options):
-        raise FlightLogError(str(path), None, None, "not a ULog file (its first bytes differ)")
+        raise FlightLogError(path, "not a ULog file (its first bytes differ)")
     log = _load(path)
     topics: dict[str, Topic] = {}
     motor_side, findings = _motor_side(log.initial_parameters)
@@ -131,8 +131,7 @@ def _load(path: Path) -> Any:
             log.is_cut = file.is_cut
             return log
     except Exception as error:
-        reason = f"a ULog file that cannot be read ({quoted(error)})"
-        raise FlightLogError(str(path), None, None, reason) from None
+        raise FlightLogError(path, f"a ULog file that cannot be read ({quoted(error)})") from None
 
 
 def _columns(topic: Topic, names: str) -> np.ndarray | None:

@@ -80,8 +80,7 @@ def _time(
     """Return the times (N,) of the rows [s], and findings; `hint` says how to name the column."""
     if "time" not in mapping.columns:
         present = ", ".join(list(columns)[:12])
-        reason = f"no column for the time; {hint}. There are: {present}"
-        raise FlightLogError(name, "time", None, reason)
+        raise FlightLogError(name, f"no column for the time; {hint}. There are: {present}", "time")
     alternatives = mapping.columns["time"]
     column = next((c for c in alternatives if c.names[0] in columns), alternatives[0])
     values = numbers(columns, column.names[0], name)
@@ -120,7 +119,7 @@ def numbers(columns: Mapping[str, np.ndarray], column: str, name: str) -> np.nda
         FlightLogError: where the column is missing or holds anything but numbers.
     """
     if column not in columns:
-        raise FlightLogError(name, column, None, _missing(columns, column))
+        raise FlightLogError(name, _missing(columns, column), column)
     values = np.asarray(columns[column])
     if values.dtype.kind in "fiub":
         return values
@@ -163,10 +162,10 @@ def _lists(values: np.ndarray, column: str, name: str) -> np.ndarray:
             rows.append([float(part) for part in text.replace(",", " ").split()])
         except ValueError:
             reason = f"{value!r} is not a list of numbers"
-            raise FlightLogError(name, column, k + 1, reason) from None
+            raise FlightLogError(name, reason, column, k + 1) from None
     width = max((len(row) for row in rows), default=0)
     for k, row in enumerate(rows):
         if len(row) not in (0, width):
             reason = f"a list of {len(row)} numbers, where others have {width}"
-            raise FlightLogError(name, column, k + 1, reason)
+            raise FlightLogError(name, reason, column, k + 1)
     return np.array([row or [np.nan] * width for row in rows])

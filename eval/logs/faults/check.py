@@ -26,6 +26,7 @@ from eval.logs.faults.finding import Finding, findings_of
 from eval.logs.faults.pose import Rows, check_pose
 from eval.logs.faults.position import check_clock_rate, check_height, check_jumps, jumps_of
 from eval.logs.faults.reading import Readings, read_rows, readings_in
+from eval.logs.faults.relation import interpolate
 from eval.logs.faults.sensors import (
     check_accelerometer_bias,
     check_barometer,
@@ -264,7 +265,7 @@ def filled(time_s: np.ndarray, value: np.ndarray) -> np.ndarray:
     if known.all() or known.sum() < 2:
         return value
     known_time = time_s[known]
-    result = np.stack([np.interp(time_s, known_time, column[known]) for column in value.T], axis=1)
+    result = interpolate(time_s, known_time, value[known])
     after = np.clip(np.searchsorted(known_time, time_s), 1, len(known_time) - 1)
     too_far = (known_time[after] - known_time[after - 1] > 0.5) & ~known
     result[too_far | (time_s < known_time[0]) | (time_s > known_time[-1])] = np.nan

@@ -20,7 +20,7 @@ from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import WIDTH_S as GYRO_S
 from eval.logs.faults.pose import Rows, turns_of
 from eval.logs.faults.reading import option
-from eval.logs.faults.relation import jackknife_error, match, pooled_scale, smooth
+from eval.logs.faults.relation import interpolate, jackknife_error, match, pooled_scale, smooth
 from eval.logs.velocity import velocity_from_position
 
 WIDTH_S = 0.4
@@ -207,7 +207,7 @@ def jumps_of(time_s: np.ndarray, pos: np.ndarray, in_metres: bool) -> np.ndarray
     after = np.searchsorted(good, bad)
     before_s = time_s[bad] - time_s[good[np.maximum(after - 1, 0)]]
     after_s = time_s[good[np.minimum(after, len(good) - 1)]] - time_s[bad]
-    line = np.stack([np.interp(time_s[bad], time_s[good], column[good]) for column in pos.T], 1)
+    line = interpolate(time_s[bad], time_s[good], pos[good])
     distance = np.abs(pos[bad] - line).max(axis=1)
     curve_m = KEPT_M + 0.5 * ACC_MAX * np.maximum(before_s * after_s, 0.0)
     jump[known[bad]] = np.where(distance > (curve_m if in_metres else least), distance, 0.0)

@@ -149,6 +149,14 @@ def smooth(time_s: np.ndarray, value: np.ndarray, width_s: float) -> np.ndarray:
     return np.where(enough, (sums[stop] - sums[first]) / np.maximum(inside, 1), np.nan)
 
 
+def interpolate(time_s: np.ndarray, known_s: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Return `value` (N, C), known at the increasing times `known_s` (N,), at `time_s` (T, C).
+
+    It is linear between two samples, and constant before the first and after the last.
+    """
+    return np.stack([np.interp(time_s, known_s, column) for column in value.T], axis=1)
+
+
 def forward_mean(value: np.ndarray, count: int) -> np.ndarray:
     """Return the mean (T - count + 1, C) of `count` rows of `value` (T, C) from each row on.
 

@@ -31,12 +31,11 @@ def matrices(params: Mapping[str, np.ndarray], spec: PolicySpec) -> dict[str, np
     """Return each of `LAYERS` as a matrix (inputs, outputs), padded with zeros."""
     hidden_padded, gates = padded(spec.hidden_size), padded(3 * spec.hidden_size)
     float_params = {name: np.asarray(value, np.float32) for name, value in params.items()}
+    image = float_params["image.weight"]
     return {
         "conv2": float_params["conv2.weight"].reshape(-1, spec.channels[1]),
         "conv3": float_params["conv3.weight"].reshape(-1, spec.channels[2]),
-        "image": zero_pad(
-            float_params["image.weight"], len(float_params["image.weight"]), hidden_padded
-        ),
+        "image": zero_pad(image, len(image), hidden_padded),
         "gru_input": zero_pad(float_params["gru.weight_input"], hidden_padded, gates),
         "gru_hidden": zero_pad(float_params["gru.weight_hidden"], hidden_padded, gates),
     }

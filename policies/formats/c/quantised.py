@@ -108,12 +108,9 @@ def actions(
     observed: Observed,
 ) -> np.ndarray:
     """Return the actions (T, size) of the quantised network for T observations."""
-    small = small_arrays(params, spec)
-
-    def layer(name: str, x: np.ndarray) -> np.ndarray:
-        return layer_outputs(layers[name], x)
-
-    return forward.actions(small, spec, layer, observed)
+    return forward.actions(
+        small_arrays(params, spec), spec, lambda name, x: layer_outputs(layers[name], x), observed
+    )
 
 
 def layer_outputs(layer: Quantised, x: np.ndarray) -> np.ndarray:

@@ -58,7 +58,7 @@ def sources(
     `layers` are the quantised large layers; None for float32.
     """
     definitions = _definitions(checkpoint, layers)
-    values = _values(checkpoint, name, label, layers, constant_bytes(checkpoint, layers))
+    values = _values(checkpoint, name, label, layers)
     kernels = ("head.c", definitions, "common.c", "int8.c" if layers else "float32.c")
     body = [_fill_template(part, values) if part.endswith(".c") else part for part in kernels]
     return {"policy.h": _fill_template("header.h", values), "policy.c": "".join(body)}
@@ -128,7 +128,6 @@ def _values(
     name: str,
     label: str,
     layers: Mapping[str, Quantised] | None,
-    constant_bytes: int,
 ) -> dict[str, Any]:
     """Return the values of the templates' placeholders."""
     spec = checkpoint.spec
@@ -160,8 +159,7 @@ def _values(
         "SHA256": checkpoint.config["weights"]["sha256"],
         "JSON": _c_string(label),
         "MACS": multiply_adds(spec),
-        "WEIGHT_BYTES": constant_bytes,
-        "HIDDEN": padded(spec.hidden_size),
+        "WEIGHT_BYTES": constant_bytes(checkpoint, layers),
         "FIRST": first,
         "SECOND": second,
         "EXTRA_STATE": f"    short bytes[{third}];\n" if layers else "",

@@ -76,11 +76,11 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
             'keeps them where the mapping file has [[pos]] of source = "mocap" and of source = '
             '"estimate", as nanobench has'
         )
-        raise FlightLogError(log.name, None, None, reason)
+        raise FlightLogError(log.name, reason)
     for group, values in (("pos", log.pos_w), ("quat", log.quat_wxyz)):
         if not np.isfinite(values).any():
             reason = f"no reference for the estimate: {GROUPS[group][0]} is missing in every row"
-            raise FlightLogError(log.name, GROUPS[group][0], None, reason)
+            raise FlightLogError(log.name, reason, GROUPS[group][0])
     # Times without take-off and landing. The velocity is also needed before `grid`, see `lean_w`.
     step_s = float(np.median(np.diff(log.time_s)))
     from_start = np.arange(log.time_s[0], log.time_s[-1] + 0.5 * step_s, step_s)
@@ -90,7 +90,7 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
         reason = (
             f"{log.duration_s:.1f} s of flight; allowed are {LEAST_S + 2 * SETTLES_S:g} s or more"
         )
-        raise FlightLogError(log.name, None, None, reason)
+        raise FlightLogError(log.name, reason)
     vel_w = interpolate(from_start - late_s, log.time_s, log.vel_w, holes=True)
     rot_w = attitude_at(from_start - late_s, log.time_s, log.quat_wxyz)
     lean_w = cross(vel_w, rot_w[..., 2]) / GRAVITY

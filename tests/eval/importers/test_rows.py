@@ -148,8 +148,8 @@ def signals():
 
 
 def test_a_good_flight_is_left_as_it_is(signals):
-    cleaned, findings = clean(Recording("log", signals))
-    assert findings == []
+    cleaned = clean(Recording("log", signals))
+    assert cleaned.findings == ()
     for name, samples in signals.items():
         np.testing.assert_array_equal(cleaned.signals[name].value, samples.value)
 
@@ -157,45 +157,43 @@ def test_a_good_flight_is_left_as_it_is(signals):
 def test_a_jump_of_position_and_one_of_speed_are_left_out(signals):
     signals["pos"].value[200] += [0.0, 0.5, 0.0]
     signals["vel"].value[320] += [1.0, 0.0, 0.0]
-    cleaned, findings = clean(Recording("log", signals))
+    cleaned = clean(Recording("log", signals))
     assert 2.0 not in cleaned.signals["pos"].time_s
     assert len(cleaned.signals["pos"].time_s) == 599
     assert np.abs(cleaned.signals["vel"].time_s - 3.2).min() > 0.005
-    assert {finding.signal for finding in findings} == {"position", "velocity"}
+    assert {finding.signal for finding in cleaned.findings} == {"position", "velocity"}
 
 
 def test_a_lone_position_does_not_end_the_check_of_velocities(signals):
     kept = np.delete(np.arange(600), [*range(400, 425), *range(426, 450)])
     signals["pos"] = Signal(*(part[kept] for part in signals["pos"]))
     signals["vel"].value[320] += [1.0, 0.0, 0.0]
-    cleaned, _ = clean(Recording("log", signals))
+    cleaned = clean(Recording("log", signals))
     assert 599 == len(cleaned.signals["vel"].time_s)
 
 
 def test_repeated_poses_are_left_out_with_what_is_logged_with_them(signals):
     for samples in signals.values():
         samples.value[1::3] = samples.value[0::3]
-    cleaned, findings = without_repeats(Recording("log", signals))
+    cleaned = without_repeats(Recording("log", signals))
     assert {len(cleaned.signals[name].time_s) for name in signals} == {400}
-    assert "33 % of the poses repeat" in findings[0].evidence
+    assert "33 % of the poses repeat" in cleaned.findings[0].evidence
 
 
 def test_whole_millimetres_are_not_repeats(signals):
     coarse = np.round(0.02 * signals["pos"].value, 3)
-    cleaned, findings = without_repeats(
-        Recording("log", {"pos": Signal(signals["pos"].time_s, coarse)})
-    )
+    cleaned = without_repeats(Recording("log", {"pos": Signal(signals["pos"].time_s, coarse)}))
     assert len(cleaned.signals["pos"].time_s) == 600
-    assert not [finding for finding in findings if "repeat" in finding.evidence]
+    assert not [finding for finding in cleaned.findings if "repeat" in finding.evidence]
 
 
 def test_attitudes_drawn_between_their_neighbours_are_left_out(signals):
     quat = signals["quat"].value
     middle = quat[0:-2:2] + quat[2::2]
     quat[1:-1:2] = middle / np.linalg.norm(middle, axis=1, keepdims=True)
-    cleaned, findings = clean(Recording("log", {"quat": signals["quat"]}))
+    cleaned = clean(Recording("log", {"quat": signals["quat"]}))
     assert len(cleaned.signals["quat"].time_s) < 340
-    assert "are interpolated" in findings[0].evidence
+    assert "are interpolated" in cleaned.findings[0].evidence
 
 
 TIME = np.arange(0, 10, 0.01)
@@ -336,7 +334,7 @@ def test_attitudes_of_zeros_are_dropouts_and_a_velocity_in_the_logs_world_is_dro
 
 def test_slow_poses_are_no_fast_ones_in_a_smaller_unit_and_the_long_file_is_named(tmp_path):
     poses = _poses((0, 60), 2.0, 0.0, 0.0)
-    assert _in_seconds(Recording("pose", {"quat": poses}))[1] == []
+    assert _in_seconds(Recording("pose", {"quat": poses})).findings == ()
     fast = Signal(np.arange(0, 8e6, 5e3), known_flight.fly(np.arange(0, 8, 0.005)).rate)
     with pytest.raises(FlightLogError, match=r"^log: column time: lasts 7.995e\+06 s, more"):
         path = made.write_mocap(tmp_path / "pose.csv", span=(0, 8))

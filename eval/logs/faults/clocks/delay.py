@@ -18,7 +18,7 @@ from eval.effects.interface import GRAVITY
 from eval.importers.frames import rates_between, rotate
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import SPAN_S, WIDTH_S, Rows
-from eval.logs.faults.relation import jackknife_error, smooth
+from eval.logs.faults.relation import interpolate, jackknife_error, smooth
 from eval.logs.velocity import velocity_from_position
 
 REACH_S, STEP_S = 0.1, 0.002
@@ -162,20 +162,16 @@ def late_against(
         return None
     time_s, known_s, given = time_s[inside], time_s[known], given[known]
     wanted = wanted[inside] - wanted[inside].mean(axis=0)
-    block = np.minimum((np.arange(len(time_s)) * BLOCKS) // len(time_s), BLOCKS - 1)
+    block = np.arange(len(time_s)) * BLOCKS // len(time_s)
     trials = np.arange(-REACH_S, REACH_S + 0.5 * STEP_S, STEP_S)
     cost = np.empty((BLOCKS, len(trials)))
     for k, late_s in enumerate(trials):
-        tried = np.stack([np.interp(time_s + late_s, known_s, column) for column in given.T], 1)
+        tried = interpolate(time_s + late_s, known_s, given)
         tried = tried - tried.mean(axis=0)
         scale = np.sum(wanted * tried) / max(float(np.sum(tried**2)), 1e-12)
         residual = np.sum((wanted - scale * tried) ** 2, axis=1)
         cost[:, k] = np.bincount(block, weights=residual, minlength=BLOCKS)
-    delay_s = _lowest(trials, cost.sum(axis=0))
-    without_block = [_lowest(trials, cost.sum(axis=0) - one) for one in cost]
-    if delay_s is None or any(one is None for one in without_block):
-        return None
-    return delay_s, jackknife_error(np.array(without_block, dtype=np.float64))
+    return _best_delay(trials, cost)
 
 
 def _fits_later(
@@ -194,7 +190,7 @@ def _fits_later(
     quat_s, quat = signals["quat"]
     unit = quat / np.linalg.norm(quat, axis=1, keepdims=True)
     z_w = rotate(unit, np.array([0.0, 0.0, 1.0]))
-    z_w = np.stack([np.interp(time_s, quat_s, column) for column in z_w.T], axis=1)
+    z_w = interpolate(time_s, quat_s, z_w)
     acc_w = velocity_from_position(time_s, velocity_from_position(time_s, pos))
     force = np.sum(z_w * (acc_w + [0.0, 0.0, GRAVITY]), axis=1, keepdims=True)
     path = smooth(time_s, force, WIDTH_S)[:, 0]
@@ -244,20 +240,18 @@ def delay_of(
 
     def gyro(late_s: float, drift: float) -> np.ndarray:
         """Return the gyro's mean rates over the same times for a trial delay and drift."""
-        at = [
-            np.stack(
-                [np.interp(t - late_s - drift * (t - middle), rate_time, c) for c in integral.T], 1
-            )
+        before, after = (
+            interpolate(t - late_s - drift * (t - middle), rate_time, integral)
             for t in (first, last)
-        ]
-        return (at[1] - at[0]) / (last - first)[:, None]
+        )
+        return (after - before) / (last - first)[:, None]
 
     if np.sqrt(np.mean(np.sum(gyro(0.0, 0.0) ** 2, axis=1))) < CALM or not turns.any():
         return None
     trials = np.arange(-REACH_S, REACH_S + 0.5 * STEP_S, STEP_S)
     rotation, turned = _rotation(turns, [gyro(late_s, 0.0) for late_s in trials])
     turns = turns @ rotation.T
-    block = np.minimum((np.arange(len(first)) * BLOCKS) // len(first), BLOCKS - 1)
+    block = np.arange(len(first)) * BLOCKS // len(first)
 
     def costs(drift: float) -> np.ndarray:
         """Return the misfit (BLOCKS, trials) of every block and trial delay."""
@@ -276,13 +270,9 @@ def delay_of(
     if abs(rest_of_drift) > LIKELY * drift_error:  # inside a block a drift would count as scatter
         first_drift, cost = rest_of_drift, costs(rest_of_drift)
         rest_of_drift, drift_error = _drift(trials, cost, duration)
-    delay_s = _lowest(trials, cost.sum(axis=0))
-    without_block = [_lowest(trials, cost.sum(axis=0) - cost[b]) for b in range(BLOCKS)]
-    if delay_s is None or any(one is None for one in without_block):
+    if (best := _best_delay(trials, cost)) is None:
         return None
-    error = jackknife_error(np.array(without_block, dtype=np.float64))
-    drift = first_drift + rest_of_drift
-    return Late(delay_s, error, drift, drift_error, middle, duration, turned)
+    return Late(*best, first_drift + rest_of_drift, drift_error, middle, duration, turned)
 
 
 def _rotation(turns: np.ndarray, gyros: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -319,16 +309,20 @@ def _drift(trials: np.ndarray, cost: np.ndarray, duration_s: float) -> tuple[flo
     It is the difference of the delays of the two halves of the flight, whose middles are half the
     flight apart.
     """
-    half = BLOCKS // 2
-    halves = [
-        [_lowest(trials, part.sum(axis=0) - left_out) for left_out in (0.0, *part)]
-        for part in (cost[:half], cost[half:])
-    ]
-    if any(part is None for each in halves for part in each):
+    first, last = (_best_delay(trials, part) for part in np.split(cost, 2))
+    if first is None or last is None:
         return 0.0, np.inf
-    delays = np.array(halves, dtype=np.float64)
-    error = float(np.hypot(jackknife_error(delays[0, 1:]), jackknife_error(delays[1, 1:])))
-    return float(delays[1, 0] - delays[0, 0]) / (0.5 * duration_s), error / (0.5 * duration_s)
+    apart_s = 0.5 * duration_s
+    return (last[0] - first[0]) / apart_s, float(np.hypot(first[1], last[1])) / apart_s
+
+
+def _best_delay(trials: np.ndarray, cost: np.ndarray) -> tuple[float, float] | None:
+    """Return the trial delay of the least `cost` (blocks, trials), and its error by jackknife."""
+    total = cost.sum(axis=0)
+    best, *without_block = (_lowest(trials, total - part) for part in (0.0, *cost))
+    if best is None or None in without_block:
+        return None
+    return best, jackknife_error(np.array(without_block, dtype=np.float64))
 
 
 def _lowest(trials: np.ndarray, cost: np.ndarray) -> float | None:

@@ -11,7 +11,7 @@ from itertools import permutations, product
 import numpy as np
 
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S
-from eval.logs.faults.relation import CLEAR, shift_rows, smooth
+from eval.logs.faults.relation import CLEAR, interpolate, shift_rows, smooth
 
 REACH_S, STEP_S = 0.3, 0.01
 """Largest delay that is tried, and the step between trials [s]."""
@@ -67,8 +67,7 @@ def bend(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> float:
     both = np.isfinite(command).all(axis=1) & np.isfinite(rate).all(axis=1)
     time_s, command, rate = time_s[both], command[both], rate[both]
     command_before, command_after = (
-        np.column_stack([np.interp(time_s + shift, time_s, c) for c in command.T])
-        for shift in (-STEADY_S, STEADY_S)
+        interpolate(time_s + shift, time_s, command) for shift in (-STEADY_S, STEADY_S)
     )
     steady = np.abs(command_after - command_before) < 0.3 * np.abs(command)
     middle = len(time_s) // 2
@@ -111,10 +110,7 @@ def loop_gain(
         return None
     # Both signals on even steps, and only the axes that are commanded to turn.
     grid = np.arange(time_s[known][0], time_s[known][-1], step)
-    command, rate = (
-        np.column_stack([np.interp(grid, time_s[known], column) for column in value[known].T])
-        for value in (command, rate)
-    )
+    command, rate = (interpolate(grid, time_s[known], v[known]) for v in (command, rate))
     axes = np.flatnonzero(command.std(axis=0) > CALM_RATE)
     if not len(axes):
         return None

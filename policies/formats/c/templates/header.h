@@ -52,7 +52,7 @@ extern "C" {
 
 /* All that a flight remembers, and the memory that a step works in. The caller owns it. */
 typedef struct {
-    float hidden[$HIDDEN]; /* between steps: the recurrent state */
+    float hidden[$PADDED]; /* between steps: the recurrent state */
     int odd; /* between steps: whether the number of steps so far is odd */
     float gates[$GATES]; /* within a step, as all that follows */
     float first[$FIRST];

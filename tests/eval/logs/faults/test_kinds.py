@@ -354,7 +354,8 @@ def test_a_late_gyro_shifts_no_pose_and_the_motors_show_a_pose_that_is_early(lat
     right = good(end=10.0)
     rows = right | {name: np.roll(right[name], 4, axis=0) for name in late}
     signals = {name: Signal(rows["time"], rows[name]) for name in rows if name != "time"}
-    fixed, (finding,) = check_delay(Recording("test", signals), fix=True)
+    fixed = check_delay(Recording("test", signals), fix=True)
+    (finding,) = fixed.findings
     shifted = {name for name in signals if fixed.signals[name].time_s[0] != rows["time"][0]}
     assert shifted == set(moved) and finding.size == pytest.approx(-0.04, abs=0.006)
     after = delay_of(*fixed.signals["quat"], *fixed.signals["rate"])

@@ -75,10 +75,12 @@ def test_an_import_spaces_the_stamps_of_all_signals_of_a_message_evenly():
     rate = np.cos(gyro_s)[:, None] * np.ones(3)
     signals = {"pos": Signal(stamps, pos), "cmd_thrust": Signal(stamps, pos[:, :1])}
     recording = Recording("bag", {**signals, "rate": Signal(gyro_s, rate)})
-    new, (found,) = check_evenness(recording, True)
+    new = check_evenness(recording, True)
+    (found,) = new.findings
     assert found.status == "corrected" and "stamps of pos, cmd_thrust" in found.evidence
     assert np.std(new.signals["pos"].time_s - even_s) < 3e-4
     np.testing.assert_array_equal(new.signals["pos"].time_s, new.signals["cmd_thrust"].time_s)
     np.testing.assert_array_equal(new.signals["rate"].time_s, gyro_s)
-    same, (found,) = check_evenness(recording, False)
-    assert same is recording and found.status == "doubt" and "--no-fix" in found.fix
+    same = check_evenness(recording, False)
+    (found,) = same.findings
+    assert same.signals is recording.signals and found.status == "doubt" and "--no-fix" in found.fix

@@ -59,7 +59,7 @@ def test_an_error_travels_with_where_it_came_up():
     )
     found = remote_error(elsewhere)
     assert explain(found) == (2, str(found)) and "linear_drag" in str(found)
-    log = unpack(pack(failure(FlightLogError("a.csv", "time", 3, "goes back"))))
+    log = unpack(pack(failure(FlightLogError("a.csv", "goes back", "time", 3))))
     assert isinstance(log.error, FlightLogError) and str(log.error).startswith("a.csv: column time")
     other = remote_error(failure(Stubborn("x", 1)))
     assert isinstance(other, ValueError) and str(other) == "Stubborn: x is 1"
