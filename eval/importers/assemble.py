@@ -280,12 +280,9 @@ def _drop_half_commands(rows: dict[str, np.ndarray], partial: bool) -> list[Find
     for name in ("cmd_thrust", "cmd_rate", "cmd_torque"):
         if name in rows and not np.isfinite(rows[name]).any():
             del rows[name]
-    dropped = []
-    if "cmd_thrust" in rows and not ({"cmd_rate", "cmd_torque"} & rows.keys()) and not partial:
-        dropped.append("cmd_thrust")
-    for name in ("cmd_rate", "cmd_torque"):
-        if name in rows and "cmd_thrust" not in rows:
-            dropped.append(name)
+    dropped = [name for name in ("cmd_rate", "cmd_torque") if name in rows]
+    if "cmd_thrust" in rows:
+        dropped = [] if dropped or partial else ["cmd_thrust"]
     for name in dropped:
         del rows[name]
     text = f"{' and '.join(dropped)} left out, as the other half of the command is missing"

@@ -53,17 +53,24 @@ POWER = {
 
 def clean(recording: Recording) -> Recording:
     """Return the recording (time in s) without impossible samples."""
-    signals, findings = dict(recording.signals), []
-    if "quat" in signals and len(signals["quat"].time_s) > MEDIAN_SAMPLES:
-        signals["quat"], more_findings = _without_interpolated(signals["quat"])
-        findings += more_findings
-    if "pos" in signals and len(signals["pos"].time_s) > MEDIAN_SAMPLES:
-        signals["pos"], more_findings = _without_jumps(signals["pos"])
-        findings += more_findings
-        if "vel" in signals and len(signals["vel"].time_s) > MEDIAN_SAMPLES:
-            signals["vel"], more_findings = _without_glitches(signals["vel"], signals["pos"])
-            findings += more_findings
-    return replace(recording, signals=signals).noting(*findings)
+    signals = dict(recording.signals)
+    for names, subject, find in (
+        (("quat",), "attitude", _interpolated),
+        (("pos",), "position", _jumps),
+        (("vel", "pos"), "velocity", _glitches),
+    ):
+        samples = [signals[name] for name in names if _is_long(recording, name)]
+        found = find(*samples) if len(samples) == len(names) else None
+        if found is not None:
+            is_bad, text = found
+            signals[names[0]] = _select(samples[0], ~is_bad)
+            recording = recording.noting(Finding("corrected", subject, f"{text}: left out"))
+    return replace(recording, signals=signals)
+
+
+def _is_long(recording: Recording, name: str) -> bool:
+    """Return whether a recording has a signal, with enough samples to clean it."""
+    return name in recording.signals and len(recording.signals[name].time_s) > MEDIAN_SAMPLES
 
 
 def _select(samples: Signal, good: np.ndarray) -> Signal:
@@ -102,9 +109,9 @@ def without_repeats(recording: Recording) -> Recording:
     """Return the recording without repeated poses, and the signals logged at the same times."""
     signals = dict(recording.signals)
     for name in ("quat", "pos"):
-        samples = signals.get(name)
-        if samples is None or len(samples.time_s) <= MEDIAN_SAMPLES:
+        if not _is_long(recording, name):
             continue
+        samples = signals[name]
         is_new = np.ones(len(samples.time_s), dtype=bool)
         is_new[1:] = np.any(samples.value[1:] != samples.value[:-1], axis=1)
         share = float(np.mean(~is_new))
@@ -133,9 +140,9 @@ def without_lost(recording: Recording) -> Recording:
     """
     signals, rate = dict(recording.signals), recording.signals.get("rate")
     for name in TEXTS:
-        samples = signals.get(name)
-        if rate is None or samples is None or len(samples.time_s) <= MEDIAN_SAMPLES:
+        if rate is None or not _is_long(recording, name):
             continue
+        samples = signals[name]
         is_lost = lost_samples(*samples, *rate)
         if is_lost[1:].all():
             continue  # nothing would be left: `check_still` reports it
@@ -154,8 +161,12 @@ def _moves(samples: Signal) -> bool:
     return bool(np.mean(np.any(samples.value[later:] != samples.value[:-later], axis=1)) > 0.9)
 
 
-def _without_interpolated(quat: Signal) -> tuple[Signal, list[Finding]]:
-    """Remove attitudes at which the body rate does not change: these were interpolated."""
+Found = tuple[np.ndarray, str] | None
+"""Which samples of a signal (N,) bool to leave out, and why; None for none."""
+
+
+def _interpolated(quat: Signal) -> Found:
+    """Return attitudes at which the body rate does not change: these were interpolated."""
     value = continuous(quat.value / np.linalg.norm(quat.value, axis=1, keepdims=True))
     _, rate = rates_between(quat.time_s, value, 1)
     change = np.linalg.norm(rate[1:] - rate[:-1], axis=1)
@@ -164,24 +175,19 @@ def _without_interpolated(quat: Signal) -> tuple[Signal, list[Finding]]:
     is_interpolated[1:-1] = (rate_size > TURNING) & (change < EXACT * rate_size)
     share = float(np.mean(is_interpolated))
     if share < REPEATED:
-        return quat, []
-    text = f"{100 * share:.0f} % of its samples are interpolated: left out"
-    return _select(quat, ~is_interpolated), [Finding("corrected", "attitude", text)]
+        return None
+    return is_interpolated, f"{100 * share:.0f} % of its samples are interpolated"
 
 
-def _without_jumps(pos: Signal) -> tuple[Signal, list[Finding]]:
-    """Remove positions further from their neighbours than the largest acceleration allows."""
+def _jumps(pos: Signal) -> Found:
+    """Return positions further from their neighbours than the largest acceleration allows."""
     jump_m = jumps_of(*pos, in_metres=True)
-    bad = jump_m > 0.0
-    if not bad.any():
-        return pos, []
-    worst = float(jump_m.max())
-    text = f"{int(bad.sum())} samples jump by up to {worst:.2g} m and back: left out"
-    return _select(pos, ~bad), [Finding("corrected", "position", text)]
+    bad, worst = jump_m > 0.0, float(jump_m.max())
+    return (bad, f"{bad.sum()} samples jump by up to {worst:.2g} m and back") if worst else None
 
 
-def _without_glitches(vel: Signal, pos: Signal) -> tuple[Signal, list[Finding]]:
-    """Remove velocities that contradict the path; a velocity in another frame is kept."""
+def _glitches(vel: Signal, pos: Signal) -> Found:
+    """Return velocities that contradict the path; a velocity in another frame is kept."""
     path = velocity_from_position(pos.time_s, pos.value)
     slope = interpolate(vel.time_s, pos.time_s, path)
     error = vel.value - slope
@@ -189,7 +195,7 @@ def _without_glitches(vel: Signal, pos: Signal) -> tuple[Signal, list[Finding]]:
     error_sd = MAD_TO_SD * np.nanmedian(deviation, axis=0)
     speed = float(np.sqrt(np.nanmean(np.sum(slope**2, axis=1))))
     if np.linalg.norm(error_sd) > 0.3 * max(speed, VEL_LEAST):
-        return vel, []
+        return None
     bad = np.any(deviation > np.maximum(GLITCH_SD * error_sd, VEL_LEAST), axis=1)
     # At the ends and next to gaps the slope uses positions on one side only.
     gaps = np.diff(pos.time_s) > 4.0 * median_step(pos.time_s)
@@ -197,10 +203,9 @@ def _without_glitches(vel: Signal, pos: Signal) -> tuple[Signal, list[Finding]]:
     for edge in (*ends, *pos.time_s[:-1][gaps], *pos.time_s[1:][gaps]):
         bad &= np.abs(vel.time_s - edge) > EDGE_S
     if not bad.any() or np.mean(bad) > 0.1:
-        return vel, []
+        return None
     worst = float(np.linalg.norm(error[bad], axis=1).max())
-    text = f"{int(bad.sum())} samples are up to {worst:.2g} m/s off the path's slope: left out"
-    return _select(vel, ~bad), [Finding("corrected", "velocity", text)]
+    return bad, f"{bad.sum()} samples are up to {worst:.2g} m/s off the path's slope"
 
 
 def check_delay(recording: Recording, fix: bool) -> Recording:

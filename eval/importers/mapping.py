@@ -19,16 +19,15 @@ from eval.importers.frames import attitude, body_vector, conjugate, from_euler, 
 from eval.importers.mapping_file import MIXERS, Column, LogMap
 from eval.importers.options import ImportOptions
 from eval.importers.rows import continuous, measured, turn_axes
-from eval.importers.signals import Recording, Signal, collect, make_signal
+from eval.importers.signals import Part, Recording, Signal, collect, make_signal
 from eval.logs.columns import ESTIMATE, GROUPS, FlightLogError
 from eval.logs.faults.drive.commands import clip_commands, is_share
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.pose import BAD, CALM_RATE, TIMES_BETTER, WIDTH_S, turns_of
+from eval.logs.faults.reading import DEG
 from eval.logs.faults.relation import match, rms, smooth
-from eval.logs.faults.vectors import DEG, GOOD
+from eval.logs.faults.vectors import GOOD
 
-Part = tuple[np.ndarray, np.ndarray]
-"""Times (N,) [s] and values (N, C)."""
 Find = Callable[[tuple[str, ...]], Part | None]
 """Function that returns the times and values of named columns, or None where one is missing."""
 KEPT = "kept:"
@@ -137,10 +136,8 @@ def _first_alternative(
 
     The alternatives of `source` are tried first. Without any, the samples are None.
     """
-    preferred = [c for c in alternatives if source and c.source == source]
-    for column in (*preferred, *(c for c in alternatives if c not in preferred)):
-        part = find(column.names)
-        if part is not None:
+    for column in sorted(alternatives, key=lambda c: bool(source) and c.source != source):
+        if (part := find(column.names)) is not None:
             return column, part
     return alternatives[0], None
 

@@ -16,15 +16,13 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import BODIES, WORLDS
 from eval.logs.columns import GROUPS, KNOWN
-from eval.logs.faults.reading import TIMES
+from eval.logs.faults.reading import DEG, RPM, TIMES
 from eval.logs.files import METADATA
 from tracks.common.names import unknown_name
 from tracks.common.toml_table import Table, read_toml, shipped_names
 
 SHIPPED = Path(__file__).resolve().parent / "mappings"
 """Folder of the mapping files that come with the suite."""
-DEG = float(np.pi / 180.0)
-RPM = float(2.0 * np.pi / 60.0)
 _LENGTH = {"m": 1.0, "cm": 0.01, "mm": 1e-3}
 _BODY_RATE = {"rad/s": 1.0, "deg/s": DEG, "mrad/s": 1e-3}
 _ANGLE = {"rad": 1.0, "deg": DEG}
@@ -143,17 +141,11 @@ def read_map(path: Path) -> LogMap:
         ValueError: naming the file, the key, its value and what is allowed.
     """
     top = read_toml(map_file(path))
-    world, body, side = "z-up", "flu", None
-    if top.has("frames"):
-        frames = top.table("frames")
-        world = frames.choice("world", WORLDS)
-        body = frames.choice("body", BODIES)
-        side = motor_side_of(frames)
-        frames.close()
-    columns = {}
-    for signal in UNITS:
-        if top.has(signal):
-            columns[signal] = _alternatives(signal, top)
+    frames = top.table("frames", {})
+    world, body = frames.choice("world", WORLDS), frames.choice("body", BODIES)
+    side = motor_side_of(frames)
+    frames.close()
+    columns = {signal: _alternatives(signal, top) for signal in UNITS if top.has(signal)}
     text_file = mass_key = ""
     if top.has("about"):
         about = top.table("about")
@@ -165,7 +157,7 @@ def read_map(path: Path) -> LogMap:
             raise about.error("file", text_file, allowed) from None
         mass_key = about.text("mass") if about.has("mass") else ""
         about.close()
-    optional = top.has("optional") and top.choice("optional", ("no", "yes")) == "yes"
+    optional = top.choice("optional", ("no", "yes")) == "yes"
     keep = tuple(top.texts("keep")) if top.has("keep") else ()
     reserved = [name for name in keep if name in KNOWN or name in ("throttle", METADATA)]
     if reserved:
@@ -232,9 +224,8 @@ def _column(signal: str, table: Table) -> Column:
     if signal in ("quat", "cmd_quat"):
         if table.choice("order", ("wxyz", "xyzw")) == "xyzw":
             order = [3, 0, 1, 2]
-            names = names if is_list_column else [names[k] for k in order]
-            if is_list_column:  # `column[3]`, `column[0]`, ... are entries of the cells' lists
-                names = [f"{names[0]}[{k}]" for k in order]
+            # `column[3]`, `column[0]`, ... are entries of the cells' lists.
+            names = [f"{names[0]}[{k}]" if is_list_column else names[k] for k in order]
             sign = sign[order]
         inverse = table.choice("maps", ("body to world", "world to body")) == "world to body"
     if signal in AXES:

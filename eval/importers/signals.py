@@ -32,6 +32,10 @@ LEAST_STEP = 1e-15
 """Least step of increasing times, so that a division by it does not overflow."""
 
 
+Part = tuple[np.ndarray, np.ndarray]
+"""Times (N,) [s] and samples, (N,) or (N, C), as a file has them; NaN where unknown."""
+
+
 class Signal(NamedTuple):
     """Samples of one signal."""
 
@@ -107,12 +111,10 @@ def make_signal(
     return Signal(time_s[forward], value[forward]), finding
 
 
-def collect(
-    parts: Mapping[str, tuple[np.ndarray, np.ndarray]], file: str
-) -> tuple[dict[str, Signal], tuple[Finding, ...]]:
+def collect(parts: Mapping[str, Part], file: str) -> tuple[dict[str, Signal], tuple[Finding, ...]]:
     """Return the signals that have samples, and findings on samples that were left out.
 
-    `parts` maps the signal's name to times (N,) [s] and values (N,) or (N, C).
+    `parts` are by the signals' names.
 
     Raises:
         FlightLogError: where a signal of `NEEDED` is unusable; another unusable signal is dropped.

@@ -186,15 +186,12 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]
 
 def _check_size(path: Path, rows: int, columns: int) -> None:
     """Refuse tables that are too large, before they are read."""
-    reason = "cut it into flights, or log less often"
+    advice = "cut it into flights, or log less often"
     if rows > MOST_ROWS:
-        reason = f"{rows:,} rows; at most {MOST_ROWS:,}: {reason}"
-    elif rows * columns > MOST_CELLS:
-        size = f"{rows:,} rows of {columns:,} columns"
-        reason = f"{size}; at most {MOST_CELLS:,} cells: leave columns out, {reason}"
-    else:
-        return
-    raise FlightLogError(path, reason)
+        raise FlightLogError(path, f"{rows:,} rows; at most {MOST_ROWS:,}: {advice}")
+    if rows * columns > MOST_CELLS:
+        size = f"{rows:,} rows of {columns:,} columns; at most {MOST_CELLS:,} cells"
+        raise FlightLogError(path, f"{size}: leave columns out, {advice}")
 
 
 def _check_text(path: Path, columns: int) -> None:

@@ -95,8 +95,8 @@ class ModelProcess:
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", str(SERVER)],
-                stdin=theirs,
-                stdout=theirs,
+                stdin=theirs.fileno(),
+                stdout=theirs.fileno(),
                 stderr=subprocess.DEVNULL,
                 # Ctrl-C reaches all processes of a session; this process decides when it ends.
                 start_new_session=True,

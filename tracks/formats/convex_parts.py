@@ -68,12 +68,10 @@ def convex_parts(path: Path) -> list[np.ndarray]:
         resolver: Any = _Resolver(path.parent, MESH_BYTES - len(data))
         scene = trimesh.load_scene(io.BytesIO(data), kind, resolver, **options)
         geometries = scene.dump()
-    except InputError:
+    except (InputError, MemoryError):
         raise
     except OSError as error:
         raise ValueError(f"{path}: cannot be read as a mesh ({reason(error)})") from None
-    except MemoryError:
-        raise
     except Exception as error:  # the loaders may raise anything for a damaged file
         reason_text = " ".join(str(error).split())[:200] or type(error).__name__
         raise ValueError(f"{path}: cannot be read as a mesh ({reason_text})") from None

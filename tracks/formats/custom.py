@@ -54,6 +54,8 @@ _ROUNDING = 0.01
 """Share by which a mesh may be thinner than `LEAST_M`, because of rounding."""
 _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Rotation from the axes of a mesh file with y up to axes with z up; x stays."""
+_ROD_SHAPES = [(3,), (3,), (), ()]
+"""Shapes of the values of a cylinder or capsule: centre, axis, radius, half length."""
 _SINGULAR = {"boxes": "box", "meshes": "mesh"}
 """Singular of the keys that do not end in a plain s."""
 
@@ -77,21 +79,16 @@ def load_track(path: str | os.PathLike[str]) -> Track:
     start_pos_w, start_yaw = _start(top, gates)
 
     names = _Names([f"gate {i} frame" for i in range(len(gate_tables))])
-    boxes, box_names = _solids_of_kind(top, "boxes", _box, names)
-    cylinders, cylinder_names = _solids_of_kind(top, "cylinders", _rod, names)
-    capsules, capsule_names = _solids_of_kind(top, "capsules", _rod, names)
-    spheres, sphere_names = _solids_of_kind(top, "spheres", _sphere, names)
+    boxes, box_names = _solids_of_kind(top, "boxes", _box, [(3,), (3, 3), (3,)], names)
+    cylinders, cylinder_names = _solids_of_kind(top, "cylinders", _rod, _ROD_SHAPES, names)
+    capsules, capsule_names = _solids_of_kind(top, "capsules", _rod, _ROD_SHAPES, names)
+    spheres, sphere_names = _solids_of_kind(top, "spheres", _sphere, [(3,), ()], names)
     meshes, mesh_names = _meshes(top, names)
 
-    all_boxes, frame_names = with_frames(gates, Boxes(*_columns(boxes, [(3,), (3, 3), (3,)])))
-    scene = Scene(
-        gates,
-        all_boxes,
-        Rods(*_columns(cylinders, [(3,), (3,), (), ()])),
-        Rods(*_columns(capsules, [(3,), (3,), (), ()])),
-        Spheres(*_columns(spheres, [(3,), ()])),
-        np.concatenate([np.zeros((0, 3, 3)), *meshes]),
-    )
+    all_boxes, frame_names = with_frames(gates, Boxes(*boxes))
+    triangles = np.concatenate([np.zeros((0, 3, 3)), *meshes])
+    rods = Rods(*cylinders), Rods(*capsules)
+    scene = Scene(gates, all_boxes, *rods, Spheres(*spheres), triangles)
     solid_names = (*box_names, *cylinder_names, *capsule_names, *sphere_names, *mesh_names)
     sizes = tuple(len(mesh) for mesh in meshes)
     all_names = (*frame_names, *solid_names)
@@ -136,22 +133,20 @@ def _tables(top: Table, kind: str) -> list[Table]:
 
 
 def _solids_of_kind(
-    top: Table, kind: str, read: Callable[[Table], tuple], names: _Names
-) -> tuple[list[tuple], list[str]]:
-    """Return the values and the names of all solids of a kind; `read` reads one table."""
+    top: Table, kind: str, read: Callable[[Table], tuple], shapes: list[tuple], names: _Names
+) -> tuple[list[np.ndarray], list[str]]:
+    """Return the columns and the names of all solids of a kind.
+
+    `read` returns the values of one table, whose `shapes` empty columns have as well.
+    """
     rows, labels = [], []
     for number, table in enumerate(_tables(top, kind)):
         rows.append(read(table))
         labels.append(names(table, kind, number))
         table.close()
-    return rows, labels
-
-
-def _columns(rows: list[tuple], shapes: list[tuple[int, ...]]) -> list[np.ndarray]:
-    """Return an array for each column of `rows`; without rows, empty ones of the given shapes."""
     if not rows:
-        return [np.zeros((0, *shape)) for shape in shapes]
-    return [np.array(column) for column in zip(*rows, strict=True)]
+        return [np.zeros((0, *shape)) for shape in shapes], []
+    return [np.array(column) for column in zip(*rows, strict=True)], labels
 
 
 def _gates(tables: list[Table]) -> Gates:

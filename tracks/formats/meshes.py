@@ -36,14 +36,10 @@ def solid_meshes(track: Track) -> list[tuple[str, trimesh.Trimesh]]:
     return [(name, mesh) for name, mesh in named if mesh.bounds[1, 2] > PARKED_Z / 2]
 
 
-def _transform(center_w: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
+def _box(center_w: np.ndarray, rot_w: np.ndarray, half_size: np.ndarray) -> trimesh.Trimesh:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rot_w, center_w
-    return matrix
-
-
-def _box(center_w: np.ndarray, rot_w: np.ndarray, half_size: np.ndarray) -> trimesh.Trimesh:
-    return trimesh.creation.box(extents=2 * half_size, transform=_transform(center_w, rot_w))
+    return trimesh.creation.box(extents=2 * half_size, transform=matrix)
 
 
 def _sphere(center_w: np.ndarray, radius: float) -> trimesh.Trimesh:

@@ -8,6 +8,8 @@ by its padding: solids far below the ground, which make the number of geoms equa
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -67,7 +69,16 @@ def add_scene(
         )
     if pad_to is not None:
         scene = pad(scene, pad_to._replace(triangles=len(scene.triangles)))
-    give_name = _Names(names, solid_counts)
+    first, used = np.concatenate([[0], np.cumsum(solid_counts)]), Counter()
+
+    def give_name(kind: int, number: int) -> str:
+        """Return a unique geom name for a solid of a kind, or for its padding."""
+        name = PARKED
+        if kind == len(solid_counts) or number < solid_counts[kind]:
+            name = names[first[kind] + number] if names else f"{Scene._fields[kind + 1]} {number}"
+        used[name] += 1
+        return name if used[name] == 1 else f"{name}{_SEPARATOR}{used[name] - 1}"
+
     world = spec.worldbody
     geom = mujoco.mjtGeom
 
@@ -94,27 +105,11 @@ def add_scene(
     world.add_geom(name=GROUND, type=geom.mjGEOM_PLANE, size=[0, 0, 1])
 
 
-class _Names:
-    """Returns a unique geom name for each solid of a kind, called in order."""
-
-    def __init__(self, names: tuple[str, ...], solid_counts: tuple[int, ...]) -> None:
-        self._names = names
-        self._counts = solid_counts
-        self._first = np.concatenate([[0], np.cumsum(solid_counts)])
-        self._used: dict[str, int] = {}
-
-    def __call__(self, kind: int, number: int) -> str:
-        name = PARKED
-        if kind == len(self._counts) or number < self._counts[kind]:
-            numbered_name = f"{Scene._fields[kind + 1]} {number}"
-            name = self._names[self._first[kind] + number] if self._names else numbered_name
-        uses = self._used.get(name, 0)
-        self._used[name] = uses + 1
-        return name if uses == 0 else f"{name}{_SEPARATOR}{uses}"
-
-
 def _add_meshes(
-    spec: mujoco.MjSpec, triangles: np.ndarray, mesh_sizes: tuple[int, ...], give_name: _Names
+    spec: mujoco.MjSpec,
+    triangles: np.ndarray,
+    mesh_sizes: tuple[int, ...],
+    give_name: Callable[[int, int], str],
 ) -> None:
     """Add each convex mesh as a geom of the world body."""
     first = 0

@@ -146,21 +146,15 @@ def _fields(cls: type) -> tuple[tuple[str, str, Range | None], ...]:
     hints = get_type_hints(cls, include_extras=True)
     fields = []
     for field in dataclasses.fields(cls):
-        metadata = list(_metadata(hints[field.name]))
+        types = list(_types(hints[field.name]))
+        metadata = [entry for part in types for entry in getattr(part, "__metadata__", ())]
         allowed = next((entry for entry in metadata if isinstance(entry, Range)), None)
-        if allowed and float not in (types := set(_types(hints[field.name]))):
+        if allowed and float not in types:
             allowed = dataclasses.replace(allowed, whole=int in types)
         names = (getattr(entry, "name", None) for entry in metadata)
         display_name = next((name for name in names if isinstance(name, str)), field.name)
         fields.append((field.name, display_name, allowed))
     return tuple(fields)
-
-
-def _metadata(hint: Any) -> Iterator[Any]:
-    """Yield the `Annotated` metadata of a type and of its parts."""
-    yield from getattr(hint, "__metadata__", ())
-    for part in get_args(hint):
-        yield from _metadata(part)
 
 
 def _types(hint: Any) -> Iterator[Any]:

@@ -68,14 +68,13 @@ def detect(path: Path, options: ImportOptions) -> str:
     """
     head = read_head(path)
     candidates = sorted(FORMATS.items(), key=lambda item: getattr(item[1], "ASKED_LAST", False))
-    reason = "of no known format; name it with --format, and a table's columns with --map"
-    if b"\0" not in head and any(mark.encode() in first_line(head) for mark in OTHER_MARKS):
-        reason = NO_COMMAS  # a table with commas is recognised below
     for name, format in candidates:
         try:
             if format.detect(head, options):
                 return name
         except ValueError as error:
-            reason = str(error)
-            break
+            raise FlightLogError(path, str(error)) from None
+    reason = "of no known format; name it with --format, and a table's columns with --map"
+    if b"\0" not in head and any(mark.encode() in first_line(head) for mark in OTHER_MARKS):
+        reason = NO_COMMAS
     raise FlightLogError(path, reason)

@@ -33,10 +33,11 @@ from eval.importers.formats.betaflight import MOTOR_SIDE as BETAFLIGHT_X
 from eval.importers.formats.px4 import QUAD_X
 from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, from_euler
 from eval.importers.options import ImportOptions
-from eval.importers.signals import Recording, collect
+from eval.importers.signals import Part, Recording, collect
 from eval.logs.columns import FlightLogError, quoted
 from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import CUT, Finding
+from eval.logs.faults.reading import DEG, RPM
 
 SUMMARY = "ArduPilot log (.bin)"
 TAKES_MAP = TAKES_SOURCE = False
@@ -61,7 +62,6 @@ INSTANCES = ("I", "C", "Inst", "Instance")
 """Columns with the number of the sensor, core or battery of a message."""
 MOTOR_1 = 33
 """SERVOn_FUNCTION of motor 1; motors 2 to 4 have the next numbers."""
-DEG, RPM = np.pi / 180.0, np.pi / 30.0
 MISSING = "an ArduPilot log; pip install 'diffracing-suite[mavlink]' reads it"
 """Reason of the error if pymavlink is not installed."""
 
@@ -81,7 +81,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
         FlightLogError: where the reader is not installed, or the file is not an ArduPilot log.
     """
     messages, parameters, about, findings = _load(path)
-    parts: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    parts: dict[str, Part] = {}
 
     def take(name: str, kinds: tuple[str, ...], columns: str, factor: Any) -> None:
         """Add a signal from the first message that has its columns."""
@@ -228,9 +228,7 @@ def _outputs(parameters: Mapping[str, float]) -> list[int]:
     return assigned if len(assigned) == 4 else []
 
 
-def _motors(
-    esc: Rows, outputs: list[int], findings: list[Finding]
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _motors(esc: Rows, outputs: list[int], findings: list[Finding]) -> dict[str, Part]:
     """Return rotor speeds [rad/s] of motors 1 to 4, whose numbers of outputs are `outputs`.
 
     Motor controllers (ESCs) have instances in the order of their outputs. Speeds are interpolated

@@ -25,6 +25,7 @@ from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError, quoted
 from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import Finding
+from eval.logs.faults.reading import DEG
 from eval.logs.files import first_line, read_columns, read_head
 
 SUMMARY = "Blackbox log (.bbl, .bfl), or CSV of blackbox_decode; --pose or --partial"
@@ -46,7 +47,6 @@ DSHOT, PULSES = (48.0, 2047.0), (1000.0, 2000.0)
 """Least and largest motor output, in steps of DShot or as pulses [us]."""
 ABOUT = {"Firmware revision": "firmware", "Craft name": "craft", "Board information": "board"}
 """Entry of the log's header -> key in the flight log's metadata."""
-DEG = np.pi / 180.0
 _ROTATION = {"": DEG, "deg/s": DEG, "rad/s": 1.0}
 _ACCELERATION = {"": GRAVITY / ACC_1G, "g": GRAVITY, "m/s2": 1.0}
 _TIME = {"": 1e-6, "us": 1e-6, "ms": 1e-3, "s": 1.0}
@@ -80,17 +80,14 @@ class Blackbox:
         """Read the log at `path`, raw or as a table."""
         self.name = str(path)
         self.header: Mapping[str, Any] = {}
-        self.findings: list[Finding] = []
         if MARKER in read_head(path):
-            self.columns, self.header, findings = decode(path)
-            self.findings += findings
+            self.columns, self.header, self.findings = decode(path)
         else:
             self.columns, _, warnings = read_columns(path)
-            self.findings += [Finding("note", "file", text) for text in warnings]
+            self.findings = [Finding("note", "file", text) for text in warnings]
         self.units: dict[str, tuple[str, str]] = {}  # name without unit -> full name, unit
         for column in self.columns:
-            match = _UNIT.match(column)
-            if match:
+            if match := _UNIT.match(column):
                 self.units[match["name"]] = (column, match["unit"] or "")
 
     def settings(self, name: str, default: tuple[float, ...]) -> tuple[float, ...]:
@@ -137,7 +134,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
         FlightLogError: where a column of every Betaflight log is missing or unusable.
     """
     box = Blackbox(path)
-    findings = list(box.findings)
+    findings = box.findings
     time_s = box.values(["time"], _TIME)[:, 0]
     if np.isfinite(time_s).any():
         time_s = time_s - np.nanmin(time_s)
@@ -158,14 +155,13 @@ def read(path: Path, options: ImportOptions) -> Recording:
     poles = options.motor_poles
     if poles is None:
         poles = int(box.settings("motor_poles", (14,))[0])
-    parts |= _motors(box, poles, findings)
-    parts |= _outputs(box, findings)
+    parts |= _motors(box, poles) | _outputs(box)
     signals, more_findings = collect(
         {name: (time_s, value) for name, value in parts.items()}, box.name
     )
     about = {our_key: str(box.header[key]) for key, our_key in ABOUT.items() if box.header.get(key)}
-    findings += more_findings
-    return Recording(box.name, signals, tuple(findings), MOTOR_SIDE, about, has_seconds=True)
+    findings = (*findings, *more_findings)
+    return Recording(box.name, signals, findings, MOTOR_SIDE, about, has_seconds=True)
 
 
 def _volts(voltage: np.ndarray, unit: str, fix: bool, findings: list[Finding]) -> np.ndarray:
@@ -186,7 +182,7 @@ def _volts(voltage: np.ndarray, unit: str, fix: bool, findings: list[Finding]) -
     return corrected if fix else voltage
 
 
-def _outputs(box: Blackbox, findings: list[Finding]) -> dict[str, np.ndarray]:
+def _outputs(box: Blackbox) -> dict[str, np.ndarray]:
     """Return motor commands from 0 to 1, scaled by the header's range, or else DShot's or PWM's."""
     names = [f"motor[{k}]" for k in range(4)]
     if not box.has(*names):
@@ -198,17 +194,17 @@ def _outputs(box: Blackbox, findings: list[Finding]) -> dict[str, np.ndarray]:
     names = [f"motor[{k}]" for k in range(8) if box.has(f"motor[{k}]")]
     if len(names) > 4 and not any(_ERPM.match(column) for column in box.columns):
         is_on = np.any(box.values(names, {"": 1.0}) > low, axis=0)
-        findings += check_count(int(np.sum(is_on)), "of the log")
+        box.findings += check_count(int(np.sum(is_on)), "of the log")
     text = f"motor outputs from {low:g} to {high:g} are 0 to 1"
-    findings.append(Finding("note", "motors", text))
+    box.findings.append(Finding("note", "motors", text))
     return {"pwm": np.clip((raw - low) / (high - low), 0.0, 1.0)}
 
 
-def _motors(box: Blackbox, poles: int, findings: list[Finding]) -> dict[str, np.ndarray]:
+def _motors(box: Blackbox, poles: int) -> dict[str, np.ndarray]:
     """Return rotor speeds [rad/s] from eRPM, which is logged in hundreds."""
     columns = {match[1]: c for c in box.columns if (match := _ERPM.match(c))}
     turning = [(numbers(box.columns, c, box.name) > 0.0).any() for c in columns.values()]
-    findings += check_count(int(sum(turning)), "of the log")
+    box.findings += check_count(int(sum(turning)), "of the log")
     if not set(columns) >= set("0123"):
         return {}
     if poles < 2 or poles % 2:
@@ -216,7 +212,7 @@ def _motors(box: Blackbox, poles: int, findings: list[Finding]) -> dict[str, np.
     raw = [numbers(box.columns, columns[k], box.name) for k in "0123"]
     turns_per_s = np.stack(raw, axis=1) * 100.0 / (poles / 2) / 60.0
     text = f"rotor speeds from eRPM of motors with {poles} poles (--motor-poles)"
-    findings.append(Finding("note", "motors", text))
+    box.findings.append(Finding("note", "motors", text))
     return {"motor": 2.0 * np.pi * turns_per_s}
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from eval.importers.mapping import recording_of
 from eval.importers.mapping_file import read_map
 from eval.importers.options import ImportOptions
-from eval.importers.signals import Recording
+from eval.importers.signals import Part, Recording
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.finding import Finding
 from eval.logs.files import read_head
@@ -202,9 +202,7 @@ def _text(data: bytes, offset: int) -> tuple[str, int]:
     return data[offset:end].decode("utf-8"), end + 1
 
 
-def _find(
-    events: Mapping[str, Mapping[str, np.ndarray]], variables: Sequence[str]
-) -> tuple[np.ndarray, np.ndarray] | None:
+def _find(events: Mapping[str, Mapping[str, np.ndarray]], variables: Sequence[str]) -> Part | None:
     """Return time and values of `variables` from the kind of event with most samples of them."""
     having_all = [e for e in events.values() if all(v in e for v in variables)]
     best = max(having_all, key=lambda event: len(event["timestamp"]), default=None)

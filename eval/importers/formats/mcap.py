@@ -26,7 +26,7 @@ import numpy as np
 from eval.importers.mapping_file import map_file, motor_side_of
 from eval.importers.options import ImportOptions
 from eval.importers.rows import turn_axes
-from eval.importers.signals import Recording, Signal, collect
+from eval.importers.signals import Part, Recording, collect
 from eval.logs.columns import FlightLogError, quoted
 from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import Finding
@@ -88,7 +88,9 @@ def read(path: Path, options: ImportOptions) -> Recording:
         reason = f"the file has no topic {topic_of[missing[0]]!r}, which the mapping names"
         raise FlightLogError(path, reason)
     messages = _on_one_clock(chosen, findings)
-    signals, more_findings = _signals(messages, str(path))
+    signals, more_findings = collect(_parts(messages, str(path)), str(path))
+    if "vel" in signals:
+        turn_axes(signals, "vel", to_world=True)
     findings += _motor_count(messages)
     return Recording(str(path), signals, (*findings, *more_findings), motor_side, has_seconds=True)
 
@@ -99,16 +101,12 @@ def _choices(
     """Return the topics that a mapping file selects, by kind, and the positions of its motors."""
     if map_path is None:
         return {}, None
-    top, topics, motor_side = read_toml(map_file(map_path)), {}, None
-    if top.has("topics"):
-        table = top.table("topics")
-        topics = {kind: table.text(kind) for kind in KINDS if table.has(kind)}
+    top = read_toml(map_file(map_path))
+    tables = [top.table(name, {}) for name in ("topics", "frames")]
+    topics = {kind: tables[0].text(kind) for kind in KINDS if tables[0].has(kind)}
+    motor_side = motor_side_of(tables[1])
+    for table in (*tables, top):
         table.close()
-    if top.has("frames"):
-        table = top.table("frames")
-        motor_side = motor_side_of(table)
-        table.close()
-    top.close()
     return topics, motor_side
 
 
@@ -174,12 +172,10 @@ def _stamp(message: Any) -> int:
     return 0 if stamp is None else int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
-def _signals(
-    messages: dict[str, list[tuple[int, Any]]], name: str
-) -> tuple[dict[str, Signal], tuple[Finding, ...]]:
-    """Return the signals of the messages, with times from 0 [s], and findings."""
+def _parts(messages: dict[str, list[tuple[int, Any]]], name: str) -> dict[str, Part]:
+    """Return the signals of the messages, with times from 0 [s]; a velocity is in body axes."""
     origin_ns = min(time_ns for stamped in messages.values() for time_ns, _ in stamped)
-    parts: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    parts: dict[str, Part] = {}
 
     def take(signal: str, kind: str, value: Callable[[Any], list[float]]) -> None:
         """Add a signal from messages of `kind`, unless an earlier kind has given it."""
@@ -209,10 +205,7 @@ def _signals(
     take("throttle", "command", lambda m: _unless(m, IGNORE_THRUST, [m.thrust]))
     take("motor", "motors", _speeds)
     take("voltage", "battery", lambda m: [m.voltage])
-    signals, findings = collect(parts, name)
-    if "vel" in signals:
-        turn_axes(signals, "vel", to_world=True)
-    return signals, findings
+    return parts
 
 
 def _xyz(vector: Any) -> list[float]:

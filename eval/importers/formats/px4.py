@@ -17,10 +17,11 @@ import numpy as np
 
 from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, rotate
 from eval.importers.options import ImportOptions
-from eval.importers.signals import Recording, collect
+from eval.importers.signals import Part, Recording, collect
 from eval.logs.columns import FlightLogError, quoted
 from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import CUT, Finding
+from eval.logs.faults.reading import RPM
 from eval.logs.faults.sensors import check_voltage_fails
 from eval.logs.files import read_head
 from tracks.input.ranges import is_number
@@ -38,12 +39,9 @@ FIRST_MOTOR = 101
 """Value of `actuator_function` for Motor1; Motor2 to Motor4 have the next values."""
 BODY_FRAME = 3
 """Value of `velocity_frame` for a velocity in body axes."""
-RPM = 2.0 * np.pi / 60.0
 
 Topic = Mapping[str, np.ndarray]
 """The columns of one topic, by field name."""
-Part = tuple[np.ndarray, np.ndarray]
-"""Times (N,) [s] and values (N, C) of a signal."""
 Change = Callable[[Topic, np.ndarray], np.ndarray | None]
 """Function of a topic and its fields (N, C) that returns them changed, or None for no samples."""
 

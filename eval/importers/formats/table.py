@@ -17,7 +17,7 @@ import numpy as np
 from eval.importers.mapping import recording_of
 from eval.importers.mapping_file import LogMap, own_map, read_map
 from eval.importers.options import ImportOptions
-from eval.importers.signals import Recording
+from eval.importers.signals import Part, Recording
 from eval.logs.columns import FlightLogError, as_numbers
 from eval.logs.faults.finding import Finding
 from eval.logs.files import PARQUET_MAGIC, first_line, read_columns
@@ -60,7 +60,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
     hint = "name it in the mapping's [time]" if file_map else f"describe the columns with {flag}"
     time_s, clock_findings = _time(columns, mapping, name, hint)
 
-    def find(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray] | None:
+    def find(names: tuple[str, ...]) -> Part | None:
         values = [_values(columns, column, name) for column in names]
         present = [value for value in values if value is not None]
         if len(present) < len(names):

@@ -10,6 +10,7 @@ TILT = "fly 2 m forward and back, then 2 m left and back, briskly"
 CLIMB = "climb and descend briskly, from a full to an almost empty battery"
 PULSE = "propellers off or the vehicle held down: pulse motor 1, then 2, 3 and 4, a second each"
 STICKS = "hold a roll, a pitch and a yaw rate of 1 rad/s and of 3 rad/s for a second each"
+HOVER = "hover for two seconds"
 REST = "let the vehicle rest, level, for a second"
 FASTER = "log at twice the controller's rate"
 GROUND = "log from two seconds before the motors start"
@@ -44,27 +45,21 @@ FAULTS: dict[str, tuple[str, str]] = {
     "motor_spin": ("motors turn the other way round", PULSE),
     "motor_dead": ("a motor never turns", PULSE),
     "motor_count": ("not four motors turn", PULSE),
-    "motor_unit": ("rotor speeds are in another unit", "hover for two seconds"),
-    "motor_poles": ("eRPM was divided by the wrong number of pole pairs", "hover for two seconds"),
+    "motor_unit": ("rotor speeds are in another unit", HOVER),
+    "motor_poles": ("eRPM was divided by the wrong number of pole pairs", HOVER),
     "rate_command_unit": ("commanded rates are in another unit", STICKS),
     "rate_command_sign": ("a commanded rate has the other sign", STICKS),
     "rate_curve": ("the firmware maps sticks by another curve", STICKS),
     "command_delay": ("commands act too late", STICKS),
     "controller_rate": ("the controller runs at another rate", FASTER),
-    "thrust_command_unit": (
-        "the thrust command is not in m/s^2 along body z",
-        "hover for two seconds",
-    ),
-    "throttle_range": ("the throttle is not from 0 to 1", "hover for two seconds"),
+    "thrust_command_unit": ("the thrust command is not in m/s^2 along body z", HOVER),
+    "throttle_range": ("the throttle is not from 0 to 1", HOVER),
     "throttle_curve": ("thrust grows with the throttle by another curve, or its size", CLIMB),
     "motor_map": ("[motors] of the vehicle file: size or curve of thrust over command", CLIMB),
     "battery_scaling": ("thrust changes with the battery's voltage by another exponent", CLIMB),
-    "thrust_scale": ("thrust is not what the vehicle file says", "hover for two seconds"),
+    "thrust_scale": ("thrust is not what the vehicle file says", HOVER),
     "voltage": ("the battery's voltage is impossible", "log the battery that drives the motors"),
-    "vehicle_mass": (
-        "the mass in the vehicle file is a multiple of the true one",
-        "hover for two seconds",
-    ),
+    "vehicle_mass": ("the mass in the vehicle file is a multiple of the true one", HOVER),
     "vehicle_arms": ("rotors or body are in cm or mm", ""),
     "vehicle_inertia": ("the inertia is another vehicle's or in another unit", ""),
     "vehicle_thrust": ("thrust-to-weight is implausible", ""),

@@ -212,11 +212,9 @@ def with_fixes(log: FlightLog, readings: Readings) -> FlightLog:
     columns = columns_from_log(log)
     signals = {**GROUPS, "throttle": ("throttle",)}  # a checked column that no group has
     rows = {"time": log.time_s, **signals_of(columns, signals)}
-    filled_quat = filled(log.time_s, rows["quat"]) if "quat" in rows else None
-    corrected = read_rows(
-        {**rows, "quat": filled_quat} if filled_quat is not None else rows, readings
-    )
-    if filled_quat is not None:
+    attitude = {"quat": filled(log.time_s, rows["quat"])} if "quat" in rows else {}
+    corrected = read_rows(rows | attitude, readings)
+    if attitude:  # missing attitudes serve other signals, but stay missing
         corrected["quat"] = read_rows({"time": log.time_s, "quat": rows["quat"]}, readings)["quat"]
     for group, names in signals.items():
         if group in rows and group not in corrected:

@@ -15,6 +15,8 @@ from eval.importers.frames import QUAT_HALF_TURN, conjugate, from_euler, multipl
 
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Unit of time -> seconds."""
+DEG, RPM = float(np.pi / 180.0), float(np.pi / 30.0)
+"""Factors from deg to rad, and from revolutions a minute to rad/s."""
 # Signals by what they contain, since each step applies to one group only.
 QUATS = ("quat", "cmd_quat")
 VECTORS = ("pos", "vel", "rate", "acc", "cmd_rate", "cmd_torque")

@@ -132,18 +132,17 @@ def check_barometer(rows: Rows) -> list[Finding]:
     if running.all() or not running.any():
         text = "the log has no row before the motors start"
         return unseen("barometer", text, "barometer_spin_up")
-    start = int(np.argmax(running))
     time_s, value = rows["time"], height[:, 0]
-    before = value[(time_s < time_s[start]) & (time_s > time_s[start] - 2.0)]
-    after = value[(time_s > time_s[start]) & (time_s < time_s[start] + 1.0)]
-    if not len(before) or not len(after):
+    start_s = time_s[np.argmax(running)]
+    before, after = time_s < start_s, (time_s > start_s) & (time_s < start_s + 1.0)
+    shortly_before = before & (time_s > start_s - 2.0)
+    if not shortly_before.any() or not after.any():
         return []
     true = 0.0
     if "pos" in rows:
         up = rows["pos"][:, 2]
-        true = float(np.nanmedian(up[(time_s > time_s[start]) & (time_s < time_s[start] + 1.0)])
-                     - np.nanmedian(up[time_s < time_s[start]]))  # fmt: skip
-    fall = float(np.nanmin(after) - np.nanmedian(before)) - min(true, 0.0)
+        true = float(np.nanmedian(up[after]) - np.nanmedian(up[before]))
+    fall = float(np.nanmin(value[after]) - np.nanmedian(value[shortly_before])) - min(true, 0.0)
     if fall < -SUNK_M:
         text = f"its height falls by {-fall:.2g} m in the second in which the motors start"
         fix = "foam over the barometer, or a height from elsewhere; leave baro out"

@@ -15,11 +15,10 @@ from eval.importers.frames import conjugate, rotate
 from eval.logs.faults.clocks.delay import CLEARLY, LATE_S, late_against
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows, turns_of
-from eval.logs.faults.reading import axes_matrix, option, read_as
+from eval.logs.faults.reading import DEG, axes_matrix, option, read_as
 from eval.logs.faults.relation import LEAST, SEEN, Match, match, pooled_scale, rms, smooth, within
 from eval.logs.velocity import velocity_from_position
 
-DEG = float(np.pi / 180.0)
 COUNTS = 16.384
 """Counts per deg/s of a 16-bit gyro with a range of 2000 deg/s."""
 RATES = {
@@ -99,7 +98,7 @@ def check_gyro(rows: Rows) -> list[Finding]:
     apart = rms(rotate(rows["quat"], turns) - turns) / size
     if apart < APART:
         text = f"body and world axes are {100 * apart:.0f} % of its turns apart only"
-        findings.append(Finding("not identifiable", "gyro", text, "gyro_frame"))
+        findings += unseen("gyro", text, "gyro_frame")
     if found.is_turned or found.is_mirrored:
         findings.append(_turned(found, "rate", "gyro"))
     elif not found.seen.any():
@@ -210,12 +209,7 @@ def check_velocity(rows: Rows) -> list[Finding]:
     best = min(residual, key=lambda way: residual[way])
     here = matches[""]
     figures = f"it is off the path's derivative by {100 * residual['']:.0f} %, its scale left out"
-    if (
-        best
-        and residual[best] < GOOD
-        and residual[""] > TIMES_BETTER * residual[best]
-        and residual[""] > 0.3
-    ):
+    if best and residual[best] < GOOD and residual[""] > max(0.3, TIMES_BETTER * residual[best]):
         words = {
             "from-body": "in body axes",
             "x,-y,-z+from-body": "in forward-right-down body axes",
@@ -236,7 +230,7 @@ def check_velocity(rows: Rows) -> list[Finding]:
         apart = 1.0 if quat is None else rms(rotate(quat, path) - path) / speed
         if apart < APART:
             text = f"body and world axes are {100 * apart:.0f} % of it apart only"
-            findings.append(Finding("not identifiable", "velocity", text, "velocity_frame"))
+            findings += unseen("velocity", text, "velocity_frame")
         findings += _unseen_axes(here, "velocity", "velocity_frame")
         findings += _velocity_delay(time_s, path, smooth(time_s, rows["vel"], WIDTH_S))
     unit = _unit(here, SPEEDS, "vel", "velocity", "velocity_unit", "the path's derivative", SLOW)

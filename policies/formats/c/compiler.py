@@ -86,18 +86,14 @@ def compiled_library(policy_c: Path) -> Path:
     key = hashlib.sha256(repr((compiler, FLAGS, NATIVE_FLAGS, platform.machine())).encode())
     for text in texts:
         key.update(hashlib.sha256(text).digest())
-    library = _cache() / f"{key.hexdigest()}.so"
+    # Machines may share a home directory, but not compiled code, since processors differ.
+    folder = user_cache() / "c" / (platform.node() or "here")
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    library = folder / f"{key.hexdigest()}.so"
     if not library.is_file():
         with replacing_file(library) as temporary:
             _compile(compiler, files, temporary)
     return library
-
-
-def _cache() -> Path:
-    # Machines may share a home directory, but not compiled code, since processors differ.
-    folder = user_cache() / "c" / (platform.node() or "here")
-    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    return folder
 
 
 def _compile(compiler: list[str], files: list[Path], out: Path) -> None:

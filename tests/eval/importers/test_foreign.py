@@ -316,16 +316,15 @@ def test_px4_and_crazyflie_without_a_position_are_read(tmp_path):
 def test_rotors_without_a_turn_are_not_counted_and_speeds_are_of_the_poles():
     """Logs may have columns for eight rotors; 700 eRPM of 14 poles are 100 turns a minute."""
     columns = {f"eRPM[{k}]": np.full(3, 7.0 if k < 4 else 0.0) for k in range(8)}
-    box: Any = SimpleNamespace(columns=columns, name="log")
-    findings: list[Any] = []
-    found = betaflight._motors(box, 14, findings)
-    assert [finding.status for finding in findings] == ["note"]
+    box: Any = SimpleNamespace(columns=columns, name="log", findings=[])
+    found = betaflight._motors(box, 14)
+    assert [finding.status for finding in box.findings] == ["note"]
     np.testing.assert_allclose(found["motor"], np.full((3, 4), 100.0 / 60.0 * 2.0 * np.pi))
-    slower = betaflight._motors(box, 28, findings)
+    slower = betaflight._motors(box, 28)
     np.testing.assert_allclose(slower["motor"], 0.5 * found["motor"])
     columns["eRPM[4]"][1] = 1.0
-    betaflight._motors(box, 14, findings)
-    assert "motor_count" in {finding.fault for finding in findings}
+    betaflight._motors(box, 14)
+    assert "motor_count" in {finding.fault for finding in box.findings}
 
 
 def test_a_hexacopter_is_counted_by_its_outputs_where_it_logs_no_speeds(tmp_path):

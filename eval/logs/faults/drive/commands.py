@@ -14,9 +14,9 @@ from eval.logs.faults.drive.motors import fit_force, torque_correlations, turn_s
 from eval.logs.faults.drive.rate_following import bend, delayed, loop_gain
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows
-from eval.logs.faults.reading import option
+from eval.logs.faults.reading import DEG, option
 from eval.logs.faults.relation import match, pooled_scale, rms, smooth, within
-from eval.logs.faults.vectors import DEG, RATES, UPWARDS, check_gyro, upwards
+from eval.logs.faults.vectors import RATES, UPWARDS, check_gyro, upwards
 from eval.vehicles.vehicle import Vehicle
 
 LATE_S = 0.06
@@ -158,21 +158,14 @@ def check_thrust_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Fin
     possible_units = within(units, THRUST_FITS, ratio)
     nearest_unit = min(possible_units, key=lambda n: abs(np.log(ratio / units[n])), default="")
     surely_not_m_s2 = abs(np.log(ratio)) > np.log(THRUST_SAME)
-    if (
-        surely_not_m_s2
-        and nearest_unit == "in newtons"
-        and "in m/s^2" in possible_units
-        and sign > 0.0
-    ):
+    may_be_newtons = nearest_unit == "in newtons" and "in m/s^2" in possible_units
+    if surely_not_m_s2 and may_be_newtons and sign > 0.0:
         text = f"{figures}: it may be in newtons, as the mass is {units['in newtons']:.3g} kg, or "
         text += "thrust is off by so much"
         fix = option(("cmd_thrust", f"{1.0 / units['in newtons']:.6g}"))
         return [Finding("doubt", subject, text, "thrust_command_unit", ratio, 0.6, fix)]
-    name = (
-        possible_units[0]
-        if possible_units and (len(possible_units) == 1 or possible_units[0] == "in m/s^2")
-        else ""
-    )
+    is_one_unit = len(possible_units) == 1 or "in m/s^2" in possible_units
+    name = possible_units[0] if is_one_unit else ""
     if name != "in m/s^2" and abs(np.log(ratio)) < np.log(THRUST_EFFECT):
         text = f"{figures}: an effect, or a mass that is off"
         return [Finding("note", subject, text, "thrust_scale", ratio, 0.9)]
@@ -207,7 +200,7 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
     delay, command = delayed(time_s, rows["cmd_rate"], rate)
     if rms(rate) < CALM_RATE:
         text = f"turns of {rms(rate):.2g} rad/s are too small to check it by"
-        return [Finding("not identifiable", subject, text, "rate_curve")]
+        return unseen(subject, text, "rate_curve")
     matched = match(command, rate)
     # No command follows the gyro. One that fits far better so is logged too late.
     smoothed = smooth(time_s, rows["cmd_rate"], WIDTH_S)
@@ -255,10 +248,8 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
         shape = f", and {1.0 + bent:.2g} times as much of large ones as of small ones"
         text = f"{figures}, by {gain:.3g} of it ({low:.3g} to {high:.3g}){shape}: a stick map or "
         text += "a rates curve that the log's commands do not have"
-        fix = "the firmware's rates curve for the map from sticks, or " + option(
-            ("cmd_rate", f"{gain:.4g}"))  # fmt: skip
         sure = 0.93 if matched.alike[matched.seen].min() > FOLLOWED else 0.7
-        findings.append(Finding("doubt", subject, text, "rate_curve", gain, sure, fix))
+        findings.append(_other_curve(text, gain, sure))
     if delay > LATE_S + (USUAL_S if vehicle is None else _response(vehicle)):
         text = f"{figures}: later than the rate loop, rotors and a link make it"
         fix = "the link's or the logger's clock; a delay in the simulation: effects.command_delay"
@@ -340,9 +331,14 @@ def check_gyro_scale(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding
         return []  # `check_rate_command` names units
     text = f"the gyro is {text.removeprefix('it is ')}: another map from sticks to rates"
     text += "" if scale is not None else ", or the gyro's scale"
-    fix = "the firmware's rates curve for the map from sticks, or " + option(
-        ("cmd_rate", f"{gain:.4g}"))  # fmt: skip
-    return [Finding("doubt", "rate command", text, "rate_curve", gain, 0.9, fix)]
+    return [_other_curve(text, gain, 0.9)]
+
+
+def _other_curve(text: str, gain: float, sure: float) -> Finding:
+    """Return the doubt that another rates curve causes the `gain`."""
+    fix = "the firmware's rates curve for the map from sticks, or "
+    fix += option(("cmd_rate", f"{gain:.4g}"))
+    return Finding("doubt", "rate command", text, "rate_curve", gain, sure, fix)
 
 
 def _response(vehicle: Vehicle) -> float:

@@ -124,12 +124,7 @@ def check_inertia(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
     range_ = turn_scale(rows, vehicle) if "quat" in rows else None
     if vehicle is None or range_ is None or 1.0 / INERTIA < range_[1] and range_[0] < INERTIA:
         return []
-    name = _drive(rows)
-    lift = 1.0
-    if name == "motor":
-        thrust = vehicle.rotors.thrust_coefficient * np.sum(rows["motor"] ** 2, axis=1)
-        lift = fit_force(rows, thrust)[1] / vehicle.mass
-    if not 1.0 / FITS < lift < FITS:
+    if "motor" in rows and not 1.0 / FITS < _lift(rows, vehicle) < FITS:
         return []
     ratio = float(np.sqrt(range_[0] * range_[1]))
     text = (
@@ -289,9 +284,7 @@ def check_lift(rows: Rows, vehicle: Vehicle | None, doubtful: bool = False) -> l
     if vehicle is None:
         why = ": the vehicle file is in doubt" if doubtful else "; --vehicle makes it possible"
         return [Finding("note", "rotor speeds", f"not checked against the weight{why}")]
-    thrust = vehicle.rotors.thrust_coefficient * np.sum(rows["motor"] ** 2, axis=1)
-    lift = fit_force(rows, thrust)[1] / vehicle.mass
-    if not lift > 0.0:
+    if not (lift := _lift(rows, vehicle)) > 0.0:
         return []
     figures = f"by {vehicle.name!r} they lift {lift:.3g} times the weight"
     if 1.0 / FITS < lift < FITS:
@@ -300,6 +293,12 @@ def check_lift(rows: Rows, vehicle: Vehicle | None, doubtful: bool = False) -> l
         text = f"{figures}: an effect, which suite diagnose names, or a mass that is off"
         return [Finding("note", "rotor speeds", text, "thrust_scale", lift, 0.9)]
     return [_of_factor(rows, vehicle, float(np.sqrt(lift)), figures)]
+
+
+def _lift(rows: Rows, vehicle: Vehicle) -> float:
+    """Return the rotors' thrust by the vehicle file over the force that the path needs; 0: none."""
+    thrust = vehicle.rotors.thrust_coefficient * np.sum(rows["motor"] ** 2, axis=1)
+    return fit_force(rows, thrust)[1] / vehicle.mass
 
 
 def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Finding:
