@@ -209,7 +209,8 @@ def made(period_s, pull, moved, rng, noise=0.1):
     turn = 2.0 * np.pi * form.middle_s[:, None] / period_s + rng.uniform(0.0, 6.0, 3)
     left = pull * np.sin(turn) + noise * rng.standard_normal(turn.shape)
     measured = moved * np.sin(turn + 1.0) + left
-    rows: Any = SimpleNamespace(rot_w=np.broadcast_to(np.eye(3), (len(TIME_S), 3, 3)))
+    motion = SimpleNamespace(rot_w=np.broadcast_to(np.eye(3), (len(TIME_S), 3, 3)))
+    rows: Any = SimpleNamespace(motion=motion)
     return SmoothedFlight(rows, form, measured), left
 
 
