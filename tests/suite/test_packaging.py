@@ -93,7 +93,8 @@ def test_the_wheel_works_from_an_empty_folder(wheel, tmp_path):
         "raise SystemExit(main(['list']))\n"
     )
     command = [home / "bin" / "python", "-c", code]
-    done = subprocess.run(command, cwd=empty, capture_output=True, text=True)
+    env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(command, cwd=empty, capture_output=True, text=True, env=env)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(f"{VERSION} 0123abc\n") and "race-small" in done.stdout
     assert list(empty.iterdir()) == []

@@ -24,6 +24,7 @@ from policies.spec import ActionSpec, PolicySpec
 from suite.common.console import Console
 from suite.judging.checking import policy_findings
 from tests.support.courses import end_of, fly_on, straight
+from tests.support.judged_cells import cut_short
 from tests.support.pilots import Pursuit, Steady
 from tracks.geometry.camera import Camera
 
@@ -251,7 +252,9 @@ def test_short_flights_show_negated_axes_saturation_and_a_constant_memory(capsys
     assert not Watched(Steady()).hints()  # it has made no decision
 
 
-def test_from_python_the_doubts_of_suite_eval_are_warnings():
+def test_from_python_the_doubts_of_suite_eval_are_warnings(monkeypatch):
+    flown = cut_short(monkeypatch, 1.0)
+
     @dataclass
     class Own(Pursuit):
         factor: float = 1.0
@@ -280,3 +283,4 @@ def test_from_python_the_doubts_of_suite_eval_are_warnings():
         assert len(said) == len(expected), said
         assert all(text in line for text, line in zip(expected, said, strict=True)), said
         assert all(warning.filename == __file__ for warning in caught)
+    assert len(flown) == 5

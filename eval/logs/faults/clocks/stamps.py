@@ -146,7 +146,7 @@ def _even(time_s: np.ndarray, number: np.ndarray) -> np.ndarray:
     """Return times (T,) that grow evenly with the samples' `number` (T,), or wander slowly."""
     step_s, start_s = np.polyfit(number, time_s, 1)
     line_s = start_s + step_s * number
-    size = max(3, round(WANDER_S / step_s))
+    size = int(np.clip(round(WANDER_S / step_s), 3, len(number)))
     return line_s + uniform_filter1d(time_s - line_s, size, mode="nearest")
 
 
