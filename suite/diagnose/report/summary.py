@@ -45,8 +45,8 @@ USE = (
     "(--vehicle)."
 )
 USE_FOR_LOGS = (
-    "Give the new vehicle.toml, in --out, to suite diagnose and identify (--vehicle) with these "
-    "logs: they then allow for this error. The vehicle is right as far as these flights show."
+    "Give the new vehicle.toml, in --out, to suite diagnose (--vehicle) with logs that have this "
+    "error: it allows for it. The vehicle is right as far as these flights show."
 )
 HEADINGS = {
     False: {False: "Wrong or missing in the vehicle file:", True: "Wrong in the logs:"},

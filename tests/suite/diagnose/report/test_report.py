@@ -300,7 +300,7 @@ def test_flights_that_no_rollout_comes_near_do_not_agree():
 def test_errors_of_the_logs_alone_send_nobody_to_the_trainer():
     arm = {**DRAG, "name": "lever_arm", "alternatives": []}
     (first, last) = summary.next_steps(entries("named", [arm]))
-    assert "diagnose and identify" in first and "train" not in first and "no_gap" in last
+    assert "to suite diagnose" in first and "train" not in first and "no_gap" in last
     assert "eval, train" in summary.next_steps(entries("named", [arm, DRAG]))[0]
 
 
