@@ -4,14 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from eval.effects.interface import (
-    GRAVITY,
-    Array,
-    Effect,
-    Parameter,
-    Sample,
-    tilted_e3,
-)
+from eval.effects.interface import GRAVITY, Array, Effect, Parameter, Sample, tilted_e3
 from tracks.geometry.rotation import cross, exp_rot, to_world
 
 

@@ -91,11 +91,14 @@ def check_evenness(recording: Recording, fix: bool) -> Recording:
 
     Without `fix` the jitter is only reported.
     """
-    signals, findings = dict(recording.signals), []
+    signals, findings, tested = dict(recording.signals), [], set[str]()
     for name, (time_s, _) in recording.signals.items():
+        if name not in MEASURED or name in tested:
+            continue
         together = [n for n, s in signals.items() if np.array_equal(s.time_s, time_s)]
+        tested.update(together)
         values = {n: signals[n].value for n in together}
-        even_s = even_stamps(time_s, measured_in(values)) if name in MEASURED else None
+        even_s = even_stamps(time_s, measured_in(values))
         if even_s is None:
             continue
         todo = "" if fix else "leave --no-fix out: the import spaces them evenly"

@@ -32,6 +32,7 @@ class Evidence(ABC):
     """Whitened residuals (in units of independent noise), and how the parameters change them."""
 
     limits: Thresholds = THRESHOLDS
+    """Thresholds of all steps of the diagnosis."""
     misfit_is_noise: bool = False
     """Whether even the best model is wrong, so that its whole residual counts as noise."""
 

@@ -49,7 +49,9 @@ class Unknown(NamedTuple):
     start: float
     """Value from which the fit starts; a number that is not identifiable keeps it."""
     low: float
+    """Lower bound."""
     high: float
+    """Upper bound."""
     max_half_width: float
     """Largest half-width of the 95 % interval with which the number counts as identified."""
     step: float
