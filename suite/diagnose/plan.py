@@ -128,7 +128,9 @@ class Separation:
     """The names of two effects, advice for people, and flights that separate them or do not."""
 
     pair: tuple[str, str]
+    """Names of the two effects."""
     words: str
+    """Advice for people."""
     blurred: tuple[Trajectory, ...]
     """Flights on which either effect explains the data."""
     separating: tuple[Trajectory, ...]

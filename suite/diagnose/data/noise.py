@@ -50,6 +50,7 @@ class Linearisation(NamedTuple):
     offset: np.ndarray
     """(W, F) correction of each window's start numbers with which the residuals were computed."""
     windows: FlightWindows
+    """The windows."""
 
 
 class Noise(NamedTuple):

@@ -26,7 +26,9 @@ class Composite(NamedTuple):
     """Effects that are tested as one hypothesis: their names, and a description for people."""
 
     parts: tuple[str, ...]
+    """Names of the effects."""
     about: str
+    """Description for people."""
     carried: str | None = None
     """Name of the effect that only acts through the others (carried by them); None where each acts
     on its own."""

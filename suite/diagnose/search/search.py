@@ -34,6 +34,7 @@ class SearchTask(NamedTuple):
     """Inputs of a search that all its steps share."""
 
     among: Sequence[Candidate]
+    """The candidates."""
     say: Callable[[str], None]
     """Receives a line for people about each step."""
     seed: int
