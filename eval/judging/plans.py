@@ -3,7 +3,7 @@
 A plan is a trajectory that was computed with knowledge of the whole track, by a local search over
 B-splines with the differentiable quadrotor. The judge then flew it in MuJoCo with the vehicle
 `reference`. Its lap time is an upper bound of the shortest lap time. The planner is in commit
-c6d768a (`suite reproduce laps --trials 2`), and docs/archive/laps.md describes it.
+c6d768a (`suite reproduce laps --trials 2`), and docs/archive/measurements.md describes it.
 """
 
 from __future__ import annotations
