@@ -2,7 +2,8 @@
 
 Stamps of the arrival of messages jitter, while the signal was sampled evenly. A measured path is
 smooth in the times of its measurement. If it is smoother in even times than in those of the stamps,
-the stamps jitter. A sampling that is really uneven makes it less smooth.
+the stamps jitter. A sampling that is really uneven makes it less smooth. Messages may also arrive
+in bursts of a few; a sample is then compared with samples outside its burst.
 """
 
 from __future__ import annotations
@@ -32,6 +33,9 @@ BLOCKS, LEAST_BLOCKS = 8, 7
 """Number of parts of a flight, and in how many of them even times must be smoother."""
 WANDER_S = 1.0
 """Time over which the true sampling may wander against a constant rate [s]."""
+STRIDES = (1, 2, 3)
+"""Distances between compared samples. Within a burst, and at distances that are multiples of its
+length, samples seem to be even."""
 MOST_ROUGH = 0.9
 """Quantile of the roughness above which samples count as outliers."""
 MEASURED = ("pos", "quat", "vel", "rate")
@@ -120,7 +124,8 @@ def even_stamps(time_s: np.ndarray, signals: Sequence[np.ndarray]) -> np.ndarray
         even_s = _even(time_s, number)
         if jitter_s(time_s, even_s) < LEAST_S or np.min(np.diff(even_s)) <= 0.0:
             continue
-        share = min((_share(time_s, even_s, signal) for signal in signals), default=1.0)
+        shares = [_share(time_s, even_s, x, stride) for x in signals for stride in STRIDES]
+        share = min(shares, default=1.0)
         if share < least:
             best, least = even_s, share
     return best
@@ -146,17 +151,22 @@ def _even(time_s: np.ndarray, number: np.ndarray) -> np.ndarray:
     """Return times (T,) that grow evenly with the samples' `number` (T,), or wander slowly."""
     step_s, start_s = np.polyfit(number, time_s, 1)
     line_s = start_s + step_s * number
-    size = int(np.clip(round(WANDER_S / step_s), 3, len(number)))
-    return line_s + uniform_filter1d(time_s - line_s, size, mode="nearest")
+    size = int(np.clip(round(0.5 * WANDER_S / step_s), 3, len(number)))
+    wander_s = time_s - line_s
+    for _ in range(2):  # once leaves ripples of bursts
+        wander_s = uniform_filter1d(wander_s, size, mode="mirror")
+    return line_s + wander_s
 
 
-def _share(time_s: np.ndarray, even_s: np.ndarray, signal: np.ndarray) -> float:
+def _share(time_s: np.ndarray, even_s: np.ndarray, signal: np.ndarray, stride: int) -> float:
     """Return the squared roughness of `signal` (T, C) in even times, as a share of that as stamped.
 
-    It is 1 if even times are not smoother in nearly all parts of the flight.
+    Compared samples are `stride` samples apart. It is 1 if even times are not smoother in nearly
+    all parts of the flight.
     """
-    rough = np.stack([_roughness(at_s, signal) for at_s in (time_s, even_s)])
-    is_whole = even_s[4:] - even_s[:-4] < 8.0 * np.median(np.diff(even_s))
+    rough = np.stack([_roughness(at_s, signal, stride) for at_s in (time_s, even_s)])
+    reach = 4 * stride
+    is_whole = even_s[reach:] - even_s[:-reach] < 2.0 * reach * np.median(np.diff(even_s))
     usual = np.isfinite(rough).all(axis=0) & is_whole
     if usual.sum() < LEAST_ROWS // 2:
         return 1.0
@@ -168,13 +178,14 @@ def _share(time_s: np.ndarray, even_s: np.ndarray, signal: np.ndarray) -> float:
     return float(rough[1].sum() / max(rough[0].sum(), 1e-300))
 
 
-def _roughness(time_s: np.ndarray, signal: np.ndarray) -> np.ndarray:
-    """Return the squared distance (T - 4,) of each sample from the cubic through its neighbours.
+def _roughness(time_s: np.ndarray, signal: np.ndarray, stride: int) -> np.ndarray:
+    """Return the squared distance of each sample from the cubic through its neighbours.
 
-    It is divided by its expectation for white noise, which is larger where times are uneven.
+    Neighbours are `stride` samples apart, and the result is (T - 4 * stride,). It is divided by its
+    expectation for white noise, which is larger where times are uneven.
     """
-    window = np.lib.stride_tricks.sliding_window_view
-    at_s, value = window(time_s, 5), window(signal, 5, axis=0)
+    window, reach = np.lib.stride_tricks.sliding_window_view, 4 * stride + 1
+    at_s, value = window(time_s, reach)[:, ::stride], window(signal, reach, axis=0)[..., ::stride]
     others, predicted, gain = (0, 1, 3, 4), 0.0, 1.0
     with np.errstate(divide="ignore", invalid="ignore"):
         for j in others:

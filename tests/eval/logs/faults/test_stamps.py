@@ -35,6 +35,18 @@ def test_jitter_is_found_and_removed_but_for_its_mean(lost):
     assert late_s.mean() == pytest.approx((stamps - even_s).mean(), abs=1e-4)
 
 
+@pytest.mark.parametrize("burst", [2, 3, 4, 8])
+def test_bursts_of_messages_are_found_and_removed_but_for_their_mean(burst):
+    even_s, _, pos = flight()
+    place = np.arange(len(even_s))
+    last = np.minimum((place // burst + 1) * burst - 1, len(place) - 1)
+    stamps = even_s[last] + 1e-4 * (place % burst)
+    found = even_stamps(stamps, [pos])
+    assert found is not None
+    assert (found - even_s).std() < 0.03 * (stamps - even_s).std()
+    assert even_stamps(stamps, [path(stamps)]) is None, "sampled in bursts"
+
+
 def test_uneven_sampling_slow_flight_noise_and_exact_clocks_are_no_jitter():
     even_s, stamps, pos = flight()
     assert even_stamps(stamps, [path(stamps)]) is None, "sampled at its stamps"
