@@ -24,6 +24,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "body_frame": ("the body is forward-right-down", ROTATE),
     "position_axes": ("an axis of the position is inverted or swapped", TILT),
     "position_jump": ("the position jumps or stands still", "log again"),
+    "position_delay": ("the position is late, or is its set point", TILT),
     "position_unit": ("positions are in cm, mm or feet", TILT),
     "velocity_frame": ("the velocity is in other axes", TILT),
     "velocity_unit": ("the velocity is in another unit", TILT),

@@ -11,6 +11,7 @@ from eval.effects.interface import GRAVITY
 from eval.logs.columns import GROUPS
 from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.clocks.delay import check_clock
+from eval.logs.faults.clocks.path import check_position_delay
 from eval.logs.faults.clocks.stamps import check_pause, check_stamps, check_time, with_even_stamps
 from eval.logs.faults.drive.commands import (
     check_controller_rate,
@@ -74,8 +75,11 @@ CLOCK: tuple[Check, ...] = (lambda rows, _: check_time(rows), lambda rows, _: ch
 POSE: tuple[Check, ...] = (
     lambda rows, _: check_copy(rows),
     lambda rows, _: check_still(rows),
-    lambda rows, _: check_pose(rows),
+    lambda rows, _: _check_pose(rows),
     lambda rows, against: [] if "attitude" in against.found else check_clock_rate(rows),
+    lambda rows, against: (
+        [] if {"attitude", "position_delay"} & against.found else check_position_delay(rows)
+    ),
     lambda rows, against: [] if "attitude" in against.found else check_height(rows),
     lambda rows, _: check_gyro(rows),
     lambda rows, _: check_velocity(rows),
@@ -158,6 +162,18 @@ def run_checks(
             if finding.status in ("corrected", "doubt"):
                 against = replace(against, found=against.found | {finding.fault})
     return findings, readings, rows
+
+
+def _check_pose(rows: Rows) -> list[Finding]:
+    """Return the findings on attitude and position.
+
+    An attitude that fits the path at another time is right; the delay is then the only finding.
+    """
+    found = check_pose(rows)
+    if any(finding.fault == "attitude" for finding in found):
+        late = [finding for finding in check_position_delay(rows) if finding.is_open]
+        return late or found
+    return found
 
 
 def _without_doubted(rows: dict[str, np.ndarray], finding: Finding) -> dict[str, np.ndarray]:

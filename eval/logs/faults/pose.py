@@ -104,7 +104,7 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
     turned: dict[str, np.ndarray] = {}
     seen_as: dict[tuple[str, bool], Match] = {}
     gyro = smooth(time_s, rows["rate"], WIDTH_S)[::every] if "rate" in rows else None
-    path = _path(time_s, rows["pos"], every) if "pos" in rows else None
+    path = path_of(time_s, rows["pos"], every) if "pos" in rows else None
     rate = 0.0 if gyro is None else rms(gyro)
     found, level = [], 0.0
     for steps in _attitudes():
@@ -121,7 +121,7 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
         turns = None if seen is None else seen.misfit(seen.alike)
         forces: dict[tuple[str, float], tuple[float, float]] = {}
         if path is not None:
-            forces = _force_misfits(_axes_of(time_s, read, every), path)
+            forces = _force_misfits(axes_of(time_s, read, every), path)
         # A wrong frame is one mistake, of the attitude alone or of attitude and gyro.
         count = sum(step not in ("", "ned", "frd") for step in steps.split("+")) + bool(frames)
         axes = "x,y,z" if seen is None else seen.axes
@@ -268,14 +268,14 @@ def turns_of(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
     return rates
 
 
-def _axes_of(time_s: np.ndarray, quat: np.ndarray, every: int) -> np.ndarray:
+def axes_of(time_s: np.ndarray, quat: np.ndarray, every: int = 1) -> np.ndarray:
     """Return the averaged body axes in the world (N, 3, 3); `[:, :, k]` is body axis k."""
     columns = [rotate(quat, np.eye(3)[k]) for k in range(3)]
     flat = smooth(time_s, np.concatenate(columns, axis=1), WIDTH_S)[::every]
     return np.moveaxis(flat.reshape(-1, 3, 3), 1, 2)
 
 
-def _path(time_s: np.ndarray, pos: np.ndarray, every: int) -> tuple[np.ndarray, np.ndarray]:
+def path_of(time_s: np.ndarray, pos: np.ndarray, every: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Return the averaged velocity and acceleration (N, 3) of a position, at every n-th row."""
     vel = velocity_from_position(time_s, pos)
     acc = velocity_from_position(time_s, vel)

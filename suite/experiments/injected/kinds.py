@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -112,6 +113,14 @@ def _hold_commands(signals: Signals, _: Vehicle) -> Signals:
     update_s = np.floor(signals["time"] * 20.0 + 1e-6) / 20.0
     index = np.clip(np.round((update_s - signals["time"][0]) / step).astype(int), 0, None)
     return {**signals, **{n: signals[n][index] for n in ("cmd_rate", "throttle", "cmd_thrust")}}
+
+
+def _move_position(signals: Signals, _: Vehicle, late_s: float) -> Signals:
+    """Log position and velocity late by `late_s` [s], early if it is negative."""
+    count = round(late_s / float(np.median(np.diff(signals["time"]))))
+    moved = {n: np.roll(signals[n], count, axis=0) for n in ("pos", "vel") if n in signals}
+    kept = slice(max(count, 0), min(count, 0) or None)
+    return {name: value[kept] for name, value in {**signals, **moved}.items()}
 
 
 def _delay_pose(signals: Signals, _: Vehicle) -> Signals:
@@ -244,6 +253,12 @@ KINDS: dict[str, Kind] = {
     "quaternion world to body": Kind(("quaternion_direction",), ("quat=inverse",)),
     "attitude's pitch and odometry's roll inverted": Kind(
         ("attitude_sign",), ("quat=-pitch", "rate=-x,y,z"), race=True
+    ),
+    "position late by 150 ms": Kind(
+        ("position_delay",), change=partial(_move_position, late_s=0.15), needs=("pos", "quat")
+    ),
+    "set point 150 ms ahead as position": Kind(
+        ("position_delay",), change=partial(_move_position, late_s=-0.15), needs=("pos", "quat")
     ),
     "pose late by 60 ms": Kind(
         ("clock_offset",), change=_delay_pose, needs=("quat", "vel", "rate")

@@ -171,7 +171,7 @@ def late_against(
         scale = np.sum(wanted * tried) / max(float(np.sum(tried**2)), 1e-12)
         residual = np.sum((wanted - scale * tried) ** 2, axis=1)
         cost[:, k] = np.bincount(block, weights=residual, minlength=BLOCKS)
-    return _best_delay(trials, cost)
+    return best_delay(trials, cost)
 
 
 def _fits_later(
@@ -270,7 +270,7 @@ def delay_of(
     if abs(rest_of_drift) > LIKELY * drift_error:  # inside a block a drift would count as scatter
         first_drift, cost = rest_of_drift, costs(rest_of_drift)
         rest_of_drift, drift_error = _drift(trials, cost, duration)
-    if (best := _best_delay(trials, cost)) is None:
+    if (best := best_delay(trials, cost)) is None:
         return None
     return Late(*best, first_drift + rest_of_drift, drift_error, middle, duration, turned)
 
@@ -309,14 +309,14 @@ def _drift(trials: np.ndarray, cost: np.ndarray, duration_s: float) -> tuple[flo
     It is the difference of the delays of the two halves of the flight, whose middles are half the
     flight apart.
     """
-    first, last = (_best_delay(trials, part) for part in np.split(cost, 2))
+    first, last = (best_delay(trials, part) for part in np.split(cost, 2))
     if first is None or last is None:
         return 0.0, np.inf
     apart_s = 0.5 * duration_s
     return (last[0] - first[0]) / apart_s, float(np.hypot(first[1], last[1])) / apart_s
 
 
-def _best_delay(trials: np.ndarray, cost: np.ndarray) -> tuple[float, float] | None:
+def best_delay(trials: np.ndarray, cost: np.ndarray) -> tuple[float, float] | None:
     """Return the trial delay of the least `cost` (blocks, trials), and its error by jackknife."""
     total = cost.sum(axis=0)
     best, *without_block = (_lowest(trials, total - part) for part in (0.0, *cost))

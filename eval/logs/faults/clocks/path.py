@@ -1,0 +1,94 @@
+"""Check whether the position is late or early against the attitude.
+
+Acceleration minus gravity is thrust, so it points along body z, except for drag. The path is
+shifted by trial delays, and the least force across body z gives the delay. A late position comes
+from another clock or a slow link, an early one is a set point. The standard error comes from
+estimates that leave out one block of the flight at a time (jackknife).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eval.effects.interface import GRAVITY
+from eval.logs.faults.clocks.delay import BLOCKS, best_delay
+from eval.logs.faults.finding import Finding, unseen
+from eval.logs.faults.pose import BIAS, CALM_ACC, DRAG, GOOD, WIDTH_S, Rows, axes_of, path_of
+from eval.logs.faults.relation import interpolate, rms
+
+REACH_S, STEP_S = 0.5, 0.02
+"""Largest delay that is tried, in both directions, and the step between trials [s]."""
+LEAST_S, SURE = 0.05, 8.0
+"""Least delay that is a fault: in seconds, and in standard errors. In 37 real logs it is at most
+0.02 s where its error is that small."""
+SEEN_S = 0.2
+"""The delay is not identifiable where `SURE` standard errors exceed this [s]."""
+LEAST_ROWS, POINTS = 200, 2000
+"""Least rows, and about how many of them are compared."""
+FAST = 4.0
+"""Accelerations above this multiple of the median are outliers."""
+
+
+def check_position_delay(rows: Rows) -> list[Finding]:
+    """Return the finding on the delay of the position against the attitude; [] without both."""
+    if not {"pos", "quat"} <= rows.keys():
+        return []
+    axes, (vel, acc) = axes_of(rows["time"], rows["quat"]), path_of(rows["time"], rows["pos"])
+    found = delay_of_path(rows["time"], axes, vel, acc)
+    if found is None or found[1] * SURE > SEEN_S:
+        text = "the flight does not accelerate enough, or as the attitude says"
+        return unseen("position delay", text, "position_delay")
+    late_s, error_s = found
+    size = f"{1e3 * abs(late_s):.0f} ms (± {1e3 * error_s:.1f} ms)"
+    figures = f"it is {size} {'late' if late_s > 0.0 else 'early'} against the attitude"
+    if abs(late_s) < max(LEAST_S, SURE * error_s):
+        return [Finding("ok", "position delay", figures)]
+    fix = "stamp positions with the time of their measurement"
+    if late_s < 0.0:
+        figures, fix = f"{figures}, as a set point is", "give the measured position"
+    return [Finding("doubt", "position", figures, "position_delay", late_s, 0.95, fix)]
+
+
+def delay_of_path(
+    time_s: np.ndarray, axes: np.ndarray, vel_w: np.ndarray, acc_w: np.ndarray
+) -> tuple[float, float] | None:
+    """Return by how much the path is later than the attitude, and its standard error [s].
+
+    None: the flight is too short, hardly accelerates, or no delay up to `REACH_S` fits.
+
+    Args:
+        time_s: (T,) increasing times.
+        axes: (T, 3, 3) averaged body axes in the world; `[:, :, k]` is body axis k.
+        vel_w: (T, 3) averaged velocity of the path [m/s].
+        acc_w: (T, 3) averaged acceleration of the path [m/s^2].
+    """
+    size = np.linalg.norm(acc_w, axis=1)
+    known = np.isfinite(vel_w).all(axis=1) & np.isfinite(size)
+    if known.sum() < LEAST_ROWS:
+        return None
+    known &= size <= FAST * np.median(size[known]) + 1.0
+    edge_s = REACH_S + WIDTH_S
+    inside = (time_s > time_s[0] + edge_s) & (time_s < time_s[-1] - edge_s)
+    inside &= np.isfinite(axes).all(axis=(1, 2))
+    if min(known.sum(), inside.sum()) < LEAST_ROWS:
+        return None
+    every = max(1, int(inside.sum()) // POINTS)
+    at_s, body = time_s[inside][::every], axes[inside][::every]
+    level = rms(GRAVITY * (body[:, 2, :2] - body[:, 2, :2].mean(axis=0)))
+    if level < CALM_ACC:
+        return None
+    known_s, path = time_s[known], np.concatenate([vel_w, acc_w], axis=1)[known]
+    block = np.arange(len(at_s)) * BLOCKS // len(at_s)
+    trials = np.arange(-REACH_S, REACH_S + 0.5 * STEP_S, STEP_S)
+    cost = np.empty((BLOCKS, len(trials)))
+    for k, late_s in enumerate(trials):
+        vel, acc = np.split(interpolate(at_s + late_s, known_s, path), 2, axis=1)
+        force = acc + [0.0, 0.0, GRAVITY]
+        side, speed = (np.einsum("tij,ti->tj", body[:, :, :2], x) for x in (force, vel))
+        speed = speed - speed.mean(axis=0)
+        drag = np.sum(speed * side, axis=0) / np.maximum(np.sum(speed**2, axis=0), 1e-9)
+        side = side - np.clip(drag, -DRAG, 0.0) * speed
+        side = side - np.clip(side.mean(axis=0), -BIAS, BIAS)
+        cost[:, k] = np.bincount(block, np.sum(side**2, axis=1), BLOCKS)
+    misfit = float(np.sqrt(cost.sum(axis=0).min() / len(at_s))) / level
+    return best_delay(trials, cost) if misfit < GOOD else None
