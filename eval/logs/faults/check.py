@@ -96,7 +96,7 @@ DRIVE: tuple[Check, ...] = (
     lambda rows, _: check_throttle(rows),
     lambda rows, against: check_thrust_command(rows, against.vehicle),
     lambda rows, against: check_motor_map(rows, against.vehicle),
-    lambda rows, against: check_rate_command(rows, against.vehicle),
+    lambda rows, against: _check_rate_command(rows, against),
     lambda rows, _: check_accelerometer_bias(rows),
     lambda rows, _: check_barometer(rows),
 )
@@ -167,13 +167,22 @@ def run_checks(
 def _check_pose(rows: Rows) -> list[Finding]:
     """Return the findings on attitude and position.
 
-    An attitude that fits the path at another time is right; the delay is then the only finding.
+    An attitude that fits path or gyro at another time is right, and the delay the only finding.
     """
     found = check_pose(rows)
     if any(finding.fault == "attitude" for finding in found):
-        late = [finding for finding in check_position_delay(rows) if finding.is_open]
-        return late or found
+        if late := [finding for finding in check_position_delay(rows) if finding.is_open]:
+            return late
+        if any(finding.fault == "clock_offset" for finding in check_clock(rows)):
+            return []  # which a later check reports
     return found
+
+
+def _check_rate_command(rows: Rows, against: CheckContext) -> list[Finding]:
+    """Return the findings on rate commands; a delay only if no other signal is late."""
+    found = check_rate_command(rows, against.vehicle)
+    is_late = "clock_offset" in against.found
+    return [f for f in found if not is_late or f.fault != "command_delay"]
 
 
 def _without_doubted(rows: dict[str, np.ndarray], finding: Finding) -> dict[str, np.ndarray]:

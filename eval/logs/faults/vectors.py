@@ -13,6 +13,7 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import conjugate, rotate
 from eval.logs.faults.clocks.delay import CLEARLY, LATE_S, late_against
+from eval.logs.faults.clocks.path import check_position_delay
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows, turns_of
 from eval.logs.faults.reading import DEG, axes_matrix, option, read_as
@@ -232,27 +233,31 @@ def check_velocity(rows: Rows) -> list[Finding]:
             text = f"body and world axes are {100 * apart:.0f} % of it apart only"
             findings += unseen("velocity", text, "velocity_frame")
         findings += _unseen_axes(here, "velocity", "velocity_frame")
-        findings += _velocity_delay(time_s, path, smooth(time_s, rows["vel"], WIDTH_S))
+        findings += _velocity_delay(rows, path)
     unit = _unit(here, SPEEDS, "vel", "velocity", "velocity_unit", "the path's derivative", SLOW)
     return findings + [matched for matched in unit if matched.status != "ok"]
 
 
-def _velocity_delay(time_s: np.ndarray, path: np.ndarray, vel: np.ndarray) -> list[Finding]:
-    """Return the finding on the delay of the velocity against the path's derivative, [] if unclear.
+def _velocity_delay(rows: Rows, path: np.ndarray) -> list[Finding]:
+    """Return the finding on the delay of the velocity against the `path`'s derivative, if clear.
 
-    If the velocity is early, the position is late, which the velocity alone does not prove.
+    If the velocity is early, either the position is late, or the velocity is a set point. The
+    attitude decides.
     """
-    found = late_against(time_s, path, vel)
+    found = late_against(rows["time"], path, smooth(rows["time"], rows["vel"], WIDTH_S))
     if found is None or abs(found[0]) < max(LATE_S, CLEARLY * found[1]):
         return []
     late_s, error_s = found
-    figures = f"it is {1e3 * abs(late_s):.0f} ms (± {1e3 * error_s:.1f} ms) late against the "
+    size = f"it is {1e3 * abs(late_s):.0f} ms (± {1e3 * error_s:.1f} ms)"
     about = ("velocity_delay", late_s, 0.95, option(("vel", "drop")))
     if late_s > 0.0:
-        text = figures + "path's derivative (a filter, or its time stamp)"
+        text = f"{size} late against the path's derivative (a filter, or its time stamp)"
+        return [Finding("doubt", "velocity", text, *about)]
+    if any(finding.status == "ok" for finding in check_position_delay(rows)):
+        text = f"{size} early against the path's derivative, as a set point is"
         return [Finding("doubt", "velocity", text, *about)]
     about = ("velocity_delay", late_s, 0.8, "stamp positions with the time of their measurement")
-    return [Finding("doubt", "position", figures + "velocity", *about)]
+    return [Finding("doubt", "position", f"{size} late against the velocity", *about)]
 
 
 def check_accelerometer(rows: Rows, body_is_frd: bool = False) -> list[Finding]:

@@ -17,12 +17,15 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import rates_between, rotate
 from eval.logs.faults.finding import Finding, unseen
-from eval.logs.faults.pose import SPAN_S, WIDTH_S, Rows
+from eval.logs.faults.pose import SPAN_S, WIDTH_S, Rows, turns_of
 from eval.logs.faults.relation import interpolate, jackknife_error, smooth
 from eval.logs.velocity import velocity_from_position
 
 REACH_S, STEP_S = 0.1, 0.002
 """Largest delay that is tried, in both directions, and the step between trials [s]."""
+FAR_S, FAR_STEP_S, FAR_SHARE = 0.5, 0.02, 0.5
+"""Larger delays, up to the first one, are tried in coarse steps. One of them must lower the misfit
+of all small delays to this share: a periodic flight fits again after a period."""
 BLOCKS = 8
 """Number of blocks of the jackknife."""
 CALM = 0.2
@@ -153,17 +156,19 @@ def late_against(
 ) -> tuple[float, float] | None:
     """Return by how much `given` (T, C) is later than `wanted` (T, C), and its error [s].
 
-    Neither the scale nor a constant of `given` counts. None: not identifiable, or over `REACH_S`.
+    Neither the scale nor a constant of `given` counts. None: not identifiable, or over `FAR_S`.
     """
-    known = np.isfinite(given).all(axis=1)
-    inside = np.isfinite(wanted).all(axis=1)
-    inside &= (time_s > time_s[0] + REACH_S) & (time_s < time_s[-1] - REACH_S)
+    known, has_wanted = (np.isfinite(value).all(axis=1) for value in (given, wanted))
+    known_s, given = time_s[known], given[known]
+    far_s = _far_delay(time_s[has_wanted], wanted[has_wanted], known_s, given)
+    reach_s = REACH_S + abs(far_s)
+    inside = has_wanted & (time_s > time_s[0] + reach_s) & (time_s < time_s[-1] - reach_s)
     if min(known.sum(), inside.sum()) < 100:
         return None
-    time_s, known_s, given = time_s[inside], time_s[known], given[known]
+    time_s = time_s[inside]
     wanted = wanted[inside] - wanted[inside].mean(axis=0)
     block = np.arange(len(time_s)) * BLOCKS // len(time_s)
-    trials = np.arange(-REACH_S, REACH_S + 0.5 * STEP_S, STEP_S)
+    trials = far_s + np.arange(-REACH_S, REACH_S + 0.5 * STEP_S, STEP_S)
     cost = np.empty((BLOCKS, len(trials)))
     for k, late_s in enumerate(trials):
         tried = interpolate(time_s + late_s, known_s, given)
@@ -216,6 +221,47 @@ def delay_of(
     The result is None where the flight is too short or the body rates are too small, or where the
     best delay is the largest that is tried.
     """
+    turns = smooth(quat_time, turns_of(quat_time, quat), SPAN_S)
+    known = np.isfinite(turns).all(axis=1)
+    gyro = smooth(rate_time, rate, 2.0 * SPAN_S)
+    far_s = _far_delay(rate_time, gyro, quat_time[known], turns[known])
+    near = _near_delay(quat_time - far_s, quat, rate_time, rate)
+    if near is None:
+        return None
+    return near._replace(delay_s=near.delay_s + far_s, middle_s=near.middle_s + far_s)
+
+
+def _far_delay(
+    time_s: np.ndarray, wanted: np.ndarray, known_s: np.ndarray, given: np.ndarray
+) -> float:
+    """Return about the delay of `given` (N, C) against `wanted` (T, C) if `REACH_S` may not do.
+
+    It is 0 if the delay is smaller or unclear [s]. Neither scale nor outliers count.
+    """
+    if min(len(time_s), len(known_s)) < 100:
+        return 0.0
+    inside = (time_s > known_s[0] + FAR_S) & (time_s < known_s[-1] - FAR_S)
+    size = np.linalg.norm(wanted, axis=1)
+    inside &= size <= 4.0 * np.quantile(size, 0.9)
+    if inside.sum() < 100:
+        return 0.0
+    time_s, wanted = time_s[inside], wanted[inside] - wanted[inside].mean(axis=0)
+    trials = np.arange(-FAR_S, FAR_S + 0.5 * FAR_STEP_S, FAR_STEP_S)
+    unlike = np.ones(len(trials))
+    for k, late_s in enumerate(trials):
+        tried = interpolate(time_s + late_s, known_s, given)
+        tried = tried - tried.mean(axis=0)
+        norm = float(np.linalg.norm(wanted) * np.linalg.norm(tried))
+        unlike[k] = 1.0 - max(float(np.sum(wanted * tried)) / max(norm, 1e-12), 0.0) ** 2
+    best, is_small = int(np.argmin(unlike)), np.abs(trials) <= 0.5 * REACH_S
+    is_clear = unlike[best] < FAR_SHARE * unlike[is_small].min()
+    return float(trials[best]) if is_clear and abs(trials[best]) > 0.75 * REACH_S else 0.0
+
+
+def _near_delay(
+    quat_time: np.ndarray, quat: np.ndarray, rate_time: np.ndarray, rate: np.ndarray
+) -> Late | None:
+    """Return the delay of at most `REACH_S`; see `delay_of`."""
     step = float(np.median(np.diff(quat_time))) if len(quat_time) > 1 else np.inf
     count = max(1, round(SPAN_S / step)) if np.isfinite(step) else 0
     if count == 0 or len(quat_time) < 20 * count or len(rate_time) < 100:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.logs.faults.clocks.delay import BLOCKS, best_delay
+from eval.logs.faults.clocks.delay import BLOCKS, best_delay, delay_of
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import BIAS, CALM_ACC, DRAG, GOOD, WIDTH_S, Rows, axes_of, path_of
 from eval.logs.faults.relation import interpolate, rms
@@ -25,6 +25,10 @@ SEEN_S = 0.2
 """The delay is not identifiable where `SURE` standard errors exceed this [s]."""
 LEAST_ROWS, POINTS = 200, 2000
 """Least rows, and about how many of them are compared."""
+ALIKE = 0.3
+"""Largest difference of two delays that have one cause, as a share of the delay."""
+MEASURED = "give the measured signal"
+"""What to do if a signal is a set point."""
 FAST = 4.0
 """Accelerations above this multiple of the median are outliers."""
 
@@ -43,10 +47,21 @@ def check_position_delay(rows: Rows) -> list[Finding]:
     figures = f"it is {size} {'late' if late_s > 0.0 else 'early'} against the attitude"
     if abs(late_s) < max(LEAST_S, SURE * error_s):
         return [Finding("ok", "position delay", figures)]
+    if late_s > 0.0 and _is_early(rows, late_s):
+        text = f"it is {size} early against path and gyro, as a set point is"
+        return [Finding("doubt", "attitude", text, "attitude", late_s, 0.95, MEASURED)]
     fix = "stamp positions with the time of their measurement"
     if late_s < 0.0:
-        figures, fix = f"{figures}, as a set point is", "give the measured position"
+        figures, fix = f"{figures}, as a set point is", MEASURED
     return [Finding("doubt", "position", figures, "position_delay", late_s, 0.95, fix)]
+
+
+def _is_early(rows: Rows, late_s: float) -> bool:
+    """Return whether the attitude is early against the gyro by about `late_s` [s]."""
+    if "rate" not in rows:
+        return False
+    late = delay_of(rows["time"], rows["quat"], rows["time"], rows["rate"])
+    return late is not None and abs(late.delay_s + late_s) < ALIKE * late_s
 
 
 def delay_of_path(

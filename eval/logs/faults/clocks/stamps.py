@@ -33,6 +33,10 @@ BLOCKS, LEAST_BLOCKS = 8, 7
 """Number of parts of a flight, and in how many of them even times must be smoother."""
 WANDER_S = 1.0
 """Time over which the true sampling may wander against a constant rate [s]."""
+TICK, MOST_LOST = 0.1, 4.0
+"""Stamps are ticks of an even clock, of which some were lost, if their steps are multiples of the
+shortest step. The first is the tolerance, as a share of that step, the second the largest
+multiple."""
 STRIDES = (1, 2, 3)
 """Distances between compared samples. Within a burst, and at distances that are multiples of its
 length, samples seem to be even."""
@@ -117,7 +121,7 @@ def even_stamps(time_s: np.ndarray, signals: Sequence[np.ndarray]) -> np.ndarray
 
     None if the stamps do not jitter by `LEAST_S`, or no signal shows that the sampling is even.
     """
-    if len(time_s) < LEAST_ROWS:
+    if len(time_s) < LEAST_ROWS or _has_ticks(time_s):
         return None
     best, least = None, SMOOTHER
     for number in (np.arange(len(time_s)), _number_with_lost(time_s)):
@@ -129,6 +133,14 @@ def even_stamps(time_s: np.ndarray, signals: Sequence[np.ndarray]) -> np.ndarray
         if share < least:
             best, least = even_s, share
     return best
+
+
+def _has_ticks(time_s: np.ndarray) -> bool:
+    """Return whether the stamps are ticks of an even clock, of which many were lost."""
+    step_s = np.diff(time_s)
+    count = step_s / max(float(np.quantile(step_s, 0.05)), 1e-12)
+    is_tick = (np.abs(count - np.round(count)) < TICK) & (count < MOST_LOST + TICK)
+    return bool(is_tick.mean() > 0.9 and (count > 2.0 - TICK).mean() > 0.05)
 
 
 def _number_with_lost(time_s: np.ndarray) -> np.ndarray:

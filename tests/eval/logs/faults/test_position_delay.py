@@ -15,14 +15,16 @@ def log():
     return fly(PLAIN, 0, duration_s=8.0)
 
 
-def shifted(log, late_s):
-    """Return the log with the position (and the velocity from it) of `late_s` before."""
+def shifted(log, late_s, names=("pos_w", "vel_w")):
+    """Return the log with the signals `names` of `late_s` before."""
     time_s = log.time_s - late_s
-    pos, vel = (
-        np.stack([np.interp(time_s, log.time_s, column) for column in value.T], axis=1)
-        for value in (log.pos_w, log.vel_w)
-    )
-    return replace(log, pos_w=pos, vel_w=vel)
+    moved = {
+        name: np.stack([np.interp(time_s, log.time_s, x) for x in getattr(log, name).T], axis=1)
+        for name in names
+    }
+    if "quat_wxyz" in moved:
+        moved["quat_wxyz"] /= np.linalg.norm(moved["quat_wxyz"], axis=1, keepdims=True)
+    return replace(log, **moved)
 
 
 def findings(log):
@@ -35,8 +37,27 @@ def findings(log):
 def test_a_late_position_and_a_set_point_are_the_only_finding(log, late_s):
     (found,), _ = findings(shifted(log, late_s))
     assert found.fault == "position_delay" and found.size == pytest.approx(late_s, abs=0.005)
-    assert ("set point" in found.evidence) == (late_s < 0.0) == ("measured position" in found.fix)
-    assert ("late" in found.evidence) == (late_s > 0.0)
+    words = "early against the attitude, as a set point" if late_s < 0.0 else "late against the att"
+    assert words in found.evidence
+    assert found.fix.startswith("give the measured" if late_s < 0.0 else "stamp positions")
+
+
+@pytest.mark.parametrize(
+    ("names", "late_s", "fault", "evidence"),
+    [
+        (("vel_w",), -0.2, "velocity_delay", "as a set point is"),
+        (("vel_w",), 0.2, "velocity_delay", "late against the path"),
+        (("quat_wxyz",), -0.1, "attitude", "early against path and gyro, as a set point is"),
+        (("quat_wxyz",), -0.3, "attitude", "early against path and gyro, as a set point is"),
+        (("pos_w", "vel_w", "quat_wxyz"), 0.1, "clock_offset", "late against the gyro"),
+        (("pos_w", "vel_w", "quat_wxyz"), 0.3, "clock_offset", "late against the gyro"),
+        (("rate_b",), 0.2, "clock_offset", "late against the attitude"),
+    ],
+)
+def test_set_points_and_late_signals_are_the_only_finding(log, names, late_s, fault, evidence):
+    (found,), _ = findings(shifted(log, late_s, names))
+    assert found.fault == fault and evidence in found.evidence
+    assert abs(found.size) == pytest.approx(abs(late_s), abs=0.005)
 
 
 def test_a_position_in_time_and_wrong_axes_are_no_delay(log):

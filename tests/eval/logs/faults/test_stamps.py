@@ -62,6 +62,18 @@ def test_uneven_sampling_slow_flight_noise_and_exact_clocks_are_no_jitter():
     assert found is not None and np.std(found - even_s - wander_s) < 3e-4
 
 
+def test_ticks_of_a_clock_of_which_many_are_lost_are_no_jitter():
+    """Slower signals, interpolated to such rows, may seem to be smoother in even times."""
+    even_s, stamps, pos = flight()
+    kept = np.random.default_rng(2).uniform(size=len(even_s)) > 0.4
+    smoother = [path(STEP_S * np.arange(kept.sum()))]
+    assert even_stamps(even_s[kept], smoother) is None
+    assert even_stamps(stamps[kept], smoother) is not None
+    assert (
+        even_stamps(np.delete(stamps, [200, 900]), [np.delete(pos, [200, 900], axis=0)]) is not None
+    )
+
+
 def test_a_check_names_it_and_later_checks_get_even_times():
     even_s, stamps, pos = flight()
     times = []
