@@ -170,12 +170,12 @@ def _check_pose(rows: Rows) -> list[Finding]:
     An attitude that fits path or gyro at another time is right, and the delay the only finding.
     """
     found = check_pose(rows)
-    if any(finding.fault == "attitude" for finding in found):
-        if late := [finding for finding in check_position_delay(rows) if finding.is_open]:
-            return late
-        if any(finding.fault == "clock_offset" for finding in check_clock(rows)):
-            return []  # which a later check reports
-    return found
+    if not any(f.fault == "attitude" and f.status == "doubt" for f in found):
+        return found
+    if late := [finding for finding in check_position_delay(rows) if finding.is_open]:
+        return late
+    is_late = any(f.fault == "clock_offset" and f.is_open for f in check_clock(rows))
+    return [] if is_late else found  # a later check reports the clock
 
 
 def _check_rate_command(rows: Rows, against: CheckContext) -> list[Finding]:
