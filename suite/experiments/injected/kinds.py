@@ -144,10 +144,10 @@ def _speed_up_pose_clock(signals: Signals, _: Vehicle) -> Signals:
 
 
 def _jitter_stamps(signals: Signals, _: Vehicle) -> Signals:
-    """Stamp each row by the arrival of its message, up to 80 % of the time between rows late."""
+    """Stamp each row by the arrival of its message, late by up to 80 % of the time to the next."""
     time_s, rng = signals["time"], np.random.default_rng(0)
-    late_s = rng.uniform(0.0, 0.8, len(time_s)) * float(np.median(np.diff(time_s)))
-    return {**signals, "time": time_s + late_s}
+    step_s = np.diff(time_s, append=2.0 * time_s[-1] - time_s[-2])
+    return {**signals, "time": time_s + rng.uniform(0.0, 0.8, len(time_s)) * step_s}
 
 
 def _drop_barometer(signals: Signals, _: Vehicle) -> Signals:
