@@ -26,6 +26,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "position_jump": ("the position jumps or stands still", "log again"),
     "position_delay": ("the position is late, or is its set point", TILT),
     "position_unit": ("positions are in cm, mm or feet", TILT),
+    "heading": ("position and attitude differ in their heading", TILT),
     "velocity_frame": ("the velocity is in other axes", TILT),
     "velocity_unit": ("the velocity is in another unit", TILT),
     "velocity_delay": ("velocity or position is late against the other", TILT),

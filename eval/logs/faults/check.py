@@ -24,6 +24,7 @@ from eval.logs.faults.drive.commands import (
 from eval.logs.faults.drive.motor_map import check_motor_map
 from eval.logs.faults.drive.motors import check_inertia, check_lift, check_motors
 from eval.logs.faults.finding import Finding, findings_of
+from eval.logs.faults.heading import check_heading
 from eval.logs.faults.pose import Rows, check_pose
 from eval.logs.faults.position import check_clock_rate, check_height, check_jumps, jumps_of
 from eval.logs.faults.reading import Readings, read_rows, readings_in
@@ -80,6 +81,7 @@ POSE: tuple[Check, ...] = (
     lambda rows, against: (
         [] if {"attitude", "position_delay"} & against.found else check_position_delay(rows)
     ),
+    lambda rows, against: [] if {"attitude", "heading"} & against.found else check_heading(rows),
     lambda rows, against: [] if "attitude" in against.found else check_height(rows),
     lambda rows, _: check_gyro(rows),
     lambda rows, _: check_velocity(rows),
@@ -167,13 +169,14 @@ def run_checks(
 def _check_pose(rows: Rows) -> list[Finding]:
     """Return the findings on attitude and position.
 
-    An attitude that fits path or gyro at another time is right, and the delay the only finding.
+    An attitude that fits at another time, or with another heading, has no other fault.
     """
     found = check_pose(rows)
     if not any(f.fault == "attitude" and f.status == "doubt" for f in found):
         return found
-    if late := [finding for finding in check_position_delay(rows) if finding.is_open]:
-        return late
+    for check in (check_position_delay, check_heading):
+        if other := [finding for finding in check(rows) if finding.is_open]:
+            return other
     is_late = any(f.fault == "clock_offset" and f.is_open for f in check_clock(rows))
     return [] if is_late else found  # a later check reports the clock
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.frames import conjugate, rotate
+from eval.importers.frames import conjugate, multiply, rotate
 from eval.logs.faults.reading import parse_readings, read_rows
 from eval.vehicles.vehicle import MotorMap, Vehicle
 
@@ -113,6 +113,14 @@ def _hold_commands(signals: Signals, _: Vehicle) -> Signals:
     update_s = np.floor(signals["time"] * 20.0 + 1e-6) / 20.0
     index = np.clip(np.round((update_s - signals["time"][0]) / step).astype(int), 0, None)
     return {**signals, **{n: signals[n][index] for n in ("cmd_rate", "throttle", "cmd_thrust")}}
+
+
+def _turn_attitude(signals: Signals, _: Vehicle) -> Signals:
+    """Log an attitude whose heading is off by 15 deg."""
+    half = np.radians(7.5)
+    turn = np.array([np.cos(half), 0.0, 0.0, np.sin(half)])
+    quat = signals["quat"]
+    return {**signals, "quat": multiply(np.broadcast_to(turn, quat.shape), quat)}
 
 
 def _move_position(signals: Signals, _: Vehicle, late_s: float) -> Signals:
@@ -254,6 +262,7 @@ KINDS: dict[str, Kind] = {
     "attitude's pitch and odometry's roll inverted": Kind(
         ("attitude_sign",), ("quat=-pitch", "rate=-x,y,z"), race=True
     ),
+    "compass off by 15 deg": Kind(("heading",), change=_turn_attitude, needs=("pos", "quat")),
     "position late by 150 ms": Kind(
         ("position_delay",), change=partial(_move_position, late_s=0.15), needs=("pos", "quat")
     ),

@@ -1,11 +1,13 @@
-"""The delay of a position against the attitude."""
+"""Delay and heading of a position against the attitude."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from eval.logs.faults.check import CheckContext, check_log
+from eval.logs.faults.heading import check_heading
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN
 
@@ -76,3 +78,21 @@ def test_without_acceleration_the_delay_is_not_identifiable(log):
         quat_wxyz=np.tile([1.0, 0.0, 0.0, 0.0], (len(log.time_s), 1)),
     )
     assert all(f.status == "not identifiable" for f in findings(still)[1])
+
+
+@pytest.mark.parametrize("turn_deg", [-8.0, 20.0, 45.0])
+def test_another_heading_of_the_path_is_the_only_finding(log, turn_deg):
+    turn = Rotation.from_euler("z", turn_deg, degrees=True)
+    turned = replace(log, pos_w=turn.apply(log.pos_w), vel_w=turn.apply(log.vel_w))
+    (found,), _ = findings(turned)
+    assert found.fault == "heading" and found.size == pytest.approx(turn_deg, abs=2.0)
+    assert f"turned by {found.size:+.0f} deg" in found.evidence
+
+
+def test_a_small_heading_and_a_calm_flight_are_no_finding(log):
+    turn = Rotation.from_euler("z", 3.0, degrees=True)
+    found, _ = check_log(replace(log, pos_w=turn.apply(log.pos_w), vel_w=turn.apply(log.vel_w)))
+    assert [f.status for f in found if f.signal == "heading"] == ["ok"]
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (len(log.time_s), 1))
+    (unseen,) = check_heading({"time": log.time_s, "pos": 0.0 * log.pos_w, "quat": level})
+    assert unseen.status == "not identifiable"

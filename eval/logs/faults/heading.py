@@ -1,0 +1,99 @@
+"""Check whether position and attitude have the same heading.
+
+Acceleration minus gravity is thrust, so it points along body z. Across body z, in axes j = x, y,
+this gives a linear equation in the path's acceleration a and velocity v:
+
+    -g . b_j = cos(h) a . b_j + sin(h) (e_z x a) . b_j + drag_j v . b_j + constant_j
+
+h is the angle by which the path must be turned about the vertical. Its standard error comes from
+estimates that leave out one block of the flight at a time (jackknife).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eval.effects.interface import GRAVITY
+from eval.logs.faults.clocks.delay import BLOCKS
+from eval.logs.faults.finding import Finding, unseen
+from eval.logs.faults.pose import CALM_ACC, GOOD, Rows, axes_of, path_of
+from eval.logs.faults.relation import jackknife_error, rms
+
+LEAST_DEG, SURE = 5.0, 4.0
+"""Least angle that is a fault: in degrees, and in standard errors. In 22 real logs with an attitude
+it is at most 4 deg and 3 standard errors."""
+SEEN_DEG = 15.0
+"""The angle is not identifiable where `SURE` standard errors exceed this [deg]."""
+LEAST_ROWS = 200
+"""Least rows for the fit."""
+FAST = 4.0
+"""Accelerations above this multiple of the median are outliers."""
+
+
+def check_heading(rows: Rows) -> list[Finding]:
+    """Return the finding on the heading of the path against the attitude; [] without both."""
+    if not {"pos", "quat"} <= rows.keys():
+        return []
+    found = heading_of_path(
+        axes_of(rows["time"], rows["quat"]), *path_of(rows["time"], rows["pos"])
+    )
+    if found is None or SURE * found[1] > SEEN_DEG:
+        text = "the flight accelerates too little to compare its directions with the attitude"
+        return unseen("heading", text, "heading")
+    turn, error = found
+    figures = f"its path is turned by {-turn:+.0f} deg (± {error:.1f} deg) against the attitude"
+    if abs(turn) < max(LEAST_DEG, SURE * error):
+        return [Finding("ok", "heading", figures)]
+    fix = "align the world axes of position and attitude (declination, or axes of a motion capture)"
+    return [Finding("doubt", "position", figures, "heading", -turn, 0.95, fix)]
+
+
+def heading_of_path(
+    axes: np.ndarray, vel_w: np.ndarray, acc_w: np.ndarray
+) -> tuple[float, float] | None:
+    """Return the angle by which the path must be turned about the vertical, and its error [deg].
+
+    None: the flight is too short, hardly accelerates, or no angle fits.
+
+    Args:
+        axes: (T, 3, 3) averaged body axes in the world; `[:, :, k]` is body axis k.
+        vel_w: (T, 3) averaged velocity of the path [m/s].
+        acc_w: (T, 3) averaged acceleration of the path [m/s^2].
+    """
+    known = np.isfinite(np.concatenate([vel_w, acc_w, axes[:, 2]], axis=1)).all(axis=1)
+    if known.sum() < LEAST_ROWS:
+        return None
+    size = np.linalg.norm(acc_w, axis=1)
+    known &= size <= FAST * np.median(size[known]) + 1.0
+    across, vel, acc = axes[known][:, :, :2], vel_w[known], acc_w[known]
+    tilt = -GRAVITY * across[:, 2]
+    level = rms(tilt - tilt.mean(axis=0))
+    if known.sum() < LEAST_ROWS or level < CALM_ACC:
+        return None
+
+    def in_body(vectors: np.ndarray) -> np.ndarray:
+        return np.einsum("tij,ti->tj", across, vectors)
+
+    turned = np.stack([-acc[:, 1], acc[:, 0], np.zeros(len(acc))], axis=1)
+    columns = np.zeros((len(acc), 2, 6))
+    columns[:, :, 0], columns[:, :, 1] = in_body(acc), in_body(turned)
+    for axis, drag in enumerate(in_body(vel).T):
+        columns[:, axis, 2 + axis], columns[:, axis, 4 + axis] = drag, 1.0
+    block = np.arange(len(acc)) * BLOCKS // len(acc)
+    parts = [(columns[block == k].reshape(-1, 6), tilt[block == k].ravel()) for k in range(BLOCKS)]
+    hessians = np.stack([x.T @ x for x, _ in parts])
+    slopes = np.stack([x.T @ y for x, y in parts])
+
+    def solution(hessian: np.ndarray, slope: np.ndarray) -> np.ndarray:
+        return np.linalg.lstsq(hessian, slope, rcond=None)[0]
+
+    def angle(values: np.ndarray) -> float:
+        return float(np.degrees(np.arctan2(values[1], values[0])))
+
+    total, slope = hessians.sum(axis=0), slopes.sum(axis=0)
+    best = solution(total, slope)
+    if rms(tilt - columns @ best) > GOOD * level:
+        return None
+    without = [angle(solution(total - h, slope - s)) for h, s in zip(hessians, slopes, strict=True)]
+    apart = (np.array(without) - angle(best) + 180.0) % 360.0 - 180.0
+    return angle(best), jackknife_error(apart)
