@@ -20,8 +20,8 @@ from eval.logs.faults.pose import CALM_ACC, GOOD, Rows, axes_of, path_of
 from eval.logs.faults.relation import jackknife_error, rms
 
 LEAST_DEG, SURE = 5.0, 4.0
-"""Least angle that is a fault: in degrees, and in standard errors. In 22 real logs with an attitude
-it is at most 4 deg and 3 standard errors."""
+"""Least angle that is a fault: in degrees, and in standard errors. In 19 real logs it is at most
+4 deg, and at most 4 standard errors where it exceeds 2 deg."""
 SEEN_DEG = 15.0
 """The angle is not identifiable where `SURE` standard errors exceed this [deg]."""
 LEAST_ROWS = 200
