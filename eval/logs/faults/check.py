@@ -23,6 +23,7 @@ from eval.logs.faults.drive.commands import (
 )
 from eval.logs.faults.drive.motor_map import check_motor_map
 from eval.logs.faults.drive.motors import check_inertia, check_lift, check_motors
+from eval.logs.faults.drive.telemetry import check_telemetry
 from eval.logs.faults.finding import Finding, findings_of
 from eval.logs.faults.heading import check_heading
 from eval.logs.faults.pose import Rows, check_pose
@@ -34,6 +35,7 @@ from eval.logs.faults.sensors import (
     check_barometer,
     check_copy,
     check_still,
+    check_velocity_mean,
     check_voltage,
 )
 from eval.logs.faults.vectors import check_accelerometer, check_gyro, check_velocity
@@ -85,6 +87,7 @@ POSE: tuple[Check, ...] = (
     lambda rows, against: [] if "attitude" in against.found else check_height(rows),
     lambda rows, _: check_gyro(rows),
     lambda rows, _: check_velocity(rows),
+    lambda rows, _: check_velocity_mean(rows),
     lambda rows, against: check_accelerometer(rows, "body_frame" in against.found),
 )
 """Position, attitude, rates, velocity and acceleration; each check relies on those before it."""
@@ -92,6 +95,7 @@ DRIVE: tuple[Check, ...] = (
     lambda rows, against: check_voltage(rows, against.vehicle),
     lambda rows, against: check_gyro_signs(rows, against.vehicle),
     lambda rows, against: check_gyro_scale(rows, against.vehicle),
+    lambda rows, _: check_telemetry(rows),
     lambda rows, against: check_motors(rows, against.vehicle),
     lambda rows, against: check_lift(rows, against.vehicle, against.implausible),
     lambda rows, against: check_inertia(rows, against.vehicle),

@@ -32,6 +32,8 @@ LOST_S, LOST_HOLDS, LOST_RATE = 0.2, 5.0, 0.3
 turns faster [rad/s]."""
 LOST_SHARE = 0.1
 """Share of lost rows above which the signal is doubtful."""
+MEAN_SPEED = 0.4
+"""Least median difference between the velocity and the path's that is a fault [m/s]."""
 COPIED = 0.95
 """Share of rows in which the gyro equals the rate command, above which it is no measurement."""
 COARSE = 4.0
@@ -169,6 +171,23 @@ def check_still(rows: Rows) -> list[Finding]:
             fix += "" if is_lost[1:].all() else " or suite import, which leaves this part out"
             findings.append(Finding("doubt", subject, text, fault, share, 0.95, fix))
     return findings
+
+
+def check_velocity_mean(rows: Rows) -> list[Finding]:
+    """Return the doubt on a velocity whose mean differs from that of the path; [] for none."""
+    if not {"pos", "vel"} <= rows.keys():
+        return []
+    apart = rows["vel"] - velocity_from_position(rows["time"], rows["pos"])
+    apart = apart[np.isfinite(apart).all(axis=1)]
+    mean = np.median(apart, axis=0) if len(apart) else np.zeros(3)
+    size = float(np.linalg.norm(mean))
+    if size < MEAN_SPEED:
+        return []
+    values = ", ".join(f"{value:+.2g}" for value in mean)
+    text = f"it differs from the path's by ({values}) m/s on average: an air speed, or an offset"
+    return [
+        Finding("doubt", "velocity", text, "velocity_mean", size, 0.95, option(("vel", "drop")))
+    ]
 
 
 def check_copy(rows: Mapping[str, np.ndarray]) -> list[Finding]:

@@ -18,7 +18,8 @@ import numpy as np
 from eval.importers.formats.betaflight import DSHOT
 from eval.importers.frames import QUAT_HALF_TURN
 from eval.importers.options import ImportOptions
-from suite.experiments.injected.kinds import DEG, RPM, Signals
+from suite.experiments.injected.changes import Signals
+from suite.experiments.injected.kinds import DEG, RPM
 
 FLIP = np.array([1.0, -1.0, -1.0])
 """Factors of a half turn about x. It converts the suite's world axes to north-east-down (PX4), and
