@@ -80,10 +80,8 @@ POSE: tuple[Check, ...] = (
     lambda rows, _: check_still(rows),
     lambda rows, _: _check_pose(rows),
     lambda rows, against: [] if "attitude" in against.found else check_clock_rate(rows),
-    lambda rows, against: (
-        [] if {"attitude", "position_delay"} & against.found else check_position_delay(rows)
-    ),
-    lambda rows, against: [] if {"attitude", "heading"} & against.found else check_heading(rows),
+    lambda rows, against: [] if "attitude" in against.found else check_position_delay(rows),
+    lambda rows, against: [] if "attitude" in against.found else check_heading(rows),
     lambda rows, against: [] if "attitude" in against.found else check_height(rows),
     lambda rows, _: check_gyro(rows),
     lambda rows, _: check_velocity(rows),

@@ -16,7 +16,7 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.logs.faults.clocks.delay import BLOCKS
 from eval.logs.faults.finding import Finding, unseen
-from eval.logs.faults.pose import CALM_ACC, GOOD, Rows, axes_of, path_of
+from eval.logs.faults.pose import CALM_ACC, GOOD, Rows, axes_of, is_usual, path_of
 from eval.logs.faults.relation import jackknife_error, rms
 
 LEAST_DEG, SURE = 5.0, 4.0
@@ -26,8 +26,6 @@ SEEN_DEG = 15.0
 """The angle is not identifiable where `SURE` standard errors exceed this [deg]."""
 LEAST_ROWS = 200
 """Least rows for the fit."""
-FAST = 4.0
-"""Accelerations above this multiple of the median are outliers."""
 
 
 def check_heading(rows: Rows) -> list[Finding]:
@@ -60,15 +58,15 @@ def heading_of_path(
         vel_w: (T, 3) averaged velocity of the path [m/s].
         acc_w: (T, 3) averaged acceleration of the path [m/s^2].
     """
-    known = np.isfinite(np.concatenate([vel_w, acc_w, axes[:, 2]], axis=1)).all(axis=1)
-    if known.sum() < LEAST_ROWS:
+    is_known = np.isfinite(np.concatenate([vel_w, acc_w, axes[:, 2]], axis=1)).all(axis=1)
+    if is_known.sum() < LEAST_ROWS:
         return None
-    size = np.linalg.norm(acc_w, axis=1)
-    known &= size <= FAST * np.median(size[known]) + 1.0
+    known = np.flatnonzero(is_known)
+    known = known[is_usual(np.linalg.norm(acc_w[known], axis=1))]
     across, vel, acc = axes[known][:, :, :2], vel_w[known], acc_w[known]
     tilt = -GRAVITY * across[:, 2]
     level = rms(tilt - tilt.mean(axis=0))
-    if known.sum() < LEAST_ROWS or level < CALM_ACC:
+    if len(known) < LEAST_ROWS or level < CALM_ACC:
         return None
 
     def in_body(vectors: np.ndarray) -> np.ndarray:

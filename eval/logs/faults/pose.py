@@ -36,6 +36,8 @@ RIGHT = 0.25
 """Misfit of the given reading below which no other reading is tried."""
 EACH = 0.06
 """Penalty on the misfit for each step of a reading, so that the simplest good one is chosen."""
+FAST = 4.0
+"""Accelerations that exceed this multiple of the median by 1 m/s^2 are outliers."""
 DRAG, BIAS = 1.2, 1.0
 """Largest drag [1/s] and constant side force [m/s^2] that are removed from a measured force."""
 # Steps of a reading of the attitude (see `reading`), "" for none: direction, frames.
@@ -282,6 +284,11 @@ def path_of(time_s: np.ndarray, pos: np.ndarray, every: int = 1) -> tuple[np.nda
     return smooth(time_s, vel, WIDTH_S)[::every], smooth(time_s, acc, WIDTH_S)[::every]
 
 
+def is_usual(acc_size: np.ndarray) -> np.ndarray:
+    """Return which sizes (N,) of accelerations [m/s^2] are no outliers."""
+    return np.asarray(acc_size <= FAST * np.median(acc_size) + 1.0)
+
+
 def _force_misfits(
     axes: np.ndarray, path: tuple[np.ndarray, np.ndarray]
 ) -> dict[tuple[str, float], tuple[float, float]]:
@@ -298,7 +305,7 @@ def _force_misfits(
     changes = np.stack([axes_matrix(pos or "x,y,z") for pos in POSITIONS])
     acc_size, found = np.linalg.norm(path[1][good], axis=1), {}
     for length in LENGTHS:
-        usual = length * acc_size <= 4.0 * length * np.median(acc_size) + 1.0
+        usual = is_usual(length * acc_size)
         body = np.moveaxis(axes[good][usual], 0, -1)  # (3, 3, N), rows are contiguous
         vel, acc = (length * np.ascontiguousarray(x[good][usual].T) for x in path)
         # Of each reading: (components, readings, N).

@@ -79,19 +79,12 @@ def turn_attitude(signals: Signals, _: Vehicle) -> Signals:
     return {**signals, "quat": multiply(np.broadcast_to(turn, quat.shape), quat)}
 
 
-def move_position(signals: Signals, _: Vehicle, late_s: float) -> Signals:
-    """Log position and velocity late by `late_s` [s], early if it is negative."""
+def shift(signals: Signals, _: Vehicle, late_s: float, names: tuple[str, ...]) -> Signals:
+    """Log the signals `names` late by `late_s` [s], early if it is negative."""
     count = round(late_s / float(np.median(np.diff(signals["time"]))))
-    moved = {n: np.roll(signals[n], count, axis=0) for n in ("pos", "vel") if n in signals}
+    moved = {n: np.roll(signals[n], count, axis=0) for n in names if n in signals}
     kept = slice(max(count, 0), min(count, 0) or None)
     return {name: value[kept] for name, value in {**signals, **moved}.items()}
-
-
-def delay_pose(signals: Signals, _: Vehicle) -> Signals:
-    """Log position, velocity and attitude 60 ms late; the last rows of the flight are lost."""
-    count = round(0.06 / float(np.median(np.diff(signals["time"]))))
-    others = {n: v[count:] for n, v in signals.items() if n not in ("pos", "vel", "quat")}
-    return {**others, **{n: signals[n][:-count] for n in ("pos", "vel", "quat")}}
 
 
 def speed_up_pose_clock(signals: Signals, _: Vehicle) -> Signals:

@@ -20,7 +20,6 @@ from suite.experiments.injected.changes import (
     Signals,
     add_throttle_bias,
     arms_in_mm,
-    delay_pose,
     drained,
     drop_barometer,
     drop_rotor_speeds,
@@ -30,9 +29,9 @@ from suite.experiments.injected.changes import (
     linear_stick_map,
     log_commands_early,
     map_of,
-    move_position,
     other_curve,
     remove_gravity,
+    shift,
     speed_up_pose_clock,
     turn_attitude,
     unlinearised,
@@ -148,15 +147,19 @@ KINDS: dict[str, Kind] = {
     "compass off by 15 deg": Kind(("heading",), change=turn_attitude, needs=("pos", "quat")),
     "position late by 150 ms": Kind(
         ("position_delay",),
-        change=partial(move_position, late_s=0.15),
+        change=partial(shift, late_s=0.15, names=("pos", "vel")),
         needs=("pos", "quat"),
     ),
     "set point 150 ms ahead as position": Kind(
         ("position_delay",),
-        change=partial(move_position, late_s=-0.15),
+        change=partial(shift, late_s=-0.15, names=("pos", "vel")),
         needs=("pos", "quat"),
     ),
-    "pose late by 60 ms": Kind(("clock_offset",), change=delay_pose, needs=("quat", "vel", "rate")),
+    "pose late by 60 ms": Kind(
+        ("clock_offset",),
+        change=partial(shift, late_s=0.06, names=("pos", "vel", "quat")),
+        needs=("quat", "vel", "rate"),
+    ),
     "pose's clock off by 0.5 %": Kind(
         ("clock_drift",), change=speed_up_pose_clock, needs=("quat", "rate")
     ),

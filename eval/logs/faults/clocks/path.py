@@ -13,7 +13,17 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.logs.faults.clocks.delay import BLOCKS, best_delay, delay_of
 from eval.logs.faults.finding import Finding, unseen
-from eval.logs.faults.pose import BIAS, CALM_ACC, DRAG, GOOD, WIDTH_S, Rows, axes_of, path_of
+from eval.logs.faults.pose import (
+    BIAS,
+    CALM_ACC,
+    DRAG,
+    GOOD,
+    WIDTH_S,
+    Rows,
+    axes_of,
+    is_usual,
+    path_of,
+)
 from eval.logs.faults.relation import interpolate, rms
 
 REACH_S, STEP_S = 0.5, 0.02
@@ -29,8 +39,6 @@ ALIKE = 0.3
 """Largest difference of two delays that have one cause, as a share of the delay."""
 MEASURED = "give the measured signal"
 """What to do if a signal is a set point."""
-FAST = 4.0
-"""Accelerations above this multiple of the median are outliers."""
 
 
 def check_position_delay(rows: Rows) -> list[Finding]:
@@ -77,15 +85,15 @@ def delay_of_path(
         vel_w: (T, 3) averaged velocity of the path [m/s].
         acc_w: (T, 3) averaged acceleration of the path [m/s^2].
     """
-    size = np.linalg.norm(acc_w, axis=1)
-    known = np.isfinite(vel_w).all(axis=1) & np.isfinite(size)
-    if known.sum() < LEAST_ROWS:
+    is_known = np.isfinite(vel_w).all(axis=1) & np.isfinite(acc_w).all(axis=1)
+    if is_known.sum() < LEAST_ROWS:
         return None
-    known &= size <= FAST * np.median(size[known]) + 1.0
+    known = np.flatnonzero(is_known)
+    known = known[is_usual(np.linalg.norm(acc_w[known], axis=1))]
     edge_s = REACH_S + WIDTH_S
     inside = (time_s > time_s[0] + edge_s) & (time_s < time_s[-1] - edge_s)
     inside &= np.isfinite(axes).all(axis=(1, 2))
-    if min(known.sum(), inside.sum()) < LEAST_ROWS:
+    if min(len(known), inside.sum()) < LEAST_ROWS:
         return None
     every = max(1, int(inside.sum()) // POINTS)
     at_s, body = time_s[inside][::every], axes[inside][::every]

@@ -40,8 +40,9 @@ def check_telemetry(rows: Rows) -> list[Finding]:
         text = f"motors {', '.join(still)} of 4 never change"
         return [_finding(text, float(len(still)), "the columns of the motors in --map")]
     stops = (speed[1:-1] == 0.0) & (speed[:-2] != 0.0) & (speed[2:] != 0.0)
-    share = float(stops.any(axis=1).mean())
-    if share > DROPPED and stops.any(axis=1).sum() >= LEAST_DROPPED:
+    has_stop = stops.any(axis=1)
+    share = float(has_stop.mean())
+    if share > DROPPED and has_stop.sum() >= LEAST_DROPPED:
         text = f"{100 * share:.1f} % of the rows have a rotor that stands still for one row"
         return [_finding(text, share, "leave dropouts of the telemetry empty, not 0")]
     repeats = float((speed[1:] == speed[:-1]).all(axis=1).mean())
