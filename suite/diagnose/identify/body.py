@@ -29,6 +29,7 @@ from suite.diagnose.identify.fit import (
     Rows,
     Unknown,
     fit,
+    rms_of,
     unexplained,
 )
 from suite.diagnose.identify.grid import (
@@ -99,7 +100,8 @@ def fit_force(
 
     held = _without_motion(windows)
     held = [unknown.name for unknown in unknowns if unknown.name in held]
-    return fit(residuals, unknowns, held, fixed=fixed)
+    fitted = fit(residuals, unknowns, held, fixed=fixed)
+    return replace(fitted, measured_rms=_measured_rms(windows))
 
 
 class Windows(NamedTuple):
@@ -130,6 +132,11 @@ class Windows(NamedTuple):
     def means(self, values: np.ndarray) -> np.ndarray:
         """Return the means (M, 3, K) of `values`, (G, 3) or (G, 3 K), over the windows."""
         return np.reshape(self.form.mean @ values, (len(self.form.middle_s), 3, -1))
+
+
+def _measured_rms(flights: Sequence[Windows]) -> np.ndarray:
+    """Return the root mean square (C,) of the measured means, as `fit` computes it of residuals."""
+    return rms_of([one.residuals(np.zeros((one.form.mean.shape[1], 3))) for one in flights])
 
 
 def _force_windows(flight: FlightGrid, drive: str) -> Windows:
@@ -277,7 +284,7 @@ def fit_torque(
             if u.name in correction and fitted.identifies(u.name) and not u.low < value < u.high
         ]
         if not at_limit:
-            return fitted
+            return replace(fitted, measured_rms=_measured_rms(windows))
         held += at_limit
 
 

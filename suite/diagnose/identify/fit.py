@@ -104,6 +104,8 @@ class Fitted:
     """Names of numbers that these flights do not identify; they keep their start."""
     residual_rms: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """(C,) root mean square of the residual in each channel."""
+    measured_rms: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """(C,) the same of what was measured, as if the model were zero."""
     known: tuple[str, ...] = ()
     """Names of numbers that an earlier fit has identified."""
 
@@ -266,9 +268,20 @@ def fit(
         worst = free[int(np.argmax(ratio))]
         not_identified.append(unknowns[worst].name)
         at.theta[worst] = unknowns[worst].start
-    misfit = np.concatenate([_without_median(row) for row in evidence.rows(at.theta)])
-    rms = np.sqrt(np.ma.mean(np.ma.masked_invalid(misfit**2), axis=0).filled(0.0))
-    return Fitted(evidence.unknowns, at.theta, covariance, tuple(not_identified), rms, known.names)
+    return Fitted(
+        evidence.unknowns,
+        at.theta,
+        covariance,
+        tuple(not_identified),
+        residual_rms=rms_of(evidence.rows(at.theta)),
+        known=known.names,
+    )
+
+
+def rms_of(flights: Sequence[Rows]) -> np.ndarray:
+    """Return the root mean square (C,) of residuals, less the median where a constant is free."""
+    misfit = np.concatenate([_without_median(row) for row in flights])
+    return np.sqrt(np.ma.mean(np.ma.masked_invalid(misfit**2), axis=0).filled(0.0))
 
 
 def _without_median(rows: Rows) -> np.ndarray:

@@ -40,7 +40,13 @@ from suite.diagnose.identify.fit import NONE_KNOWN, Fitted, NoWholeWindow, Unkno
 from suite.diagnose.identify.flapping import flapping_of, perturbed_vehicles
 from suite.diagnose.identify.grid import FlightGrid, grid_of
 from suite.diagnose.identify.loop import fit_commanded, loop_rates, loop_unknowns, rotor_speeds
-from suite.diagnose.identify.numbers import Number, not_attempted, not_identified, notes_on
+from suite.diagnose.identify.numbers import (
+    Number,
+    misfit_notes,
+    not_attempted,
+    not_identified,
+    notes_on,
+)
 
 PARTS = {
     "drag": ("drag_",),
@@ -272,5 +278,9 @@ class _Fits:
                 if name in results
             },
             tuple(flight.name for flight in self.flights),
-            (*notes_on(self.flights, self.without_voltage, original, vehicle), *notes),
+            (
+                *misfit_notes(results),
+                *notes_on(self.flights, self.without_voltage, original, vehicle),
+                *notes,
+            ),
         )

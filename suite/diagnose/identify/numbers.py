@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.inertial import UNSEEN
+from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.identify.fit import Fitted
 from suite.diagnose.identify.grid import IMU_ACC, FlightGrid
 
@@ -84,6 +85,11 @@ WHY = {
     "gain_z": "rate_gain about z: the body hardly yaws",
 }
 """Description of each fitted number, by name, with the reason why flights may not identify it."""
+WELL_EXPLAINED, SMALL_MISFIT = 0.5, 1.0
+"""A model fits an axis if it explains this share of the measured mean square, or if the root mean
+square of the rest is below the second value: 1 m/s^2 or 1 rad/s^2."""
+MOTIONS = {"force": "acceleration along", "torque": "angular acceleration about"}
+"""Name of a fit -> what it explains."""
 NO_RATES = "no body rates and no attitude in these logs"
 """Reason if a fit needs body rates and the logs have none."""
 NEVER_BOTH = "these logs have no stretch with both"
@@ -174,6 +180,23 @@ def not_attempted(
             why = f"rate_gain: {NEVER_BOTH} body rates and commanded ones"
         lines.append(why)
     return lines
+
+
+def misfit_notes(fitted: Mapping[str, Fitted]) -> list[str]:
+    """Return the warning that a fit leaves most of what was measured, [] if none does."""
+    poor = []
+    for name, motion in MOTIONS.items():
+        if name not in fitted:
+            continue
+        left, measured = fitted[name].residual_rms, fitted[name].measured_rms
+        for axis, rest, size in zip("xyz"[3 - len(left) :], left, measured, strict=True):
+            share = 1.0 - float(rest / max(size, TINY)) ** 2
+            if share < WELL_EXPLAINED and rest > SMALL_MISFIT:
+                poor.append(f"{max(100.0 * share, 0.0):.0f} % of the {motion} {axis}")
+    if not poor:
+        return []
+    text = f"with the identified numbers, the model explains only {', '.join(poor)}; "
+    return [f"{text}a signal or another number of the file may be wrong, so do not rely on them"]
 
 
 def notes_on(

@@ -59,6 +59,15 @@ def test_identified_numbers_are_near_the_truth(drive, least):
     assert found.drive == drive and len(near_truth(found)) >= least
 
 
+def test_rotor_speeds_of_another_flight_are_a_warning():
+    one, other = known.logs("rotors", 0)[::3]
+    rows = np.arange(len(one.time_s)) % len(other.time_s)
+    wrong = identify([replace(one, rotor_speed=other.rotor_speed[rows])], start := known.start())
+    assert "the model explains only" in wrong.notes[0]
+    assert "angular acceleration about x" in wrong.notes[0]
+    assert not any("explains only" in note for note in identify([one], start).notes)
+
+
 @pytest.mark.slow
 def test_rotors_that_are_faster_than_the_rows_of_the_log_do_not_look_like_less_inertia():
     """Without a lag the torque falls between two rows, by a tenth here; the loop shows the lag."""
