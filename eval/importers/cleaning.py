@@ -16,6 +16,7 @@ from eval.importers.mapping import KEPT
 from eval.importers.rows import continuous
 from eval.importers.signals import MAD_TO_SD, Recording, Signal, median_step
 from eval.logs.faults.clocks.delay import LATE_S, LEAST_S, OF_POSE, SURE, delay_of
+from eval.logs.faults.clocks.rotation import rotation_findings
 from eval.logs.faults.clocks.stamps import MEASURED, even_stamps, finding_of, measured_in
 from eval.logs.faults.drive.commands import has_both_signs
 from eval.logs.faults.finding import Finding
@@ -221,15 +222,13 @@ def check_delay(recording: Recording, fix: bool) -> Recording:
     fit = delay_of(quat.time_s, quat.value, rate.time_s, rate.value)
     if fit is None:
         return recording
-    delay, findings = fit.delay_s, fit.rotation_findings()
-    is_late = abs(delay) > max(LEAST_S, SURE * fit.error_s)
+    delay, findings = fit.delay_s, rotation_findings(fit.rotation)
+    is_late = not fit.jump_s and abs(delay) > max(LEAST_S, SURE * fit.error_s)
     moved = fit.moved(recording.signals) if is_late else OF_POSE
     subject, figures = fit.figures(moved)
     option = "leave --no-fix out: the import shifts it"
     status = "corrected" if fix else "doubt"
-    if fit.drifts:
-        about = ("clock_drift", fit.drift, 0.95, option)
-        findings.append(Finding(status, "pose clock", fit.drift_figures(), *about))
+    findings += fit.drift_findings(status, option)
     if is_late:
         confidence = 0.95 if abs(delay) > LATE_S else 0.8
         what = {"rate": "it is", "acc": "it and the accelerometer are"}.get(
@@ -238,12 +237,12 @@ def check_delay(recording: Recording, fix: bool) -> Recording:
         text = f"{figures}: {what} shifted" if fix else f"{figures}; not corrected"
         about = ("clock_offset", delay, confidence, option)
         findings.append(Finding(status, subject, text, *about))
-    else:
+    elif not fit.jump_s:
         findings.append(Finding("ok", subject, figures))
     recording = recording.noting(*findings)
-    if not fix or not (is_late or fit.drifts):
-        return recording
     drift = fit.drift if fit.drifts else 0.0
+    if not fix or not (is_late or drift):
+        return recording
     signals = dict(recording.signals)
     for name in {*OF_POSE, *moved} & signals.keys():
         time_s, value = signals[name]

@@ -232,6 +232,9 @@ def _check_time(time: np.ndarray, row_number: np.ndarray, name: str) -> None:
     if len(back):
         k = back[0] + 1
         reason = f"{time[k]:.9g} s does not come after {time[k - 1]:.9g} s; time must increase"
+        if time[k] == time[k - 1] and (time == time.astype(np.float32)).all():
+            reason += "; these times have single precision, which is too coarse: subtract the "
+            reason += "first one before they are converted to it"
         raise FlightLogError(name, reason, "time", int(row_number[k]))
     if (duration := time[-1] - time[0]) < DURATION_MIN:
         reason = f"{duration:.3g} s of flight; at least {DURATION_MIN:g} s is needed"

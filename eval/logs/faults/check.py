@@ -52,6 +52,8 @@ LEAST_ROWS = 50
 """Least rows for any check."""
 SLOWEST_S = 0.1
 """Largest time between rows at which the checks find faults [s]."""
+QUARTER_DEG = 15.0
+"""An angle within this of a quarter turn may be that of swapped axes [deg]."""
 NOT_CHECKED = "not checked"
 """Subject of the note on a log with too few or too slow rows."""
 
@@ -93,7 +95,7 @@ DRIVE: tuple[Check, ...] = (
     lambda rows, against: check_voltage(rows, against.vehicle),
     lambda rows, against: check_gyro_signs(rows, against.vehicle),
     lambda rows, against: check_gyro_scale(rows, against.vehicle),
-    lambda rows, _: check_telemetry(rows),
+    lambda rows, against: check_telemetry(rows, against.vehicle, "clock_offset" in against.found),
     lambda rows, against: check_motors(rows, against.vehicle),
     lambda rows, against: check_lift(rows, against.vehicle, against.implausible),
     lambda rows, against: check_inertia(rows, against.vehicle),
@@ -171,16 +173,21 @@ def run_checks(
 def _check_pose(rows: Rows) -> list[Finding]:
     """Return the findings on attitude and position.
 
-    An attitude that fits at another time, or with another heading, has no other fault.
+    An attitude that fits at another time, or with another heading, has no other fault. Neither has
+    a position whose heading is no quarter turn.
     """
     found = check_pose(rows)
-    if not any(f.fault == "attitude" and f.status == "doubt" for f in found):
-        return found
-    for check in (check_position_delay, check_heading):
-        if other := [finding for finding in check(rows) if finding.is_open]:
-            return other
+    doubts = {f.fault for f in found if f.status in ("doubt", "corrected")}
+    if doubts & {"attitude", "position_axes"}:
+        turned = [f for f in check_heading(rows) if f.is_open]
+        if "attitude" in doubts:
+            turned = [f for f in check_position_delay(rows) if f.is_open] or turned
+        elif turned and abs((turned[0].size + 45.0) % 90.0 - 45.0) < QUARTER_DEG:
+            turned = []
+        if turned:
+            return turned
     is_late = any(f.fault == "clock_offset" and f.is_open for f in check_clock(rows))
-    return [] if is_late else found  # a later check reports the clock
+    return [] if is_late and "attitude" in doubts else found  # a later check reports the clock
 
 
 def _check_rate_command(rows: Rows, against: CheckContext) -> list[Finding]:

@@ -114,6 +114,8 @@ def check_height(rows: Rows) -> list[Finding]:
         f"{s.value:.2f} (± {s.error:.2f}) times that of the {s.source}" for s in slopes
     )
     right, inverted = (any(slope.shows(sign) for slope in slopes) for sign in (1.0, -1.0))
+    if inverted and any(slope.value > SURE_SLOPE * slope.error for slope in slopes):
+        return unseen("position", f"{text}: these contradict each other", "position_axes")
     if right == inverted:
         return unseen("position", f"{text}: too uncertain for the sign of z", "position_axes")
     feet = [FOOT_M * slope.value for slope in sorted(slopes, key=lambda slope: slope.error)]

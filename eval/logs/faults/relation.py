@@ -12,6 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from eval.logs.faults.finding import Finding, unseen
+from eval.logs.faults.reading import axes_matrix, option
+
 ALIKE = 0.8
 """Two axes with a higher correlation measure the same."""
 UNLIKE = 0.5
@@ -26,6 +29,15 @@ LEAST = 20
 """Least rows for a comparison."""
 SEEN = 0.5
 """Least correlation at which an axis is identifiable."""
+
+NEAR = 1.06
+"""A scale within this factor of a unit's factor is explained by that unit."""
+SAME = 1.1
+"""A scale within this factor of 1 is correct."""
+FAR = 1.15
+"""A scale within this factor of 1 is no fault but a note: attitude filters cause as much."""
+OK = 0.3
+"""Largest relative residual of a correct signal."""
 
 
 class Match(NamedTuple):
@@ -133,6 +145,68 @@ def pooled_scale(found: Match) -> tuple[float, float, float]:
 def within(table: Mapping[str, float], limit: float, factor: float) -> list[str]:
     """Return the names in `table` whose value is within the ratio `limit` of `factor`."""
     return [n for n, wrong in table.items() if abs(np.log(factor / wrong)) < np.log(limit)]
+
+
+def axes_finding(found: Match, signal: str, subject: str) -> Finding:
+    """Return the finding for a signal whose axes are swapped or inverted."""
+    alike = ", ".join(
+        f"{axis} {value:+.2f}" for axis, value in zip("xyz", found.as_given, strict=True)
+    )
+    frame = {"x,-y,-z": "body_frame"}.get(found.axes, f"{subject}_axes")
+    text = f"correlations with what it should be are {alike}; its axes are {found.axes}"
+    if frame == "gyro_axes" and np.linalg.det(axes_matrix(found.axes)) > 0.0:
+        text += ", or the attitude's body is rotated by as much against the vehicle"
+    sure = float(np.clip(np.min(found.alike[found.seen]), 0.0, 0.99))
+    fix = option((signal, found.axes))
+    status = "corrected" if found.is_turned else "doubt"
+    return Finding(status, subject, text, frame, None, max(sure, 0.9), fix)
+
+
+def unseen_axes(found: Match, subject: str, *faults: str) -> list[Finding]:
+    """Return findings for axes that cannot be checked: with too little motion, or in proportion."""
+    axes = " and ".join(axis for axis, seen in zip("xyz", found.seen, strict=True) if not seen)
+    text = f"along {axes} there is too little to check its sign by"
+    findings = unseen(subject, text, *faults) if axes else []
+    text = f"two axes move in proportion, so that the order {found.rival} fits about as well"
+    return findings + (unseen(subject, text, faults[0]) if found.rival else [])
+
+
+def scale_findings(
+    found: Match,
+    units: Mapping[str, float],
+    signal: str,
+    subject: str,
+    fault: str,
+    of: str,
+    same: float = SAME,
+) -> list[Finding]:
+    """Return the findings on a signal's scale: correct, a wrong unit, or an unknown factor.
+
+    `of` names the reference in words; a scale within the factor `same` of 1 is correct. Where the
+    signal resembles the reference little, a scale that is no unit's has no fix.
+    """
+    scale, low, high = pooled_scale(found)
+    figures = f"it is {scale:.3g} times {of} ({low:.3g} to {high:.3g})"
+    if not np.isfinite(scale) or low < 1.0 < high or 1.0 / same < scale < same:
+        return [Finding("ok", subject, figures)]
+    if low / max(FAR, same) < 1.0 < high * max(FAR, same):
+        text = f"{figures}: filters of the log may cause as much"
+        return [Finding("note", subject, text), *unseen(subject, text, fault)]
+    distance = {words: abs(np.log(scale / factor)) for words, factor in units.items()}
+    words, *others = sorted(distance, key=lambda name: distance[name])
+    if low / NEAR < units[words] < high * NEAR and distance[words] < np.log(1.3):
+        clear = distance[words] < 0.5 * min((distance[name] for name in others), default=np.inf)
+        fix = option((signal, f"{1.0 / units[words]:.10g}"))
+        status, sure = ("corrected", 0.99) if clear else ("doubt", 0.9)
+        return [Finding(status, subject, f"{figures}: {words}", fault, scale, sure, fix)]
+    misfit = found.misfit(found.alike)
+    if misfit > OK:
+        text = f"{figures}, and off them by {100 * misfit:.0f} % then: a filter or a limited range"
+        return [Finding("doubt", subject, text, fault, scale, 0.6)]
+    sure = 0.97 if high / low < 1.15 else 0.9 if high / low < 1.5 else 0.6
+    fix = option((signal, f"{1.0 / scale:.4g}"))
+    text = f"{figures}, which is no unit's doing; check its range and scale, and the clock"
+    return [Finding("doubt", subject, text, fault, scale, sure, fix)]
 
 
 def smooth(time_s: np.ndarray, value: np.ndarray, width_s: float) -> np.ndarray:

@@ -6,18 +6,28 @@ accelerometer. The rotations of the attitude are the reference for the gyro.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import conjugate, rotate
 from eval.logs.faults.clocks.delay import CLEARLY, LATE_S, late_against
 from eval.logs.faults.clocks.path import check_position_delay
+from eval.logs.faults.clocks.rotation import rotated_to
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows, turns_of
-from eval.logs.faults.reading import DEG, axes_matrix, option, read_as
-from eval.logs.faults.relation import LEAST, SEEN, Match, match, pooled_scale, rms, smooth, within
+from eval.logs.faults.reading import DEG, option, read_as
+from eval.logs.faults.relation import (
+    LEAST,
+    OK,
+    SEEN,
+    axes_finding,
+    match,
+    rms,
+    scale_findings,
+    smooth,
+    unseen_axes,
+    within,
+)
 from eval.logs.velocity import velocity_from_position
 
 COUNTS = 16.384
@@ -43,14 +53,8 @@ FORCES = {
     "g, taken for raw counts of 2048 per g": 1.0 / 2048.0,
 } | {f"raw counts of {per_g} per g": per_g / GRAVITY for per_g in (512, 2048, 4096, 8192, 16384)}
 """Wrong unit of the accelerometer -> factor by which its values are then too large."""
-NEAR = 1.06
-"""A scale within this factor of a unit's factor is explained by that unit."""
-SAME = 1.1
-"""A scale within this factor of 1 is correct."""
-FAR = 1.15
-"""A scale within this factor of 1 is no fault but a note: attitude filters cause as much."""
 SLOW = 1.25
-"""The same as `SAME` for a velocity, whose filters change it more."""
+"""A velocity within this factor of 1 is correct: its filters change it more than a gyro's."""
 CALM_SPEED = 0.3
 """Smallest usable speed, root mean square [m/s]."""
 GOOD, BAD, TIMES_BETTER = 0.35, 0.6, 2.0
@@ -64,8 +68,6 @@ MIRRORS = ("-x,y,z", "x,-y,z")
 SIMPLER = 0.03
 """Penalty on the relative residual of an accelerometer's unusual readings, so that the usual ones
 are chosen where both fit."""
-OK = 0.3
-"""Largest relative residual of a correct signal."""
 UPWARDS = 0.5
 """Least share of an accelerometer's median that must be along body z, the direction of thrust."""
 APART = 0.5
@@ -88,7 +90,10 @@ def check_gyro(rows: Rows) -> list[Finding]:
     found = match(turns, gyro)
     world = match(rotate(rows["quat"], turns), gyro)
     in_body, in_world = found.misfit(found.as_given), world.misfit(world.as_given)
-    if not found.is_turned and in_world < GOOD and in_body > max(BAD, TIMES_BETTER * in_world):
+    rotated = match(rotated_to(turns, gyro), gyro)
+    least = min(GOOD, rotated.misfit(rotated.as_given))  # `check_clock` names a rotated body
+    is_off = in_body > max(BAD, TIMES_BETTER * in_world)
+    if is_off and in_world < least and not found.is_turned:
         text = (
             f"its turns are off the attitude's by {100 * in_body:.0f} % in body axes and by "
             f"{100 * in_world:.0f} % in world axes"
@@ -101,12 +106,12 @@ def check_gyro(rows: Rows) -> list[Finding]:
         text = f"body and world axes are {100 * apart:.0f} % of its turns apart only"
         findings += unseen("gyro", text, "gyro_frame")
     if found.is_turned or found.is_mirrored:
-        findings.append(_turned(found, "rate", "gyro"))
+        findings.append(axes_finding(found, "rate", "gyro"))
     elif not found.seen.any():
         text = "its noise hides how the attitude turns"
         return _gyro_alone(rows, text, "gyro_axes", "gyro_frame", "body_frame")
-    findings += _unseen_axes(found, "gyro", "gyro_axes", "body_frame")
-    findings += _unit(found, RATES, "rate", "gyro", "gyro_scale", "the attitude's turns")
+    findings += unseen_axes(found, "gyro", "gyro_axes", "body_frame")
+    findings += scale_findings(found, RATES, "rate", "gyro", "gyro_scale", "the attitude's turns")
     return findings
 
 
@@ -131,63 +136,6 @@ def _gyro_alone(rows: Rows, why: str, *faults: str) -> list[Finding]:
         return [*unknown, found]
     fix = f"{option(('rate', f'{DEG:.6g}'))} for deg/s, or {DEG / COUNTS:.6g} for raw counts"
     return [*unknown, Finding("doubt", "gyro", text, "gyro_scale", None, 0.95, fix)]
-
-
-def _turned(found: Match, signal: str, subject: str) -> Finding:
-    """Return the finding for a signal whose axes are swapped or inverted."""
-    alike = ", ".join(
-        f"{axis} {value:+.2f}" for axis, value in zip("xyz", found.as_given, strict=True)
-    )
-    frame = {"x,-y,-z": "body_frame"}.get(found.axes, f"{subject}_axes")
-    text = f"correlations with what it should be are {alike}; its axes are {found.axes}"
-    if frame == "gyro_axes" and np.linalg.det(axes_matrix(found.axes)) > 0.0:
-        text += ", or the attitude's body is rotated by as much against the vehicle"
-    sure = float(np.clip(np.min(found.alike[found.seen]), 0.0, 0.99))
-    fix = option((signal, found.axes))
-    status = "corrected" if found.is_turned else "doubt"
-    return Finding(status, subject, text, frame, None, max(sure, 0.9), fix)
-
-
-def _unseen_axes(found: Match, subject: str, *faults: str) -> list[Finding]:
-    """Return findings for axes that cannot be checked: with too little motion, or in proportion."""
-    axes = " and ".join(axis for axis, seen in zip("xyz", found.seen, strict=True) if not seen)
-    text = f"along {axes} there is too little to check its sign by"
-    findings = unseen(subject, text, *faults) if axes else []
-    text = f"two axes move in proportion, so that the order {found.rival} fits about as well"
-    return findings + (unseen(subject, text, faults[0]) if found.rival else [])
-
-
-def _unit(
-    found: Match,
-    units: Mapping[str, float],
-    signal: str,
-    subject: str,
-    fault: str,
-    of: str,
-    same: float = SAME,
-) -> list[Finding]:
-    """Return the findings on a signal's scale: correct, a wrong unit, or an unknown factor.
-
-    `of` names the reference in words; a scale within the factor `same` of 1 is correct.
-    """
-    scale, low, high = pooled_scale(found)
-    figures = f"it is {scale:.3g} times {of} ({low:.3g} to {high:.3g})"
-    if not np.isfinite(scale) or low < 1.0 < high or 1.0 / same < scale < same:
-        return [Finding("ok", subject, figures)]
-    if low / max(FAR, same) < 1.0 < high * max(FAR, same):
-        text = f"{figures}: filters of the log may cause as much"
-        return [Finding("note", subject, text), *unseen(subject, text, fault)]
-    distance = {words: abs(np.log(scale / factor)) for words, factor in units.items()}
-    words, *others = sorted(distance, key=lambda name: distance[name])
-    if low / NEAR < units[words] < high * NEAR and distance[words] < np.log(1.3):
-        clear = distance[words] < 0.5 * min((distance[name] for name in others), default=np.inf)
-        fix = option((signal, f"{1.0 / units[words]:.10g}"))
-        status, sure = ("corrected", 0.99) if clear else ("doubt", 0.9)
-        return [Finding(status, subject, f"{figures}: {words}", fault, scale, sure, fix)]
-    sure = 0.97 if high / low < 1.15 else 0.9 if high / low < 1.5 else 0.6
-    fix = option((signal, f"{1.0 / scale:.4g}"))
-    text = f"{figures}, which is no unit's doing; check its range and scale, and the clock"
-    return [Finding("doubt", subject, text, fault, scale, sure, fix)]
 
 
 def check_velocity(rows: Rows) -> list[Finding]:
@@ -221,7 +169,7 @@ def check_velocity(rows: Rows) -> list[Finding]:
                             option(("vel", best)))]  # fmt: skip
         here = matches[best]
     elif here.is_turned or here.is_mirrored:
-        findings = [_turned(here, "vel", "velocity")._replace(fault="velocity_frame")]
+        findings = [axes_finding(here, "vel", "velocity")._replace(fault="velocity_frame")]
     elif residual[""] > BAD:
         text = f"{figures}, and no other frame of it fits"
         sure = 0.9 if residual[""] > 0.9 else 0.6
@@ -232,9 +180,10 @@ def check_velocity(rows: Rows) -> list[Finding]:
         if apart < APART:
             text = f"body and world axes are {100 * apart:.0f} % of it apart only"
             findings += unseen("velocity", text, "velocity_frame")
-        findings += _unseen_axes(here, "velocity", "velocity_frame")
+        findings += unseen_axes(here, "velocity", "velocity_frame")
         findings += _velocity_delay(rows, path)
-    unit = _unit(here, SPEEDS, "vel", "velocity", "velocity_unit", "the path's derivative", SLOW)
+    of = "the path's derivative"
+    unit = scale_findings(here, SPEEDS, "vel", "velocity", "velocity_unit", of, SLOW)
     return findings + [matched for matched in unit if matched.status != "ok"]
 
 
@@ -302,7 +251,7 @@ def check_accelerometer(rows: Rows, body_is_frd: bool = False) -> list[Finding]:
         if given < OK:
             matched = match(force, readings["", 1.0])
             if matched.is_turned:
-                return [_turned(matched, "acc", "accelerometer")]
+                return [axes_finding(matched, "acc", "accelerometer")]
             return [Finding("ok", "accelerometer", figures + lateral)]
         sure = 0.9 if given > 0.8 else 0.6
         text = f"{figures}, and no unit, sign or frame of it fits"

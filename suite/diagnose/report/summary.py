@@ -55,7 +55,10 @@ HEADINGS = {
 """Headings of named effects, by whether a change was searched for, and whether they are of the
 log."""
 UNTESTED = "Whether the file itself is right was not tested: for that, leave out --reference."
-CHECK = "Run suite check on these logs: a wrong unit, sign, order or clock resembles physics."
+CHECK = (
+    "Verify the signals: a log's errors resemble physics. The checks of suite check, which ran "
+    "here, too, do not find scales that are off by less than a tenth, or strong filters."
+)
 
 
 def headline(result: Mapping[str, Any]) -> str:

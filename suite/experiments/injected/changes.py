@@ -90,7 +90,18 @@ def shift(signals: Signals, _: Vehicle, late_s: float, names: tuple[str, ...]) -
 def speed_up_pose_clock(signals: Signals, _: Vehicle) -> Signals:
     """Stamp position, velocity and attitude by a clock that runs 0.5 % fast."""
     time_s = signals["time"]
-    true_s = time_s - 0.005 * (time_s - time_s.mean())
+    return with_pose_at(signals, time_s - 0.005 * (time_s - time_s.mean()))
+
+
+def set_pose_clock(signals: Signals, _: Vehicle) -> Signals:
+    """Stamp the second half of position, velocity and attitude 60 ms late."""
+    time_s = signals["time"]
+    return with_pose_at(signals, time_s - 0.06 * (time_s > time_s.mean()))
+
+
+def with_pose_at(signals: Signals, true_s: np.ndarray) -> Signals:
+    """Return the signals with the pose of the times `true_s` (T,) in place of those logged [s]."""
+    time_s = signals["time"]
     stretched = {
         n: np.stack([np.interp(true_s, time_s, c) for c in signals[n].T], axis=1)
         for n in ("pos", "vel", "quat")

@@ -31,6 +31,7 @@ from suite.experiments.injected.changes import (
     map_of,
     other_curve,
     remove_gravity,
+    set_pose_clock,
     shift,
     speed_up_pose_clock,
     turn_attitude,
@@ -163,6 +164,9 @@ KINDS: dict[str, Kind] = {
     "pose's clock off by 0.5 %": Kind(
         ("clock_drift",), change=speed_up_pose_clock, needs=("quat", "rate")
     ),
+    "pose's clock set by 60 ms in flight": Kind(
+        ("clock_drift",), change=set_pose_clock, needs=("quat", "rate")
+    ),
     "stamps of arrival, up to 80 % of a row late": Kind(
         ("clock_jitter",), change=jitter_stamps, needs=("pos", "quat", "rate")
     ),
@@ -183,6 +187,11 @@ KINDS: dict[str, Kind] = {
     ),
     "rotor speeds that drop out": Kind(
         ("motor_telemetry",), change=drop_rotor_speeds, needs=("motor",)
+    ),
+    "rotor speeds late by 60 ms": Kind(
+        ("motor_telemetry",),
+        change=partial(shift, late_s=0.06, names=("motor",)),
+        needs=("motor", "rate"),
     ),
     "motor 4 is a copy of motor 3": Kind(
         ("motor_telemetry",),

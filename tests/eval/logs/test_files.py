@@ -190,8 +190,13 @@ def drop(name, other="unknown"):
     return lambda table: table.update({other: table.pop(name)})
 
 
+def in_single_precision(table):
+    table["time"] = (table["time"] + 2e5).astype(np.float32).astype(np.float64)
+
+
 BAD = [
     (spoil("time", 7, 0.06), "time", 8, "does not come after"),
+    (in_single_precision, "time", 3, "single precision"),
     (spoil("time", 7, 0.01), "time", 8, "must increase"),
     (spoil("pos_y", 3, np.inf), "pos_y", 4, "infinite"),
     (spoil("vel_x", 0, -np.inf), "vel_x", 1, "infinite"),

@@ -16,6 +16,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import rates_between, rotate
+from eval.logs.faults.clocks.rotation import rotation_between, rotation_findings
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import SPAN_S, WIDTH_S, Rows, turns_of
 from eval.logs.faults.relation import interpolate, jackknife_error, smooth
@@ -28,6 +29,8 @@ FAR_S, FAR_STEP_S, FAR_SHARE = 0.5, 0.02, 0.5
 of all small delays to this share: a periodic flight fits again after a period."""
 BLOCKS = 8
 """Number of blocks of the jackknife."""
+PLACE = np.arange(BLOCKS)
+"""(BLOCKS,) numbers of the blocks."""
 CALM = 0.2
 """Smallest usable body rate, root mean square [rad/s]."""
 LEAST_S, SURE = 0.002, 4.0
@@ -37,6 +40,9 @@ CLEARLY = 15.0
 GROWN_S, DRIFT, SURE_DRIFT = 0.005, 3e-4, 5.0
 """Least drift that is reported: over a flight [s], relative (two crystals differ by less than
 200 ppm), and in standard errors."""
+JUMP = 0.5
+"""A clock jumps if two constant delays leave less than this share of the squares that a line leaves
+of the delays of the blocks."""
 LIKELY = 2.5
 """A drift above this many standard errors is removed, and its error is estimated again. A force
 that fits the path better by as many has the other time."""
@@ -45,18 +51,12 @@ SEEN = 0.005
 LATE_S = 0.025
 """Least delay that is a fault [s]. A diagnosis estimates smaller ones itself (effect
 `clock_offset`)."""
+CUT = "find the jump, and cut the log there with --start or --end of suite import"
+"""Fix of a clock that jumps."""
 OF_POSE = ("pos", "quat", "vel")
 """Signals of the device that measures the pose; they share its delay."""
 COARSE = 2.0
 """Shifts below this many rows of the path are too small to be seen in its acceleration."""
-
-ROTATED_DEG = (5.0, 15.0, 120.0)
-"""Rotation between the body axes of pose and gyro above which it is reported, above which it is a
-fault, and its limit [deg]. A smaller one may be a tilt of the markers, a larger one a wrong sign,
-which other checks name."""
-HALF, PRIOR = 0.5, 0.03
-"""A rotation must lower the squared misfit of the best delay to this share. The second counts as
-the share of the rates for which the axes are equal, since few axes may turn."""
 
 
 class Late(NamedTuple):
@@ -74,6 +74,8 @@ class Late(NamedTuple):
     """Middle of the flight [s]."""
     duration_s: float
     """Duration of the flight [s]."""
+    jump_s: float
+    """By how much the delay grows at once; 0 if it changes evenly or not at all [s]."""
     rotation: np.ndarray
     """(3,) rotation vector from the attitude's body axes to the gyro's [deg]; 0 if too small."""
 
@@ -99,20 +101,22 @@ class Late(NamedTuple):
     @property
     def drifts(self) -> bool:
         """Whether the drift exceeds what two crystals cause, and what its own error can cause."""
-        growth_s = abs(self.drift) * self.duration_s
+        growth_s = 0.0 if self.jump_s else abs(self.drift) * self.duration_s
         return growth_s > GROWN_S and abs(self.drift) > max(DRIFT, SURE_DRIFT * self.drift_error)
 
-    def rotation_findings(self) -> list[Finding]:
-        """Return the finding on a rotation between the body axes; none if it is too small."""
-        angle = float(np.linalg.norm(self.rotation))
-        if angle < ROTATED_DEG[0]:
+    def drift_findings(self, status: str, fix: str) -> list[Finding]:
+        """Return the finding on a drift or jump of the delay, [] for neither.
+
+        A drift has the status and the fix that are given; no shift corrects a jump.
+        """
+        if self.jump_s:
+            text = f"its delay jumps by {1e3 * self.jump_s:+.0f} ms: a clock was set, or rows are "
+            about = ("clock_drift", self.jump_s, 0.95, CUT)
+            return [Finding("doubt", "pose clock", f"{text}missing", *about)]
+        if not self.drifts:
             return []
-        axis = ", ".join(f"{part / angle:+.2f}" for part in self.rotation)
-        text = f"its body is rotated by {angle:.0f} deg about ({axis}) against the gyro"
-        if angle < ROTATED_DEG[1]:
-            return [Finding("note", "pose axes", text)]
-        fix = "align the body in the motion capture, or the gyro, with the vehicle's axes"
-        return [Finding("doubt", "pose axes", text, "body_frame", angle, 0.95, fix)]
+        about = ("clock_drift", self.drift, 0.95, fix)
+        return [Finding(status, "pose clock", self.drift_figures(), *about)]
 
     def drift_figures(self) -> str:
         """Return the drift as text."""
@@ -134,13 +138,13 @@ def check_clock(rows: Rows) -> list[Finding]:
     if late is None:
         text = "the flight turns too little to hold its clocks against each other"
         return unseen("pose clock", text, "clock_offset", "clock_drift")
-    drift = late.rotation_findings()
-    if not late.drifts and not SURE_DRIFT * late.drift_error < SEEN:
+    drift = rotation_findings(late.rotation)
+    if not (late.jump_s or late.drifts) and not SURE_DRIFT * late.drift_error < SEEN:
         drift += unseen("pose clock", late.drift_figures(), "clock_drift")
-    if late.drifts:
-        fix = "suite import of the log that it was made of: the pose is moved"
-        about = ("clock_drift", late.drift, 0.95, fix)
-        drift += [Finding("doubt", "pose clock", late.drift_figures(), *about)]
+    fix = "suite import of the log that it was made of: the pose is moved"
+    drift += late.drift_findings("doubt", fix)
+    if late.jump_s:
+        return drift
     if abs(late.delay_s) < max(LATE_S, SURE * late.error_s):
         return [Finding("ok", *late.figures(OF_POSE)), *drift]
     moved = late.moved({name: (rows["time"], value) for name, value in rows.items()})
@@ -295,7 +299,7 @@ def _near_delay(
     if np.sqrt(np.mean(np.sum(gyro(0.0, 0.0) ** 2, axis=1))) < CALM or not turns.any():
         return None
     trials = np.arange(-REACH_S, REACH_S + 0.5 * STEP_S, STEP_S)
-    rotation, turned = _rotation(turns, [gyro(late_s, 0.0) for late_s in trials])
+    rotation, turned = rotation_between(turns, [gyro(late_s, 0.0) for late_s in trials])
     turns = turns @ rotation.T
     block = np.arange(len(first)) * BLOCKS // len(first)
 
@@ -318,35 +322,24 @@ def _near_delay(
         rest_of_drift, drift_error = _drift(trials, cost, duration)
     if (best := best_delay(trials, cost)) is None:
         return None
-    return Late(*best, first_drift + rest_of_drift, drift_error, middle, duration, turned)
+    drift = first_drift + rest_of_drift
+    each = [_lowest(trials, part) for part in cost]
+    jump_s = (
+        0.0 if None in each else _jump(np.array(each) + first_drift * duration / BLOCKS * PLACE)
+    )
+    return Late(*best, drift, drift_error, middle, duration, jump_s, turned)
 
 
-def _rotation(turns: np.ndarray, gyros: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rotation (3, 3) from the rates `turns` (N, 3) to the gyro's, and its vector [deg].
-
-    `gyros` are the gyro's rates (N, 3) for each trial delay. It is 0 where a delay alone fits about
-    as well (Kabsch 1976, for every delay).
-    """
-    from scipy.spatial.transform import Rotation
-
-    size = np.linalg.norm(turns, axis=1)
-    kept = size <= 8.0 * np.quantile(size, 0.9)
-    source = turns[kept] - turns[kept].mean(axis=0)
-    source /= max(float(np.linalg.norm(source)), 1e-12)
-    alone, least, best = np.inf, np.inf, np.eye(3)
-    for gyro in gyros:
-        target = gyro[kept] - gyro[kept].mean(axis=0)
-        product = target.T @ source / max(float(np.linalg.norm(target)), 1e-12)
-        u, _, vt = np.linalg.svd(product + PRIOR * np.eye(3))
-        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-        alone = min(alone, 2.0 - 2.0 * float(np.trace(product)))
-        if (misfit := 2.0 - 2.0 * float(np.sum(rotation * product))) < least:
-            least, best = misfit, rotation
-    vector = np.rad2deg(Rotation.from_matrix(best).as_rotvec())
-    angle = float(np.linalg.norm(vector))
-    if least > HALF * alone or not ROTATED_DEG[0] < angle < ROTATED_DEG[2]:
-        return np.eye(3), np.zeros(3)
-    return best, vector
+def _jump(delay_s: np.ndarray) -> float:
+    """Return by how much the delays (B,) of equal blocks grow at once; 0 if evenly or hardly."""
+    line = delay_s - np.polyval(np.polyfit(PLACE, delay_s, 1), PLACE)
+    parts = [np.split(delay_s, [k]) for k in PLACE[2:-1]]
+    left = [sum(float(np.sum((part - part.mean()) ** 2)) for part in pair) for pair in parts]
+    before, after = parts[int(np.argmin(left))]
+    size_s = float(after.mean() - before.mean())
+    error_s = np.sqrt(min(left) / (BLOCKS - 2) * (1.0 / len(before) + 1.0 / len(after)))
+    is_clear = abs(size_s) > max(LATE_S, SURE_DRIFT * error_s)
+    return size_s if is_clear and min(left) < JUMP * float(np.sum(line**2)) else 0.0
 
 
 def _drift(trials: np.ndarray, cost: np.ndarray, duration_s: float) -> tuple[float, float]:

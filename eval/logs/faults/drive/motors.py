@@ -111,8 +111,8 @@ def torque_correlations(rows: Rows, vehicle: Vehicle | None) -> np.ndarray | Non
     The result is None where the log lacks a signal or the vehicle hardly turns.
     """
     name = _drive(rows)
-    torques = "" if name is None or "rate" not in rows else _torques(rows, name, vehicle)
-    return None if isinstance(torques, str) else _scores(*torques)[AS_GIVEN]
+    torques = "" if name is None or "rate" not in rows else _delayed_torques(rows, name, vehicle)
+    return None if isinstance(torques, str) else scores_of(*torques)[AS_GIVEN]
 
 
 def check_inertia(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
@@ -145,7 +145,7 @@ def turn_scale(rows: Rows, vehicle: Vehicle | None) -> tuple[float, float] | Non
     name = _drive(rows)
     if vehicle is None or name is None or "rate" not in rows:
         return None
-    torques = _torques(rows, name, vehicle)
+    torques = _delayed_torques(rows, name, vehicle)
     if isinstance(torques, str) or (name == "pwm" and vehicle.motors is None):
         return None
     mean, turning, mixer = torques
@@ -166,13 +166,14 @@ def _drive(rows: Rows) -> str | None:
     return next((n for n in ("motor", "pwm", "motor_cmd") if n in rows), None)
 
 
-def _torques(
+def torques_of(
     rows: Rows, name: str, vehicle: Vehicle | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | str:
     """Return the motors' mean thrusts (N, 4), the torques by the gyro (N, 3) and the mixer (3, 4).
 
-    The torque by the gyro is the change of the angular momentum. Without a vehicle file the inertia
-    is set to 1. If the flight is too short or too calm, the result is the reason in words.
+    Each is that of the time `SPAN_S` from a row on. The torque by the gyro is the change of the
+    angular momentum. Without a vehicle file the inertia is set to 1. If the flight is too short or
+    too calm, the result is the reason in words.
     """
     hubs = np.array(SHIPPED_ORDER if vehicle is None else [h[:2] for h in vehicle.rotors.position])
     spin = np.array(X_SPIN if vehicle is None else vehicle.rotors.spin, dtype=float)
@@ -192,13 +193,20 @@ def _torques(
     size = rms(turning / inertia)
     if size < CALM_TURN:
         return f"turns change by {size:.2g} rad/s^2 only, too little to check their order by"
-    # Mean thrust over the same time, with the delay that correlates best.
-    mean = forward_mean(thrust, count)[:-1]
-    step = float(np.median(np.diff(time_s)))
+    return forward_mean(thrust, count)[:-1], turning, mixer
+
+
+def _delayed_torques(
+    rows: Rows, name: str, vehicle: Vehicle | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | str:
+    """Return `torques_of`, with the delay of the thrusts that correlates best."""
+    torques = torques_of(rows, name, vehicle)
+    if isinstance(torques, str):
+        return torques
+    mean, turning, mixer = torques
+    step = float(np.median(np.diff(rows["time"])))
     delayed_means = [np.roll(mean, round(lag / step), axis=0) for lag in LAGS_S]
-    mean = max(
-        delayed_means, key=lambda delayed: float(np.sum(_correlations(delayed, turning) ** 2))
-    )
+    mean = max(delayed_means, key=lambda one: float(np.sum(_correlations(one, turning) ** 2)))
     return mean, turning, mixer
 
 
@@ -207,14 +215,14 @@ def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
 
     The torques in every order of the four motors are compared with the angular accelerations.
     """
-    torques = _torques(rows, name, vehicle)
+    torques = _delayed_torques(rows, name, vehicle)
     if isinstance(torques, str):
         return unseen("motors", torques, "motor_order", "motor_spin")
     mean, turning, mixer = torques
-    scores = _scores(mean, turning, mixer)
+    scores = scores_of(mean, turning, mixer)
     half = len(mean) // 2
     halves = [
-        _scores(mean[part], turning[part], mixer) for part in (slice(half), slice(half, None))
+        scores_of(mean[part], turning[part], mixer) for part in (slice(half), slice(half, None))
     ]
     as_given, best = scores[AS_GIVEN], _best(scores)
     values = ", ".join(
@@ -253,7 +261,7 @@ Scores = dict[tuple[int, ...], np.ndarray]
 """Order of the motors -> correlation of torque and angular acceleration about x, y and z."""
 
 
-def _scores(mean: np.ndarray, turning: np.ndarray, mixer: np.ndarray) -> Scores:
+def scores_of(mean: np.ndarray, turning: np.ndarray, mixer: np.ndarray) -> Scores:
     """Return the correlations of every order of the motors."""
     return {
         order: _correlations(mean[:, order] @ mixer.T, turning).diagonal()

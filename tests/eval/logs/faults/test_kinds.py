@@ -50,7 +50,7 @@ OPEN = {
     "field of view", "thrust -10 %", "stamps of arrival, up to 80 % of a row late",
     "position late by 150 ms", "set point 150 ms ahead as position", "compass off by 15 deg",
     "rotor speeds held for 0.1 s", "rotor speeds that drop out", "motor 4 is a copy of motor 3",
-    "velocity through the air",
+    "velocity through the air", "rotor speeds late by 60 ms", "pose's clock set by 60 ms in flight",
 }  # fmt: skip
 """Kinds that are reported and left to the reader; all others are corrected."""
 
@@ -321,6 +321,18 @@ def test_a_body_that_is_defined_askew_is_no_delay(angle, status, late_s):
     (delay,) = [f for f in found if f.signal == "pose delay"]
     ms = float(delay.evidence.split("it is ")[1].split(" ms")[0])
     assert ms == pytest.approx(1e3 * late_s, abs=6.0)
+
+
+def test_a_clock_that_is_set_in_flight_is_neither_a_drift_nor_a_delay():
+    parts = good()
+    set_s = np.where(parts["time"] > parts["time"].mean(), -0.05, 0.0)
+    parts["quat"] = known_flight.fly(parts["time"] - set_s).quat
+    (jump,) = [f for f in check_clock(parts) if f.status != "ok"]
+    assert (jump.fault, jump.size) == ("clock_drift", pytest.approx(-0.05, abs=0.005))
+    streams = {name: Signal(parts["time"], parts[name]) for name in ("pos", "vel", "quat", "rate")}
+    shifted = check_delay(Recording("a log", streams), fix=True)
+    assert np.array_equal(shifted.signals["quat"].time_s, parts["time"])
+    assert [f.status for f in shifted.findings] == ["doubt"]
 
 
 @pytest.mark.parametrize("axes", [[0], [1], [2], [0, 1, 2]])

@@ -89,6 +89,29 @@ def test_another_heading_of_the_path_is_the_only_finding(log, turn_deg):
     assert f"turned by {found.size:+.0f} deg" in found.evidence
 
 
+def test_a_heading_near_a_quarter_turn_is_swapped_axes_and_another_one_is_not():
+    log = fly(PLAIN, 3, duration_s=8.0)
+    for turn_deg, faults in ((60.0, {"heading"}), (90.0, {"position_axes", "velocity_frame"})):
+        turn = Rotation.from_euler("z", turn_deg, degrees=True)
+        opened, _ = findings(replace(log, pos_w=turn.apply(log.pos_w), vel_w=turn.apply(log.vel_w)))
+        assert {finding.fault for finding in opened} == faults
+
+
+def test_a_body_that_is_turned_by_45_deg_does_not_make_rates_those_of_world_axes(log):
+    body = Rotation.from_quat(log.quat_wxyz, scalar_first=True)
+    turned = body * Rotation.from_euler("z", 45.0, degrees=True)
+    opened, _ = findings(replace(log, quat_wxyz=turned.as_quat(scalar_first=True)))
+    assert {finding.fault for finding in opened} == {"body_frame"}
+
+
+def test_an_accelerometer_with_gravity_twice_does_not_invert_the_position(log):
+    down_b = Rotation.from_quat(log.quat_wxyz, scalar_first=True).apply([0.0, 0.0, 9.81], True)
+    acc_w = np.gradient(log.vel_w, log.time_s, axis=0)
+    inverse = Rotation.from_quat(log.quat_wxyz, scalar_first=True).inv()
+    wrong = replace(log, acc_b=inverse.apply(acc_w) - down_b)
+    assert {finding.signal for finding in findings(wrong)[0]} == {"accelerometer"}
+
+
 def test_a_small_heading_and_a_calm_flight_are_no_finding(log):
     turn = Rotation.from_euler("z", 3.0, degrees=True)
     found, _ = check_log(replace(log, pos_w=turn.apply(log.pos_w), vel_w=turn.apply(log.vel_w)))

@@ -1,4 +1,4 @@
-"""Rotor speeds that are copied, drop out or are held, and a velocity of the air."""
+"""Rotor speeds that are copied, drop out, are held or late, and a velocity of the air."""
 
 from dataclasses import replace
 
@@ -52,6 +52,29 @@ def test_speeds_in_every_row_every_second_row_and_rows_without_a_sample_are_fine
     empty = np.where((np.arange(len(speed)) % 10 == 0)[:, None], speed, np.nan)
     for fine in (speed, every_second, empty):
         assert not [f for f in opened(replace(log, rotor_speed=fine)) if "telemetry" in f.fault]
+
+
+def late(log, late_s):
+    """Return the log with the rotor speeds of `late_s` before."""
+    time_s = log.time_s - late_s
+    speed = [np.interp(time_s, log.time_s, one) for one in log.rotor_speed.T]
+    return replace(log, rotor_speed=np.stack(speed, axis=1))
+
+
+@pytest.mark.parametrize("late_s", [-0.03, 0.02, 0.09, 0.3])
+def test_late_rotor_speeds_and_commands_in_their_place_are_the_only_finding(log, late_s):
+    (found,) = opened(late(log, late_s))
+    assert found.fault == "motor_telemetry" and found.size == pytest.approx(late_s, abs=0.003)
+    assert ("early against the gyro, as commands are" in found.evidence) == (late_s < 0.0)
+
+
+def test_motors_in_another_order_are_not_late_and_a_late_gyro_does_not_make_them_early(log):
+    assert not opened(late(log, 0.008))
+    (found,) = opened(replace(log, rotor_speed=log.rotor_speed[:, [1, 0, 3, 2]]))
+    assert found.fault == "motor_order"
+    gyro = np.stack([np.interp(log.time_s - 0.05, log.time_s, x) for x in log.rate_b.T], axis=1)
+    (found,) = opened(replace(log, rate_b=gyro))
+    assert found.fault == "clock_offset"
 
 
 def test_an_air_speed_is_not_the_velocity_of_the_path(log):
