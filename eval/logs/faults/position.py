@@ -20,7 +20,14 @@ from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import WIDTH_S as GYRO_S
 from eval.logs.faults.pose import Rows, turns_of
 from eval.logs.faults.reading import option
-from eval.logs.faults.relation import interpolate, jackknife_error, match, pooled_scale, smooth
+from eval.logs.faults.relation import (
+    OK,
+    interpolate,
+    jackknife_error,
+    match,
+    pooled_scale,
+    smooth,
+)
 from eval.logs.velocity import velocity_from_position
 
 WIDTH_S = 0.4
@@ -33,6 +40,9 @@ NEARER = 0.5
 """Least size of the slope: above it, a slope of 1 or -1 fits the flight better than 0."""
 CHANCE = 1e-4
 """Largest probability of such a slope where both accelerations are unrelated."""
+NEAR_CLOCK, ALIKE = 1.03, 1.015
+"""Least factor of a wrong clock that both gyro and velocity show, and by how much they may differ.
+In real logs filters change one of them by up to a tenth, but not both alike."""
 CLOCK, SURE_SLOPE, NEAR_SLOPE = 1.1, 4.0, 0.3
 """Least factor of a wrong clock on the gyro; the path's slope is then as many standard errors from
 1, and within this share of that distance from the value by this factor."""
@@ -83,12 +93,16 @@ def check_clock_rate(rows: Rows) -> list[Finding]:
     If times are too long by a factor, the attitude's turns are too small by it, and the path's
     accelerations by its square.
     """
-    if "quat" not in rows or "rate" not in rows or not (slopes := _slopes(rows)):
+    if not {"pos", "quat", "rate"} <= rows.keys():
         return []
     turns = smooth(rows["time"], turns_of(rows["time"], rows["quat"]), GYRO_S)
     found = match(turns, smooth(rows["time"], rows["rate"], GYRO_S))
     scale = pooled_scale(found)[0]
-    if not np.isfinite(scale) or found.is_turned or 1.0 / CLOCK < scale < CLOCK:
+    if not np.isfinite(scale) or found.is_turned:
+        return []
+    if 1.0 / CLOCK < scale < CLOCK:
+        return _small_clock_rate(rows, scale)
+    if not (slopes := _slopes(rows)):
         return []
     one = min(slopes, key=lambda slope: slope.error)
     far = abs(one.value - 1.0)
@@ -97,9 +111,30 @@ def check_clock_rate(rows: Rows) -> list[Finding]:
     text = f"the gyro is {scale:.3g} times the attitude's turns, and the path's vertical "
     text += f"acceleration is {one.value:.2f} times that of the {one.source}: its steps are "
     text += f"{scale:.3g} times the true ones"
+    return [_clock_rate(text, scale)]
+
+
+def _small_clock_rate(rows: Rows, scale: float) -> list[Finding]:
+    """Return the finding on a clock whose rate is off by less than a tenth, if two signals agree.
+
+    `scale` is that of the gyro. A filter or a wrong scale of one sensor changes one of them only.
+    """
+    if "vel" not in rows or abs(np.log(scale)) < np.log(NEAR_CLOCK):
+        return []
+    path = velocity_from_position(rows["time"], rows["pos"])
+    found = match(*(smooth(rows["time"], value, GYRO_S) for value in (path, rows["vel"])))
+    speed, low, high = pooled_scale(found)
+    if not low / ALIKE < scale < high * ALIKE or found.misfit(found.as_given) > OK:
+        return []
+    text = f"gyro and velocity are {scale:.3g} and {speed:.3g} times what attitude and position "
+    return [_clock_rate(f"{text}show: its steps are about {speed:.3g} times the true ones", speed)]
+
+
+def _clock_rate(text: str, scale: float) -> Finding:
+    """Return the finding on times that are `scale` times the true ones."""
     fix = "the unit or rate of the time column in the mapping, or "
     fix += option(("time", f"{1.0 / scale:.4g}"))
-    return [Finding("doubt", "time", text, "time_unit", scale, 0.95, fix)]
+    return Finding("doubt", "time", text, "time_unit", scale, 0.95, fix)
 
 
 def check_height(rows: Rows) -> list[Finding]:

@@ -36,6 +36,8 @@ SAME = 1.1
 """A scale within this factor of 1 is correct."""
 FAR = 1.15
 """A scale within this factor of 1 is no fault but a note: attitude filters cause as much."""
+EXACT = 1.04
+"""A scale within this factor of 1 needs no note."""
 OK = 0.3
 """Largest relative residual of a correct signal."""
 
@@ -187,8 +189,10 @@ def scale_findings(
     """
     scale, low, high = pooled_scale(found)
     figures = f"it is {scale:.3g} times {of} ({low:.3g} to {high:.3g})"
-    if not np.isfinite(scale) or low < 1.0 < high or 1.0 / same < scale < same:
+    if not np.isfinite(scale) or low < 1.0 < high or 1.0 / EXACT < scale < EXACT:
         return [Finding("ok", subject, figures)]
+    if 1.0 / same < scale < same:
+        return [Finding("note", subject, f"{figures}: a filter, a scale, or the rate of a clock")]
     if low / max(FAR, same) < 1.0 < high * max(FAR, same):
         text = f"{figures}: filters of the log may cause as much"
         return [Finding("note", subject, text), *unseen(subject, text, fault)]

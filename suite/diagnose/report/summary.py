@@ -56,8 +56,8 @@ HEADINGS = {
 log."""
 UNTESTED = "Whether the file itself is right was not tested: for that, leave out --reference."
 CHECK = (
-    "Verify the signals: a log's errors resemble physics. The checks of suite check, which ran "
-    "here, too, do not find scales that are off by less than a tenth, or strong filters."
+    "Verify the signals: a log's errors resemble physics. Read the notes of suite check: a small "
+    "error of a scale or a filter is a note, and stops no diagnosis."
 )
 
 

@@ -239,6 +239,12 @@ KINDS: dict[str, Kind] = {
         change=lambda p, _: {**p, "time": 1e3 * p["time"]},
         formats=("table", "flight log"),
     ),
+    "clock 6 % too slow": Kind(
+        ("time_unit",),
+        change=lambda p, _: {**p, "time": 0.94 * p["time"]},
+        needs=("pos", "quat", "vel", "rate"),
+        formats=("table", "flight log"),
+    ),
     "throttle is a share of the motors' speed": Kind(
         ("throttle_curve",), change=unlinearised, needs=("throttle", "cmd_thrust")
     ),

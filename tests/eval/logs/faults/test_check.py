@@ -34,6 +34,23 @@ def test_a_time_takes_a_unit_or_a_positive_factor(text):
     )
 
 
+@pytest.mark.parametrize("factor", [0.92, 0.95, 1.05, 1.08])
+def test_a_small_error_of_a_clocks_rate_needs_gyro_and_velocity(factor):
+    log = fly(PLAIN, 0, duration_s=8.0)
+    scaled = {
+        "clock": {"time_s": factor * log.time_s},
+        "gyro": {"rate_b": factor * log.rate_b},
+        "velocity": {"vel_w": factor * log.vel_w},
+        "position": {"pos_w": factor**2 * log.pos_w, "vel_w": factor**2 * log.vel_w},
+    }
+    for name, change in scaled.items():
+        found, _ = check_log(replace(log, **change), CheckContext(PLAIN))
+        sizes = [f.size for f in found if f.is_open]
+        assert sizes == ([pytest.approx(factor, rel=0.01)] if name == "clock" else []), name
+        noted = {f.signal for f in found if f.status == "note" and "a clock" in f.evidence}
+        assert noted <= {name} and (noted or name in ("clock", "position"))
+
+
 @pytest.mark.parametrize("factor", [0.5, 0.8, 1.25, 2.0])
 def test_a_clock_of_another_rate_is_one_fault(factor):
     parts = flight(100.0, 10.0, 0.3)
