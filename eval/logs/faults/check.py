@@ -179,13 +179,13 @@ def _check_pose(rows: Rows) -> list[Finding]:
     found = check_pose(rows)
     doubts = {f.fault for f in found if f.status in ("doubt", "corrected")}
     if doubts & {"attitude", "position_axes"}:
-        turned = [f for f in check_heading(rows) if f.is_open]
+        other = [f for f in check_heading(rows) if f.is_open]
         if "attitude" in doubts:
-            turned = [f for f in check_position_delay(rows) if f.is_open] or turned
-        elif turned and abs((turned[0].size + 45.0) % 90.0 - 45.0) < QUARTER_DEG:
-            turned = []
-        if turned:
-            return turned
+            other = [f for f in check_position_delay(rows) if f.is_open] or other
+        elif other and abs(((other[0].size or 0.0) + 45.0) % 90.0 - 45.0) < QUARTER_DEG:
+            other = []
+        if other:
+            return other
     is_late = any(f.fault == "clock_offset" and f.is_open for f in check_clock(rows))
     return [] if is_late and "attitude" in doubts else found  # a later check reports the clock
 

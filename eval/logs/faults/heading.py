@@ -28,7 +28,7 @@ LEAST_DEG, SURE = 5.0, 4.0
 SEEN_DEG = 15.0
 """The angle is not identifiable where `SURE` standard errors exceed this [deg]."""
 LEAST_SCALE = 0.05
-"""Least error of the path's scale that is a note. In 7 of 19 real logs it is larger, as attitude
+"""Least error of the path's scale that is a note. In 7 of 20 real logs it is larger, as attitude
 filters cause as much."""
 LEAST_ROWS = 200
 """Least rows for the fit."""
@@ -49,10 +49,8 @@ def check_heading(rows: Rows) -> list[Finding]:
     if abs(turn) < max(LEAST_DEG, SURE * error):
         notes = [Finding("ok", "heading", figures)]
         if abs(scale - 1.0) > max(LEAST_SCALE, SURE * scale_error):
-            text = (
-                f"the path's acceleration is {scale:.3g} times (± {scale_error:.2g}) that of the "
-            )
-            text += "attitude and gravity: a scale, the rate of a clock (squared), or a filter"
+            text = f"the path's acceleration is {scale:.3g} times (± {scale_error:.2g}) what the "
+            text += "attitude shows: a scale, the rate of a clock (squared), or a filter"
             notes.append(Finding("note", "position", text))
         return notes
     fix = "align the world axes of position and attitude (declination, or axes of a motion capture)"

@@ -124,7 +124,8 @@ def _small_clock_rate(rows: Rows, scale: float) -> list[Finding]:
     path = velocity_from_position(rows["time"], rows["pos"])
     found = match(*(smooth(rows["time"], value, GYRO_S) for value in (path, rows["vel"])))
     speed, low, high = pooled_scale(found)
-    if not low / ALIKE < scale < high * ALIKE or found.misfit(found.as_given) > OK:
+    is_alike = low / ALIKE < scale < high * ALIKE and found.misfit(found.as_given) < OK
+    if not is_alike or low / NEAR_CLOCK < 1.0 < high * NEAR_CLOCK:
         return []
     text = f"gyro and velocity are {scale:.3g} and {speed:.3g} times what attitude and position "
     return [_clock_rate(f"{text}show: its steps are about {speed:.3g} times the true ones", speed)]
