@@ -24,7 +24,7 @@ from eval.logs.flight import Flight
 from eval.sensors import view_models
 from eval.sensors.sensors_file import PERFECT, SensorSet
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds import REFERENCE, World, action_argument, compiles, world_class
+from eval.worlds import World, action_argument, compiles, world_class
 from eval.worlds.slots import layout_of, slot_groups
 from eval.worlds.trial import (
     FLYING,
@@ -128,8 +128,6 @@ def fly(
     for trial in trials:
         if trial.track not in tracks:
             check_family(trial.track)
-    if record:
-        check_records(world)
     task = Task(policy, vehicle, world, options, record, tracks)
     results: dict[int, TrialResult] = {}
 
@@ -147,14 +145,6 @@ def fly(
     shares = [share for group in groups for share in pieces_of(group, count, most_a_piece)]
     run_pieces(partial(fly_share, task), shares, workers, keep)
     return [results[index] for index in range(len(trials))]
-
-
-def check_records(world: str) -> None:
-    """Raise a ValueError for a simulator that cannot record flights; it names the alternative."""
-    if world == REFERENCE:
-        raise ValueError(
-            f"simulator {REFERENCE!r} records no flights; record in 'mujoco', which flies equally"
-        )
 
 
 def pieces_of(trials: Sequence[Trial], processes: int, most: int) -> list[Sequence[Trial]]:
@@ -193,16 +183,6 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
     policy = task.policy if _is_policy(task.policy) else task.policy()
     check_is_policy(policy)
     options = task.options
-    if task.world == REFERENCE:
-        frequency = task.vehicle.controller.frequency
-        check_rate(f"policy {policy.name!r}", policy.spec.rate_hz, frequency)
-        for index, trial in share:
-            result = world_class(REFERENCE)(
-                policy, trial, track_of(task.tracks, trial), task.vehicle, options.rules,
-                options.limits, options.slots, options.sensors,
-            )  # fmt: skip
-            yield index, result, None
-        return
     # Empty slots take little time, but another number of slots may need a compilation.
     block = COMPILED_SLOTS if compiles(task.world) else 1
     slots = min(options.slots, block * max(1, math.ceil(len(share) / block)))

@@ -23,21 +23,18 @@ from policies.spec import ActionSpec
 from tracks.common.names import Registry
 from tracks.track import Track
 
-REFERENCE = "reference"
-"""The simulator without slots: `eval.worlds.reference.fly_trial`, one trial at a time."""
 WORLDS: Registry[Any] = Registry(
     "simulator",
     "diffracing_suite.worlds",
     {
         "mujoco": "eval.worlds.mujoco:MujocoWorld",
         "mjx": "eval.worlds.mjx:MjxWorld",
-        REFERENCE: "eval.worlds.reference:fly_trial",
         "rotorpy": "eval.worlds.rotorpy:RotorpyWorld",
     },
     lambda name, world: None if callable(world) else f"{world!r}; must be a class (`World`)",
 )
 """Name of a simulator -> class (a `World`), called with (vehicle, camera, layout, rules, slots=,
-threads=). `REFERENCE` is a function instead."""
+threads=)."""
 
 
 class Rows(NamedTuple):
@@ -140,7 +137,7 @@ class World(Protocol):
 
 
 def world_class(name: str) -> Any:
-    """Return the class of the world `name`; for `REFERENCE`, the function.
+    """Return the class of the world `name`.
 
     Raises:
         ValueError: for an unknown simulator, or a missing package.

@@ -15,7 +15,7 @@ import tyro
 
 from eval.judging.tables import percent
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.worlds import REFERENCE, WORLDS, differences, nearest
+from eval.worlds import WORLDS, differences, nearest
 from policies import shipped
 from suite.common.console import Console
 from suite.experiments.pages.document import PageContents
@@ -69,11 +69,10 @@ def conditions(config: Config) -> list[Condition]:
         raise ValueError(f"--simulator {repeated} is given twice; give each simulator once")
     entries = [Condition(BASE, 1.0, "", vehicle)]
     for name in config.simulator or (ROUNDING, "rotorpy"):
-        if name in (BASE, REFERENCE):
-            others = ", ".join(known for known in WORLDS if known not in (BASE, REFERENCE))
+        if name == BASE:
+            others = ", ".join(known for known in WORLDS if known != BASE)
             raise ValueError(
-                f"--simulator {name}: the page compares with {BASE}, whose dynamics are those of "
-                f"{REFERENCE}; give one of {others}"
+                f"--simulator {name}: the page compares the others with it; give one of {others}"
             )
         # A simulator with other aerodynamics offers the vehicle that is nearest to them in mujoco.
         described = nearest(name, vehicle)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from eval.effects.log_faults import apply_log_faults
-from eval.judging.judge import Record, check_records
+from eval.judging.judge import Record
 from eval.judging.results import Journal
 from eval.logs.columns import DURATION_MIN, FlightLogError
 from eval.logs.flight import Flight
@@ -65,7 +65,6 @@ def collect(
         ValueError: if a setting of `collection` cannot be used, or `out` holds other flights.
     """
     trial_set, manner = read_trial_set(collection), Manner(speed=collection.speed)
-    check_records(collection.simulator)
     refuse_equal_names({trial.track for trial in trial_set.trials})
     source = collection.policy or default_policy()
     policy = load_in_manner(source, collection.trust, manner)

@@ -44,8 +44,8 @@ class SimulatedFlights(Flights):
     """Flights with a choice of simulator and sensors."""
 
     simulator: str = "mujoco"
-    """mujoco (fast on CPUs), mjx (for GPUs), reference (slow and simple), rotorpy (needs
-    pip install 'diffracing-suite[rotorpy]'), or the simulator of an installed package."""
+    """mujoco (fast on CPUs), mjx (for GPUs), rotorpy (needs pip install
+    'diffracing-suite[rotorpy]'), or the simulator of an installed package."""
     sensors: str = "perfect"
     """Errors in what the policy sees: a shipped name (perfect, vio, stereo-depth, ...) or a sensors
     file (.toml). Recorded logs have the true state, with the log

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from eval.judging.judge import check_records
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors.sensors_file import SensorSet, load_sensors, sensors_table
 from eval.vehicles.vehicle import Vehicle
@@ -198,7 +197,6 @@ def resolve(options: Config) -> LoopConfig:
     if hidden:
         refuse_own_motion(simulated)
         world_class(simulator)
-        check_records(simulator)
         true = load_vehicle(true_vehicle)
         if simulated == replace(true, name=simulated.name) and simulator in EXACT_SIMULATORS:
             raise ValueError(

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from eval.judging.judge import JudgeOptions, fly
+from eval.judging.judge import JudgeOptions
 from eval.worlds.trial import TrialSpec
+from tests.support.reference import fly
 from tracks.geometry.scene import Boxes, Gates, Rods, Scene, Spheres
 from tracks.track import Track
 

@@ -5,7 +5,7 @@ import multiprocessing
 import numpy as np
 import pytest
 
-from eval.judging.judge import JudgeOptions, Record, fly
+from eval.judging.judge import JudgeOptions, Record
 from eval.judging.recorder import Recorder
 from eval.judging.results import Journal
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -14,6 +14,7 @@ from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
 from tests.support.courses import fly_on, straight
 from tests.support.pilots import Pursuit, Steady, random_network
+from tests.support.reference import fly
 from tracks.formats.custom import load_track
 
 VEHICLE = load_vehicle("reference")
@@ -28,16 +29,13 @@ def test_unknown_names_are_refused_before_anything_flies():
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, 501.0])
-@pytest.mark.parametrize("world", ["mujoco", "reference"])
-def test_a_policy_that_cannot_keep_time_is_refused(rate_hz, world):
+def test_a_policy_that_cannot_keep_time_is_refused(rate_hz):
     policy = Steady(spec=PolicySpec(rate_hz=rate_hz))
     with pytest.raises(ValueError, match="decides at"):
-        fly(policy, [TrialSpec("zigzag", 0, 0)], VEHICLE, world)
+        fly(policy, [TrialSpec("zigzag", 0, 0)], VEHICLE)
 
 
-def test_the_reference_world_records_nothing_and_without_trials_nothing_flies():
-    with pytest.raises(ValueError, match="records no flights"):
-        fly(Pursuit(), [TrialSpec("zigzag", 0, 0)], VEHICLE, "reference", record=Record())
+def test_without_trials_nothing_flies():
     assert fly(Pursuit(), [], VEHICLE) == []
 
 

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from eval.judging import judge, sensors
 from eval.judging import judge as module
-from eval.judging.judge import JudgeOptions, fly
+from eval.judging.judge import JudgeOptions
 from eval.judging.sensors import Filtered, Sensors, inertial
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors.filter.kalman import update_gate
@@ -19,6 +19,7 @@ from eval.worlds.trial import Rules, TrialSpec
 from policies.observation import View
 from policies.spec import PolicySpec
 from tests.support.pilots import Pursuit, random_network
+from tests.support.reference import fly
 from tracks.geometry.camera import Camera
 from tracks.geometry.rotation import exp_rot
 
@@ -118,8 +119,6 @@ def test_the_reference_simulator_shows_the_same():
     prompt = sensor_set({name: v for name, v in models.items() if name != "delay"})
     one, two = (results(TRIALS[:2], prompt, world=world) for world in ("mujoco", "reference"))
     assert [row._replace(world="mujoco") for row in two] == one
-    with pytest.raises(ValueError, match="has no delay of observations"):
-        results(TRIALS[:1], sensor_set({"delay": {"state": 0.1}}), world="reference")
 
 
 SPEC = PolicySpec(rate_hz=31.25, camera=Camera(width=4, height=4))
@@ -195,10 +194,8 @@ def test_a_trials_outcome_is_the_same_at_any_batch(monkeypatch):
     assert together == alone
 
 
-def test_what_has_no_estimator_refuses_it(monkeypatch):
+def test_an_estimator_with_another_delay_is_refused(monkeypatch):
     wanted = load_sensors("imu+gates")
-    with pytest.raises(ValueError, match="world 'reference' has no state estimator"):
-        fly(Pursuit(spec=SPEC), TWO_TRACKS[:1], VEHICLE, "reference", JudgeOptions(sensors=wanted))
     models = {name: values._asdict() for name, values in wanted.models.items()}
     late = sensor_set({**models, "delay": {"state": 0.02}})
     with pytest.raises(ValueError, match=r"delay.state is 0.02 s, but the estimator"):

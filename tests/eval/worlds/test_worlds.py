@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from eval.effects.slung_load import SlungLoad
-from eval.judging.judge import JudgeOptions, Record, fly
+from eval.judging.judge import JudgeOptions, Record
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.worlds import reference as reference_world
 from eval.worlds import scene_slots
 from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
+from tests.support import reference as reference_world
 from tests.support.courses import fly_on, straight
 from tests.support.pilots import Pursuit, Scripted, Steady, Watcher
+from tests.support.reference import fly
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 from tracks.families import make_track
 from tracks.geometry.camera import Camera

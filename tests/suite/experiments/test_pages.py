@@ -266,7 +266,7 @@ def test_every_experiment_is_listed_and_has_help_for_every_option(capsys):
         ("table2 --policy race-papr", "Did you mean 'race-paper'?"),
         ("table2 --policy nowhere/policy", "nowhere/policy: no such file"),
         ("simulators --policy {folder}/mine.pt2", "suite reproduce never does"),
-        ("simulators --simulator reference", "reference: the page compares with mujoco"),
+        ("simulators --simulator mujoco", "mujoco: the page compares the others"),
         ("simulators --simulator mjx --simulator mjx", "--simulator mjx is given twice"),
         ("robustness --only linear_darg", "Did you mean 'linear_drag'?"),
         ("robustness --policy race --policy race", "--policy race is given twice"),

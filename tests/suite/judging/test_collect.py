@@ -182,10 +182,7 @@ def test_what_cannot_be_recorded_is_refused(pilots, tmp_path, capfd):
     for track in tracks:
         track.parent.mkdir()
         track.write_text(COURSE)
-    for option, value, words in (
-        ("--track", ",".join(map(str, tracks)), "several tracks are called 'course'"),
-        ("--simulator", "reference", "'reference' records no flights; record in 'mujoco'"),
-    ):
-        asked = ("collect --policy", pilots["diver"], "--out", tmp_path / "out")
-        assert words in refused(capfd, *asked, option, value)
-        assert not (tmp_path / "out").exists()
+    asked = ("collect --policy", pilots["diver"], "--out", tmp_path / "out")
+    said = refused(capfd, *asked, "--track", ",".join(map(str, tracks)))
+    assert "several tracks are called 'course'" in said
+    assert not (tmp_path / "out").exists()

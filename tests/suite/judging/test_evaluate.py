@@ -126,9 +126,6 @@ def test_what_cannot_be_used_is_said_before_the_first_flight(pilots, tmp_path, m
         ("--simulator mujco", "Did you mean 'mujoco'?"),
         ("--vehicle referense", "Did you mean 'reference'?"),
         ("--policy nobody_we_know", "nobody_we_know"),
-        ("--rerun trials.rrd --simulator reference", "'reference' records no flights"),
-        ("--rerun /proc/nowhere/trials.rrd", "/proc/nowhere"),
-        ("--rerun trials.mp4", "trials.mp4"),
         # What tables would take for one.
         (f"--policy {pilots['other']} --track zigzag --speed 0.5 0.5", "judged twice; give each"),
         (f"--policy {pilots['other']} --speed 0.5 0.50000001", "other@0.5 would be judged twice"),

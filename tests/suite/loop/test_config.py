@@ -48,7 +48,6 @@ EXAMPLE = "examples/hidden.toml"
         ("--policy race-paper --iterations 5", "--iterations is 5, but with --policy, --hidden"),
         ("--hidden-vehicle reference", "nothing is hidden"),
         ("--simulator mjx", "nothing is hidden"),
-        ("--simulator reference", "records no flights"),
         ("--hidden-vehicle {0} --no-delta --fit-iterations 5", "--fit-iterations is 5, but"),
         ("--hidden-vehicle {0} --set quadrotor.mas_std=0", "Did you mean 'mass_std'"),
     ],

@@ -1,7 +1,6 @@
-"""The simulator `reference`: one trial (a flight along a track) as a loop of MuJoCo steps.
+"""One trial (a flight along a track) as a loop of MuJoCo steps, to compare the simulators with.
 
-Tests compare the batched simulators with this readable function. Both use the same vehicle model,
-but this one counts gates and ends a trial by separate code.
+Both use the same vehicle model, but this one counts gates and ends a trial by separate code.
 """
 
 from __future__ import annotations
@@ -9,6 +8,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from eval.judging import judge
 from eval.judging.guard import ActionLimits, Guarded, call_policy, first_action, limits_of
 from eval.judging.outputs import Outputs
 from eval.judging.sensors import Sensors
@@ -17,16 +17,33 @@ from eval.quadrotor.plant import Motion, uses_noise
 from eval.sensors import view_models
 from eval.sensors.sensors_file import PERFECT, SensorSet
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds import REFERENCE
 from eval.worlds.engine import DepthCamera, compile_model, contact_name, motion_of, start_state
 from eval.worlds.slots import GustDraws, layout_of
-from eval.worlds.trial import Rules, TrialResult, TrialSpec
+from eval.worlds.trial import Rules, TrialResult, TrialSpec, track_of
 from policies.observation import observe, view_of
 from policies.policy import Policy
 from tracks.geometry.crossing import crossing, is_near
 from tracks.geometry.rotation import to_world
 from tracks.geometry.scene import Gates
 from tracks.track import Track
+
+REFERENCE = "reference"
+"""Name of this simulator, for `fly`."""
+
+
+def fly(policy, trials, vehicle, world="mujoco", options=None, on_result=None, record=None,
+        tracks=None):  # fmt: skip
+    """Fly trials as `eval.judging.judge.fly` does; in the world `REFERENCE` one after the other."""
+    if world != REFERENCE:
+        return judge.fly(policy, trials, vehicle, world, options, on_result, record, tracks)
+    options, results = options or judge.JudgeOptions(), []
+    for trial in trials:
+        track = track_of(tracks or {}, trial)
+        how = (options.rules, options.limits, options.slots, options.sensors)
+        results.append(fly_trial(policy, trial, track, vehicle, *how))
+        if on_result:
+            on_result(results[-1], None)
+    return results
 
 
 def fly_trial(
@@ -48,12 +65,9 @@ def fly_trial(
     Returns:
         The outcome of the trial.
 
-    Raises:
-        ValueError: for delayed or filtered observations, which this simulator does not have.
+    It has neither delayed nor filtered observations.
     """
-    if sensor_set.has_delay or sensor_set.estimator:
-        missing = "state estimator" if sensor_set.estimator else "delay of observations"
-        raise ValueError(f"world 'reference' has no {missing}; fly in 'mujoco'")
+    assert not sensor_set.has_delay and not sensor_set.estimator
     rules, limits = rules or Rules(), limits or ActionLimits()
     autopilot = make_autopilot(vehicle, policy.spec.action)
     dt, spec = autopilot.dt, policy.spec
