@@ -19,14 +19,12 @@ from eval.logs.flight import Flight
 from eval.view import colours
 from eval.view.chase import ABOVE_M, Drone, camera_behind, draw_drone, scenery_of
 from eval.view.scene3d import SKY, Lines
-from eval.view.video_file import write_gif, write_mp4
+from eval.view.video_file import ENCODING, write_video_file
 from eval.worlds.trial import TrialResult
 from tracks.common.files import replacing_file
 from tracks.geometry.rotation import quat_to_rot
 from tracks.track import Track
 
-SUFFIXES = (".mp4", ".gif")
-"""Allowed endings of a video file."""
 DEPTH_RANGE_M = 10.0
 """Depth at the end of the colour scale [m]."""
 TRAIL_S = 1.6
@@ -78,8 +76,7 @@ def write_video(
         OSError: where the file cannot be written; nothing is left under its name.
     """
     path, options = Path(path), options or VideoOptions()
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
+    if path.suffix.lower() not in ENCODING:
         raise ValueError(f"{path}: ending {path.suffix!r}; a video ends in .mp4 or .gif")
     if options.size[0] % 2 or options.size[1] % 2 or min(options.size) < 64:
         raise ValueError(f"size {options.size}; both must be even and 64 or more")
@@ -88,10 +85,7 @@ def write_video(
         raise ValueError(f"{path}: a flight of {len(flight.time_s)} usable rows; two are needed")
     frames = video_frames(track, flight, result, options)
     with replacing_file(path) as temporary:
-        if suffix == ".gif":
-            write_gif(temporary, frames, options.fps, _swatches(), on_frame)
-        else:
-            write_mp4(temporary, frames, options.size, options.fps, on_frame)
+        write_video_file(temporary, frames, options.size, options.fps, on_frame)
     return path
 
 
@@ -129,14 +123,6 @@ def video_frames(
         ended = time >= flight.time_s[-1]
         _draw_text(frame, side_width, track, result, float(time), float(speed[row]), passed, ended)
         yield frame
-
-
-def _swatches() -> np.ndarray:
-    """Return colours (n, 3) that a video needs and that are rare in its first frame."""
-    gates = np.array([colours.AHEAD, colours.PASSED, colours.CRASH, colours.START])
-    shades = [gates * shade for shade in (0.5, 0.65, 0.8, 0.95)]
-    depths = colours.depth_colours(np.linspace(0, DEPTH_RANGE_M, 40), DEPTH_RANGE_M)
-    return np.concatenate([*shades, depths, colours.speed_colours(np.linspace(0, 1, 12), 1.0)])
 
 
 def _finite_part(flight: Flight) -> Flight:

@@ -19,7 +19,7 @@ from eval.view.recording import Drone, write_recording
 from eval.view.scene3d import Faces, Lines, divide_faces, look_at, paint
 from eval.view.solids import flat_normals, join_solids, outline, track_solids
 from eval.view.video import DEPTH_RANGE_M, VideoOptions, frame_times, video_frames, write_video
-from eval.view.video_file import write_gif
+from eval.view.video_file import write_video_file
 from tests.support.flights import rollout, small_track
 from tests.support.pixels import opened, share
 from tests.support.recordings import columns
@@ -248,7 +248,7 @@ def test_a_video_plays_the_whole_flight(tmp_path, kind):
 
 def test_a_gif_is_as_long_as_its_frames_at_any_rate(tmp_path):
     frames = [Image.new("RGB", (8, 8), (20 * k, 0, 0)) for k in range(12)]
-    write_gif(tmp_path / "a.gif", frames, 12, np.array([[255, 0, 0]]))
+    write_video_file(tmp_path / "a.gif", frames, (8, 8), 12)
     with Image.open(tmp_path / "a.gif") as video:
         lasting = [frame.info["duration"] for frame in ImageSequence.Iterator(video)]
     assert sum(lasting) == 1000
