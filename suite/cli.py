@@ -2,9 +2,9 @@
 
 A command NAME is the module suite/commands/NAME.py, imported only when it is called. It has
 `Config`, a frozen dataclass whose fields become its options (the text under a field is its help),
-and `run(config, console)`, which does the work and returns the object that --json prints. If it has
-`config_of(args)`, this returns the configuration that the first word selects, that word, and the
-other words.
+and `run(config, console)`, which does the work and returns the object that --json prints; it raises
+a ValueError for options that cannot be used. If it has `config_of(args)`, this returns the
+configuration that the first word selects, that word, and the other words.
 """
 
 from __future__ import annotations

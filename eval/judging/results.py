@@ -20,10 +20,6 @@ from tracks.input.reading import LOG_BYTES, check_file, parse_json, read_bytes
 
 SCHEMA = 1
 """Version of the result files."""
-MOST_TRIALS = 1_000_000
-"""Largest number of rows of a trials.parquet that is read; they take about a gigabyte of memory."""
-MOST_TEXT = 1000
-"""Largest number of characters of a name in a trials.parquet."""
 
 
 def write_results(
@@ -56,18 +52,24 @@ def write_trials(
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    types = {"str": pa.string(), "int": pa.int64(), "float": pa.float64(), "bool": pa.bool_()}
-    fields = [pa.field(name, types[kind.split(" | ")[0]]) for name, kind in _kinds().items()]
-    schema = pa.schema(fields, metadata={"suite": to_json(header)})
     columns = {name: [getattr(result, name) for result in results] for name in TrialResult._fields}
+    table = pa.table(columns, schema=pa.schema(_types(), metadata={"suite": to_json(header)}))
     with replacing_file(path) as temporary:
-        pq.write_table(pa.table(columns, schema=schema), temporary)
+        pq.write_table(table, temporary)
 
 
 def _kinds() -> dict[str, str]:
     """Return name -> type, as text, of each field of `TrialResult`."""
     annotations = TrialResult.__annotations__.items()
     return {name: getattr(kind, "__forward_arg__", kind) for name, kind in annotations}
+
+
+def _types() -> dict[str, Any]:
+    """Return name -> type in Parquet of each field of `TrialResult`."""
+    import pyarrow as pa
+
+    types = {"str": pa.string(), "int": pa.int64(), "float": pa.float64(), "bool": pa.bool_()}
+    return {name: types[kind.split(" | ")[0]] for name, kind in _kinds().items()}
 
 
 def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
@@ -80,20 +82,10 @@ def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    kinds = _kinds()
     try:
         check_file(path, LOG_BYTES)
         with pq.ParquetFile(path) as file:
-            schema, rows = file.schema_arrow, file.metadata.num_rows
-        if rows > MOST_TRIALS:
-            raise ValueError(f"{path}: {rows:,} trials, allowed are up to {MOST_TRIALS:,}")
-        present = [name for name in kinds if name in schema.names]
-        _check_columns(path, schema, present)
-        # Texts stay dictionary-encoded; a long text in every row would not fit into memory.
-        text_columns = [name for name in present if kinds[name].startswith("str")]
-        with pq.ParquetFile(path, read_dictionary=text_columns) as file:
-            table = file.read(present)
-        columns = [_cells(path, name, table[name], kinds[name]) for name in present]
+            names, table = file.schema_arrow.names, file.read()
     except MemoryError:  # also a subclass of ArrowException
         raise
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
@@ -101,65 +93,25 @@ def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
         raise ValueError(
             f"{path}: not a readable Parquet file ({first_line}); run suite eval again"
         ) from error
-    rows = zip(*columns, strict=True)
-    return [TrialResult(**dict(zip(present, row, strict=True))) for row in rows]
-
-
-def _check_columns(path: str | os.PathLike[str], schema: Any, present: list[str]) -> None:
-    """Check the columns `present` before they are read.
-
-    Raises:
-        ValueError: where a required one is missing, occurs twice or has another type.
-    """
-    from pyarrow import types
-
-    kinds = _kinds()
-    for name in sorted(kinds.keys() - TrialResult._field_defaults.keys() - set(present)):
-        raise ValueError(f"{path}: no column {name!r}; is it a trials.parquet of this suite?")
-    fits = {
-        "int": types.is_integer,
-        "float": lambda kind: types.is_floating(kind) or types.is_integer(kind),
-        "bool": types.is_boolean,
-        "str": lambda kind: types.is_string(kind) or types.is_large_string(kind),
-    }
-    for name in present:
-        if schema.names.count(name) > 1:
-            raise ValueError(f"{path}: column {name!r} is there twice; run suite eval again")
-        column_type = kind = schema.field(name).type
-        if types.is_dictionary(column_type):
-            kind = column_type.value_type
-        required, *optional = kinds[name].split(" | ")
-        if not fits[required](kind) and not (optional and types.is_null(kind)):
-            raise _type_error(path, name, column_type)
-
-
-def _type_error(path: str | os.PathLike[str], name: str, column_type: Any) -> ValueError:
-    """Return (not raise) the error for a column with values that a trial cannot have."""
-    return ValueError(
-        f"{path}: column {name!r} holds {column_type}, cells without a value or texts of more than "
-        f"{MOST_TEXT:,} characters, where a trial has {_kinds()[name]}; is it a trials.parquet "
-        "of this suite?"
-    )
-
-
-def _cells(path: str | os.PathLike[str], name: str, column: Any, kind: str) -> list[Any]:
-    """Return a column as a list of Python values.
-
-    Raises:
-        ValueError: where values are missing, or texts are too long.
-    """
-    from pyarrow import types
-
-    if column.null_count and "None" not in kind:
-        raise _type_error(path, name, column.type)
-    if not types.is_dictionary(column.type):
+    columns = {}
+    for name, kind in _kinds().items():
+        if name not in names and name in TrialResult._field_defaults:
+            continue
+        if names.count(name) != 1:
+            count = names.count(name) or "no"
+            raise ValueError(
+                f"{path}: {count} columns {name!r}; is it a trials.parquet of this suite?"
+            )
+        column = table[name]
+        if column.type != _types()[name] or (column.null_count and "None" not in kind):
+            raise ValueError(
+                f"{path}: column {name!r} holds {column.type}, or cells without a value, where a "
+                f"trial has {kind}; is it a trials.parquet of this suite?"
+            )
         # All NaN are one object, so that trials with NaN compare equal.
-        return [math.nan if cell != cell else cell for cell in column.to_pylist()]
-    coded = column.unify_dictionaries().combine_chunks()
-    texts = [*coded.dictionary.to_pylist(), None]
-    if any(len(text or "") > MOST_TEXT for text in texts):
-        raise _type_error(path, name, column.type)
-    return [texts[number] for number in coded.indices.fill_null(len(texts) - 1).to_pylist()]
+        columns[name] = [math.nan if cell != cell else cell for cell in column.to_pylist()]
+    rows = zip(*columns.values(), strict=True)
+    return [TrialResult(**dict(zip(columns, row, strict=True))) for row in rows]
 
 
 class Journal:

@@ -28,11 +28,7 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Run the benchmark `config.name`, and show the speeds of both sides and their ratio.
-
-    Raises:
-        ValueError: for an unknown benchmark, or a policy for one that measures no policy.
-    """
+    """Run the benchmark `config.name`, and show the speeds of both sides and their ratio."""
     if not config.name:
         if config.policy is not None:
             raise ValueError(

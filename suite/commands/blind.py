@@ -62,12 +62,7 @@ USED_BY = {
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Do the action `config.what`.
-
-    Raises:
-        ValueError: for an option of another action, a folder that holds another set, or names that
-            are not in the catalogue.
-    """
+    """Do the action `config.what`."""
     for name, actions in USED_BY.items():
         value = getattr(config, name)
         if config.what not in actions and value != getattr(Config, name):

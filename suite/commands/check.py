@@ -44,9 +44,6 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Returns:
         `findings`, `not_identifiable` (faults that these files can neither show nor exclude), and
         facts about the checked files.
-
-    Raises:
-        ValueError: if there is nothing to check, or a file is refused.
     """
     from eval.logs.faults.check import NOT_CHECKED
     from suite.judging.checking import check_flight_files, check_policy

@@ -29,11 +29,7 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Record the flights; existing logs of an interrupted call are kept.
-
-    Raises:
-        ValueError: for an option that cannot be used, before the first flight.
-    """
+    """Record the flights; existing logs of an interrupted call are kept."""
     from suite.judging.collect import collect
 
     return collect(config.flown, config.out, console, read_workers_option(config.workers))

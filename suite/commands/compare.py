@@ -32,9 +32,6 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """Compare the runs and print a sentence about each comparison.
 
     With several runs on one side of --against, the means over the training seeds are compared.
-
-    Raises:
-        ValueError: for too few runs, a run given twice, or runs under different conditions.
     """
     from suite.judging.comparing import (
         compare_runs,

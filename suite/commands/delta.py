@@ -41,11 +41,7 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Fit the model, and show the errors on held-out flights with the model and without it.
-
-    Raises:
-        ValueError: for an unknown recipe or logs that cannot be used.
-    """
+    """Fit the model, and show the errors on held-out flights with the model and without it."""
     from eval.logs.faults.check import CheckContext
     from eval.logs.faults.checked import COMPENSATED, read_checked
     from suite.delta.fit import FitConfig

@@ -9,11 +9,7 @@ from suite.diagnose.config import Config
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Diagnose, and print the verdict, the named effects and the next steps.
-
-    Raises:
-        ValueError: for flights or a vehicle file that cannot be used.
-    """
+    """Diagnose, and print the verdict, the named effects and the next steps."""
     from suite.diagnose.report.summary import components, next_steps
     from suite.diagnose.run import diagnose_files
 

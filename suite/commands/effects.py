@@ -23,11 +23,7 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """List the catalogue, or describe `config.name`.
-
-    Raises:
-        ValueError: for a name that is not in the catalogue.
-    """
+    """List the catalogue, or describe `config.name`."""
     from eval.effects import EFFECTS
     from eval.effects.interface import bound_value
     from eval.quadrotor.vehicle_file import load_vehicle

@@ -28,11 +28,7 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Judge the policies, and write the tables.
-
-    Raises:
-        ValueError: for an option that cannot be used, before the first flight.
-    """
+    """Judge the policies, and write the tables."""
     from suite.judging.evaluate import evaluate
 
     return evaluate(config.flown, config.out, console, read_workers_option(config.workers))

@@ -29,11 +29,7 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Write the files and print their paths.
-
-    Raises:
-        ValueError: if the policy was not trained by the suite, or a format or type is unknown.
-    """
+    """Write the files and print their paths."""
     from policies import shipped
     from policies.formats.export import FORMATS
     from suite.judging.deploy.exporting import export

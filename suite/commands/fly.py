@@ -46,7 +46,6 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """Fly, and write the flight logs.
 
     Raises:
-        ValueError: for an option that cannot be used, before the first flight.
         WorkFailed: if no vehicle answers.
     """
     from suite.judging.link.fly import fly_over_link

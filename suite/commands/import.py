@@ -64,11 +64,7 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Convert the log, and print the findings (records of probable faults).
-
-    Raises:
-        ValueError: for a file, a mapping or an option that cannot be used.
-    """
+    """Convert the log, and print the findings (records of probable faults)."""
     import numpy as np
 
     from eval.importers import import_log

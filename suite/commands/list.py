@@ -34,11 +34,7 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """List the names of a kind with a line about each, or the names of all kinds.
-
-    Raises:
-        ValueError: for an unknown kind or recipe.
-    """
+    """List the names of a kind with a line about each, or the names of all kinds."""
     if config.kind == "settings":
         from suite.train.recipes import named_recipe
 

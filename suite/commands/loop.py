@@ -14,11 +14,7 @@ from suite.loop.options import Config
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Run the loop, or its unfinished stages.
-
-    Raises:
-        ValueError: for an option that cannot be used, before the first stage.
-    """
+    """Run the loop, or its unfinished stages."""
     from suite.loop.config import resolve
     from suite.loop.run import run_loop
 

@@ -78,11 +78,7 @@ def config_of(args: Sequence[str]) -> tuple[Any, str, list[str]]:
 
 
 def run(config: Any, console: Console) -> dict[str, Any]:
-    """Make the page, or continue an interrupted call; without a page list them.
-
-    Raises:
-        ValueError: for an option that cannot be used, before the first flight.
-    """
+    """Make the page, or continue an interrupted call; without a page list them."""
     from suite.experiments import published
 
     experiment = getattr(config, "experiment", None)

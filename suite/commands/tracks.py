@@ -31,11 +31,7 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """List the families, or draw `config.track` at each level.
-
-    Raises:
-        ValueError: for an unknown family, a level out of range, or an invalid track file.
-    """
+    """List the families, or draw `config.track` at each level."""
     seed_given = config.seed != Config.seed
     if not config.track:
         if config.difficulty != Config.difficulty or seed_given or config.out != Config.out:

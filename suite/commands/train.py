@@ -115,11 +115,7 @@ def resolve(config: Config) -> TrainConfig:
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Train a policy; print its folder and the last row of the curve.
-
-    Raises:
-        ValueError: for options that cannot be used or do not go together.
-    """
+    """Train a policy; print its folder and the last row of the curve."""
     if config.list_settings:
         return {"settings": list_settings(resolve(config), console)}
     member = read_member(config.process_options)

@@ -59,11 +59,7 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Fly the chosen trials again and write the files.
-
-    Raises:
-        ValueError: if `config.run` is neither a run nor a policy, or no trial is left to show.
-    """
+    """Fly the chosen trials again and write the files."""
     recording = config.rerun or config.out / "trials.rrd"
     if recording.suffix != ".rrd":
         raise ValueError(f"--rerun {recording}: a recording's name must end in .rrd")

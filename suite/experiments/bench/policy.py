@@ -16,13 +16,6 @@ from suite.common.errors import WorkFailed
 from suite.experiments.bench.compare import Comparison, Figure
 from tracks.common.grid import Grid, table
 
-M7_HZ, M7_CYCLES = 480e6, {"C float32": 3.0, "C int8": 2.0}
-"""Processor Cortex-M7: clock [Hz], and clock cycles of a multiply-add in plain C with the weights
-in fast memory (two loads, the product, a share of the loop). Assumed, not measured."""
-A76_HZ, A76_CYCLES = 2.4e9, {"C float32": 0.5, "C int8": 0.5}
-"""Processor Cortex-A76: clock [Hz], and clock cycles of a multiply-add, at a quarter of the peak
-speed of two units of four lanes. Assumed, not measured."""
-
 
 def run(policy: str = "", rounds: int = 20) -> Comparison:
     """Time blocks of 100 steps of every engine (C export, ONNX Runtime, torch) in turn.
@@ -69,10 +62,6 @@ def run(policy: str = "", rounds: int = 20) -> Comparison:
             quantised = layers[engine]
             row["weight_bytes"] = constant_bytes(checkpoint, quantised)
             row["working_bytes"] = memory_bytes(checkpoint.spec, quantised is not None)
-            row["estimate_cortex_m7_480mhz_ms"] = (
-                1e3 * multiply_add_count * M7_CYCLES[engine] / M7_HZ
-            )
-            row["estimate_a76_2400mhz_ms"] = 1e3 * multiply_add_count * A76_CYCLES[engine] / A76_HZ
         rows[engine] = row
     ours, baseline = (
         Figure(rows[engine]["median_us"], "us/step, median", less_is_better=True)
@@ -103,12 +92,7 @@ def _c_steps(name: str, checkpoint: Any, folder: Path) -> tuple[dict[str, Any], 
 
 
 def _grid(rows: dict[str, dict[str, Any]]) -> Grid:
-    """Return a table of the measured times, and estimates for two processors, a row per engine."""
-    m7, a76 = M7_CYCLES, A76_CYCLES
-    note = (
-        f"Estimates are multiply-adds x cycles each, assumed and not measured: Cortex-M7 "
-        f"{m7['C float32']:g} (float32) and {m7['C int8']:g} (int8), A76 {a76['C float32']:g}."
-    )
+    """Return a table of the measured times and sizes, a row per engine."""
     columns = {
         "median [us]": ("median_us", ".1f"),
         "p99 [us]": ("p99_us", ".1f"),
@@ -116,11 +100,9 @@ def _grid(rows: dict[str, dict[str, Any]]) -> Grid:
         "multiply-adds": ("multiply_adds", "d"),
         "weights [B]": ("weight_bytes", "d"),
         "working memory [B]": ("working_bytes", "d"),
-        "Cortex-M7 480 MHz [ms], estimate": ("estimate_cortex_m7_480mhz_ms", ".2f"),
-        "A76 2.4 GHz [ms], estimate": ("estimate_a76_2400mhz_ms", ".2f"),
     }
     lines = [
         [name] + [format(row[k], f) if row.get(k) is not None else "-" for k, f in columns.values()]
         for name, row in rows.items()
     ]
-    return table(["engine", *columns], lines, note=note)
+    return table(["engine", *columns], lines)

@@ -13,7 +13,7 @@ import pytest
 from eval.judging.plans import over_plan, plans
 from eval.judging.results import Journal, read_trials, write_results
 from eval.judging.tables import NOTE, markdown_table, summarise
-from eval.worlds.trial import TrialResult, TrialSpec, track_of
+from eval.worlds.trial import TrialSpec, track_of
 from suite.common.errors import explain
 from tests.support.judged_cells import ROWS, result
 from tracks.geometry.crossing import crossing
@@ -89,9 +89,8 @@ def test_journal_of_something_else_is_refused(tmp_path):
         ("seed", pa.array(["a", "b"]), "'seed' holds string"),
         ("success", pa.array([2.5, 3.5]), "'success' holds double"),
         ("gates_passed", pa.array([1, None]), "cells without a value"),
-        ("policy", pa.array(["a", "b" * 1001]), "'policy' holds .* texts of more than 1,000"),
         ("policy", pa.array(["a", None]), "'policy' holds .* without a value"),
-        ("policy", None, "no column 'policy'"),
+        ("policy", None, "no columns 'policy'"),
     ],
 )
 def test_trials_of_other_types_are_refused_by_column(tmp_path, column, cells, said):
@@ -105,19 +104,15 @@ def test_trials_of_other_types_are_refused_by_column(tmp_path, column, cells, sa
     assert explain(met.value) is not None
 
 
-def test_a_pipe_a_column_twice_and_too_many_rows_are_no_trials(tmp_path):
+def test_a_pipe_and_a_column_twice_are_no_trials(tmp_path):
     os.mkfifo(tmp_path / "pipe.parquet")
     with pytest.raises(ValueError, match="a named pipe"):
         read_trials(tmp_path / "pipe.parquet")
     write_results(tmp_path, ROWS, table_markdown="", summary=summarise(ROWS), seed=7)
     table = pq.read_table(tmp_path / "trials.parquet")
     pq.write_table(table.append_column("seed", table["seed"]), tmp_path / "trials.parquet")
-    with pytest.raises(ValueError, match="'seed' is there twice"):
+    with pytest.raises(ValueError, match="2 columns 'seed'"):
         read_trials(tmp_path / "trials.parquet")
-    fields = {name: pa.array(np.zeros(1_000_001, np.int8)) for name in TrialResult._fields}
-    pq.write_table(pa.table(fields), tmp_path / "many.parquet")
-    with pytest.raises(ValueError, match="1,000,001 trials, allowed are up to 1,000,000"):
-        read_trials(tmp_path / "many.parquet")
 
 
 def test_paired_differences_are_on_the_same_trials():

@@ -87,8 +87,6 @@ def test_every_engine_is_timed_and_the_ratio_is_of_the_times(tmp_path, monkeypat
     for row in rows.values():
         assert 0 < row["median_us"] <= row["p99_us"] <= row["max_us"]
     assert rows["C int8"]["weight_bytes"] < 0.4 * rows["C float32"]["weight_bytes"]
-    estimate = rows["C float32"]["estimate_cortex_m7_480mhz_ms"]
-    assert estimate == pytest.approx(rows["C float32"]["multiply_adds"] * 3.0 / 480e3)
 
 
 def test_bench_times_both_sides_in_turn():
