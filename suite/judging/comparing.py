@@ -35,8 +35,8 @@ class Run(NamedTuple):
     """Versions of the suite and of MuJoCo, which may change results."""
     manner: str
     """End of the policy's label that says how it flew, such as "@0.5+monitor"; see `Manner`."""
-    digest: str | None = None
-    """SHA-256 of the policy's files; None if the evaluation does not record it."""
+    digest: str
+    """SHA-256 of the policy's files."""
 
 
 def read_runs(folder: Path) -> list[Run]:
@@ -48,13 +48,12 @@ def read_runs(folder: Path) -> list[Run]:
     path = folder / "trials.parquet"
     if not path.is_file():
         raise ValueError(f"{folder}: holds no trials.parquet; give the --out folder of suite eval")
-    results, summary = read_trials(path), read_json(folder / "summary.json", judged=dict)
+    results = read_trials(path)
+    summary = read_json(folder / "summary.json", judged=dict, sha256=dict, policies=list)
     if len({(row.trial, row.policy) for row in results}) < len(results):
         raise ValueError(f"{path}: holds a trial twice; run suite eval again")
-    # Runs of older versions call the simulator world, and have no digests of files.
-    judged = {"simulator": summary["judged"].get("world"), **summary["judged"]}
-    conditions, files = {key: judged.get(key) for key in CONDITIONS}, summary.get("sha256")
-    conditions |= files if isinstance(files, dict) else {"files": files}
+    judged = summary["judged"]
+    conditions = {key: judged.get(key) for key in CONDITIONS} | summary["sha256"]
     versions = {key: summary.get(key) for key in ("suite_version", "git_commit")}
     if (record := folder / "run.json").is_file():
         versions["mujoco"] = read_json(record, packages=dict)["packages"].get("mujoco")
@@ -62,8 +61,7 @@ def read_runs(folder: Path) -> list[Run]:
     flown = manners(judged.get("speed") or (), bool(judged.get("monitor")))
     endings = sorted((manner.label("") for manner in flown), key=len, reverse=True)
     # The summary has an entry for each label, in the order of the rows.
-    digests = [policy.get("sha256") for policy in summary.get("policies") or ()]
-    digests += [None] * (len(names) - len(digests))
+    digests = [policy["sha256"] for policy in summary["policies"]]
     return [
         Run(
             f"{folder}" if len(names) == 1 else f"{folder}: {name}",
@@ -129,7 +127,7 @@ def policy_notes(runs: Sequence[Run], others: Sequence[Run] = ()) -> list[str]:
         names = f"{run.name} and {other.name}"
         if run.manner != other.manner:
             notes.append(f"{names}: --speed or --monitor differ, which the difference includes")
-        elif run.digest and run.digest == other.digest:
+        elif run.digest == other.digest:
             notes.append(f"{names}: have the same policy, so no difference is expected")
     return notes
 
@@ -191,7 +189,7 @@ def compare_seeds(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, 
                     f"{group[0].name} and {run.name}: are no training seeds of one method, because "
                     "their --speed or --monitor differ; run suite eval for each of them alone"
                 )
-            if run.digest and (first := policies.setdefault(run.digest, run)) is not run:
+            if (first := policies.setdefault(run.digest, run)) is not run:
                 raise ValueError(
                     f"{first.name} and {run.name}: have the same policy, which is one training "
                     "seed; give a policy of another seed"

@@ -45,8 +45,6 @@ def read_evaluation(folder: Path) -> Evaluation:
     path = folder / "run.json"
     try:
         config: dict[str, Any] = dict(read_json(path)["config"])
-        if "world" in config:  # its name before version 0.2
-            config["simulator"] = config.pop("world")
         names = {field.name for field in dataclasses.fields(Evaluation)}
         fits = "policies" in config and set(config) <= names
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -70,9 +68,7 @@ def read_digests(folder: Path, number: int = 0) -> dict[str, str]:
     path = folder / "summary.json"
     try:
         summary = read_json(path)
-        policy = summary["policies"][number]["sha256"]
-        # Earlier versions of the suite wrote only that of policies.
-        return {"policy": str(policy), **dict(summary.get("sha256", {}))}
+        return {"policy": str(summary["policies"][number]["sha256"]), **summary["sha256"]}
     except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
         raise ValueError(
             f"{path}: does not say which policy was judged ({error}); run suite eval again with "
