@@ -16,10 +16,8 @@ from suite.common.options import Advanced, Command
 class Config(Command):
     """Write a policy of the suite as torch program (.pt2), ONNX (.onnx) or C (policy.h, .c)."""
 
-    name: tyro.conf.Positional[str] = ""
-    """A shipped policy's name or a checkpoint's folder. Without it the policy race."""
     policy: str = ""
-    """The same as NAME."""
+    """A shipped policy's name or a checkpoint's folder. Without it the policy race."""
     formats: Annotated[tuple[str, ...], tyro.conf.arg(name="format")] = ("torch", "onnx")
     """One or more of torch, onnx and c."""
     dtype: Advanced[str] = "float32"
@@ -30,19 +28,11 @@ class Config(Command):
 
 def run(config: Config, console: Console) -> dict[str, Any]:
     """Write the files and print their paths."""
-    from policies import shipped
-    from policies.formats.export import FORMATS
     from suite.judging.deploy.exporting import export
     from suite.judging.flying import default_policy
 
-    if config.name and config.policy and config.name != config.policy:
-        raise ValueError(f"--policy {config.policy}: NAME is {config.name}; give one of them")
-    policy, formats = config.policy or config.name, config.formats
-    last = formats[-1] if formats else FORMATS[0]
-    if not policy and last not in FORMATS and (last in shipped.names() or Path(last).exists()):
-        # In `--format c race` the list takes all words after it, also the policy's name.
-        *formats, policy = formats
-    answer = export(policy or default_policy(), config.out, formats, config.dtype, console)
+    policy = config.policy or default_policy()
+    answer = export(policy, config.out, config.formats, config.dtype, console)
     for path in answer["written"]:
         console.say(f"written: {path} ({size(path.stat().st_size)})")
     return answer

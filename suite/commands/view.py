@@ -46,9 +46,7 @@ class Config(Command):
     speed: Annotated[float, Range(0.0, 1.0)] | None = None
     """For a policy with a speed input: 0 (careful) to 1 (a race). Without it the policy's own."""
     out: Path = Path("runs/view")
-    """Folder for the pictures (PNG), the video and the GIF."""
-    rerun: Advanced[Path | None] = None
-    """File of the recording (.rrd, for rerun). Without it trials.rrd in --out."""
+    """Folder for the recording (trials.rrd), the pictures (PNG), the video and the GIF."""
     video: bool = False
     """Also write a video (MP4) of the first trial; takes about its length."""
     gif: bool = False
@@ -60,11 +58,8 @@ class Config(Command):
 
 def run(config: Config, console: Console) -> dict[str, Any]:
     """Fly the chosen trials again and write the files."""
-    recording = config.rerun or config.out / "trials.rrd"
-    if recording.suffix != ".rrd":
-        raise ValueError(f"--rerun {recording}: a recording's name must end in .rrd")
+    recording = config.out / "trials.rrd"
     check_place(recording)
-    check_place(config.out / "picture.png")
     evaluation, trials, digests, label = _choose_trials(config, console)
     from eval.view.picture import write_picture
     from eval.view.recording import write_recording

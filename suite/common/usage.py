@@ -76,7 +76,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "export": (
         "suite export --policy runs/mine/policy --out runs/export",
-        "suite export race --format c --out runs/c",
+        "suite export --policy race --format c --out runs/c",
     ),
     "import": (
         "suite import flight.ulg --out flight.parquet",
@@ -205,7 +205,6 @@ RENAMED: dict[str, dict[str, Callable[[str], list[str]]]] = {
     "collect": {"--world": _simulator},
     "reproduce": {"--world": _simulator},
     "loop": {"--world": _hidden_vehicle},
-    "export": {"--formats": lambda value: ["--format", value]},
 }
 """Command -> option of an earlier version -> function (value) -> words that replace the option.
 Version 0.2 removes these options."""

@@ -137,13 +137,9 @@ def test_a_list_may_have_commas_or_spaces_and_some_options_may_be_given_again():
     assert config.relevance == (0.0, 0.0, 0.0)
 
 
-def test_a_word_behind_a_list_may_be_a_positional_one(tmp_path, capsys):
+def test_a_word_behind_a_list_may_be_a_positional_one():
     _, config = cli.parse("tracks", ["--difficulty", "9", "ellipse"])
     assert (config.difficulty, config.track) == ("9", "ellipse")
-    assert cli.main(["export", "--out", str(tmp_path), "--format", "onnx", "race-paper"]) == 0
-    assert (tmp_path / "race-paper.onnx").is_file()
-    assert cli.main(["export", "--out", str(tmp_path), "--format", "onnx", "rac"]) == 2
-    assert "unknown format 'rac'" in capsys.readouterr().err
 
 
 def test_json_is_one_object_on_standard_output_and_nothing_else(command, capfd):

@@ -51,7 +51,7 @@ def test_the_command_writes_c_and_a_card_that_says_how_near_it_is(folder, tmp_pa
 def test_int8_is_scaled_by_flights(folder, tmp_path, monkeypatch, capsys):
     observed = random_observations(load_policy_checkpoint(folder).spec, 30, seed=3)
     monkeypatch.setattr(exporting, "observed_flights", lambda policy: observed)
-    assert run("export --format c --dtype int8 --out", tmp_path, folder) == 0
+    assert run("export --format c --dtype int8 --out", tmp_path, "--policy", folder) == 0
     assert "on flights" in capsys.readouterr().out
     assert load_policy(tmp_path, trust=True).name == "tiny-int8.c"
 
@@ -61,25 +61,22 @@ def test_what_cannot_be_exported_or_would_write_over_the_card_of_a_policy_is_ref
 ):
     for args, message in (
         ("--format onnx --dtype int8", "supports float32 only"),
-        ("--policy race-paper", "give one"),
         ("--format c --dtype int9", "unknown type 'int9'. Did you mean 'int8'"),
         ("--format", "no format"),
     ):
-        assert message in refused(capsys, f"export {args} --out {tmp_path}", folder)
+        assert message in refused(capsys, f"export {args} --out {tmp_path} --policy", folder)
     assert list(tmp_path.iterdir()) == []
     own = shutil.copytree(folder, tmp_path / "own")
     (own / exporting.CARD).write_text("mine")
-    said = refused(capsys, "export --format c --out", own, own)
+    said = refused(capsys, "export --format c --out", own, "--policy", own)
     assert "card.md is also an input and would be overwritten" in said
     names = {path.name for path in folder.iterdir()}
     assert {path.name for path in own.iterdir()} == {*names, exporting.CARD}
 
 
-def test_an_entry_of_the_folder_with_a_formats_name_is_no_policy(tmp_path, monkeypatch):
+def test_without_a_policy_the_default_one_is_exported(monkeypatch):
     asked = []
     monkeypatch.setattr(exporting, "export", lambda *args: asked.append(args) or {"written": []})
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "onnx").mkdir()
     assert run("export") == 0
     assert asked[0][0] == default_policy() and asked[0][2] == ("torch", "onnx")
 
@@ -94,7 +91,7 @@ def test_an_export_of_another_policy_is_not_written_over(
     one, other = (tmp_path / run / "policy" for run in "ab")
     out = tmp_path / "out"
 
-    asked = f"export --format {wanted} --out {out}"
+    asked = f"export --format {wanted} --out {out} --policy"
     shutil.copytree(folder, one)
     assert "not compared here" in parity.parity(out, load_policy_checkpoint(one), None).sentence
     save_policy(other, lively(SPEC, 3), SPEC, seed=1)
@@ -116,7 +113,7 @@ def test_an_export_of_another_policy_is_not_written_over(
 @pytest.mark.parametrize("file", ["main.c", "CMakeLists.txt", exporting.CARD])
 def test_files_of_a_project_are_not_written_over(file, folder, tmp_path, capsys):
     (tmp_path / file).write_text("mine")
-    said = refused(capsys, f"export --format c --out {tmp_path}", folder)
+    said = refused(capsys, f"export --format c --out {tmp_path} --policy", folder)
     assert f"{file} is not recorded in exports.json and would be overwritten" in said
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(file, "mine")]
 
