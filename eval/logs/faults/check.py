@@ -178,16 +178,17 @@ def _check_pose(rows: Rows) -> list[Finding]:
     """
     found = check_pose(rows)
     doubts = {f.fault for f in found if f.status in ("doubt", "corrected")}
-    if doubts & {"attitude", "position_axes"}:
+    if "attitude" in doubts:
+        for check in (check_position_delay, check_heading):
+            if other := [f for f in check(rows) if f.is_open]:
+                return other
+        is_late = any(f.fault == "clock_offset" and f.is_open for f in check_clock(rows))
+        return [] if is_late else found  # a later check reports the clock
+    if "position_axes" in doubts:
         other = [f for f in check_heading(rows) if f.is_open]
-        if "attitude" in doubts:
-            other = [f for f in check_position_delay(rows) if f.is_open] or other
-        elif other and abs(((other[0].size or 0.0) + 45.0) % 90.0 - 45.0) < QUARTER_DEG:
-            other = []
-        if other:
-            return other
-    is_late = any(f.fault == "clock_offset" and f.is_open for f in check_clock(rows))
-    return [] if is_late and "attitude" in doubts else found  # a later check reports the clock
+        far = [abs(((f.size or 0.0) + 45.0) % 90.0 - 45.0) > QUARTER_DEG for f in other]
+        return other if any(far) else found
+    return found
 
 
 def _check_rate_command(rows: Rows, against: CheckContext) -> list[Finding]:
