@@ -44,12 +44,11 @@ def _summed(products: Array, axis: int) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """Return a x b (..., 3); `numpy.cross` is several times slower on small arrays."""
-    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
-    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    ax, ay, az = (a[..., i : i + 1] for i in range(3))
+    bx, by, bz = (b[..., i : i + 1] for i in range(3))
     parts = [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]
     # Of one numpy and one JAX array the product is one of JAX. `stack` is slower on small arrays.
-    xp = parts[0].__array_namespace__()
-    return xp.concatenate([part[..., None] for part in parts], axis=-1)
+    return parts[0].__array_namespace__().concatenate(parts, axis=-1)
 
 
 def yaw_rotation(yaw: Array) -> Array:
@@ -63,7 +62,7 @@ def yaw_rotation(yaw: Array) -> Array:
 def quat_to_rot(quat_wxyz: Array) -> Array:
     """Return the rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
     xp = quat_wxyz.__array_namespace__()
-    w, x, y, z = (quat_wxyz[..., i, None] for i in range(4))
+    w, x, y, z = (quat_wxyz[..., i : i + 1] for i in range(4))
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
     wx, wy, wz = w * x, w * y, w * z
     parts = [
