@@ -91,8 +91,8 @@ def mix(
     roll_pitch = torque_b[..., 0, None] * unmixer[:, 1] + torque_b[..., 1, None] * unmixer[:, 2]
     yaw = torque_b[..., 2, None] * per_yaw
     exact = force_z[..., None] * per_force + roll_pitch + yaw
-    outside = xp.any((exact < 0.0) | (exact > thrust_max), axis=-1, keepdims=True)
-    if nowhere(outside):
+    beyond = (exact < 0.0) | (exact > thrust_max)
+    if nowhere(beyond):
         return exact
 
     spread = largest(roll_pitch) - least(roll_pitch)
@@ -113,4 +113,5 @@ def mix(
     exceeds = yaw_size > xp.maximum(margin, NEGLIGIBLE)
     feasible_share = xp.where(exceeds, margin / xp.where(exceeds, yaw_size, 1.0), 1.0)
     limited = without_yaw + least(feasible_share)[..., None] * yaw
+    outside = xp.any(beyond, axis=-1, keepdims=True)
     return xp.where(outside, xp.clip(limited, 0.0, thrust_max), exact)

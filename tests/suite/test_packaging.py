@@ -145,8 +145,9 @@ def test_all_four_are_used_by_commands(installed, tmp_path, root):
         [time_s[:, None], circle, level, 0.0 * circle, 800.0 + 0.0 * level], axis=1
     )
     np.savetxt(tmp_path / "flight.simlog", rows, header="simlog")
-    fly = "eval --policy race-paper --track staircase --trials 1 --workers 1 --simulator"
+    fly = "eval --policy race-paper --track staircase --trials 1 --time-limit-s 1"
     lines = ["effects", "tracks", "import flight.simlog --no-fix --out flight.parquet"]
+    fly += " --workers 1 --simulator"
     lines += [f"{fly} coarse --out coarse", f"{fly} mujoco --vehicle finned.toml --out finned"]
     effects, tracks, imported, *_ = suite(lines, installed, tmp_path)
     assert list(effects["effects"])[-1] == "fin_drag"

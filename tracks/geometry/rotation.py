@@ -6,7 +6,12 @@ another batch size, and the outcome of a trial (one judged flight) must not depe
 
 from __future__ import annotations
 
+import numpy as np
+
 from tracks.geometry.scene import Array
+
+LONG = 1000
+"""Number of products above which three are added faster one by one, to the same bits."""
 
 
 def to_world(rot_w: Array, vector: Array) -> Array:
@@ -16,7 +21,7 @@ def to_world(rot_w: Array, vector: Array) -> Array:
         rot_w: (..., 3, 3) body or gate to world.
         vector: (..., 3) vectors in body or gate axes.
     """
-    return (rot_w * vector[..., None, :]).sum(-1)
+    return _summed(rot_w * vector[..., None, :], -1)
 
 
 def to_local(rot_w: Array, vector_w: Array) -> Array:
@@ -26,16 +31,24 @@ def to_local(rot_w: Array, vector_w: Array) -> Array:
         rot_w: (..., 3, 3) body or gate to world.
         vector_w: (..., 3) vectors in world axes.
     """
-    return (rot_w * vector_w[..., :, None]).sum(-2)
+    return _summed(rot_w * vector_w[..., :, None], -2)
+
+
+def _summed(products: Array, axis: int) -> Array:
+    """Return the sum of `products` over an axis of 3; numpy's own is slow on long arrays."""
+    if isinstance(products, np.ndarray) and products.size > LONG:
+        first, second, third = np.moveaxis(products, axis, 0)
+        return first + second + third
+    return products.sum(axis)
 
 
 def cross(a: Array, b: Array) -> Array:
     """Return a x b (..., 3); `numpy.cross` is several times slower on small arrays."""
-    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
-    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    ax, ay, az = (a[..., i : i + 1] for i in range(3))
+    bx, by, bz = (b[..., i : i + 1] for i in range(3))
     parts = [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]
-    # Of one numpy and one JAX array the product is one of JAX.
-    return parts[0].__array_namespace__().stack(parts, axis=-1)
+    # Of one numpy and one JAX array the product is one of JAX. `stack` is slower on small arrays.
+    return parts[0].__array_namespace__().concatenate(parts, axis=-1)
 
 
 def yaw_rotation(yaw: Array) -> Array:
@@ -49,13 +62,15 @@ def yaw_rotation(yaw: Array) -> Array:
 def quat_to_rot(quat_wxyz: Array) -> Array:
     """Return the rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
     xp = quat_wxyz.__array_namespace__()
-    w, x, y, z = (quat_wxyz[..., i] for i in range(4))
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+    w, x, y, z = (quat_wxyz[..., i : i + 1] for i in range(4))
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    wx, wy, wz = w * x, w * y, w * z
+    parts = [
+        1 - 2 * (yy + zz), 2 * (xy - wz), 2 * (xz + wy),
+        2 * (xy + wz), 1 - 2 * (xx + zz), 2 * (yz - wx),
+        2 * (xz - wy), 2 * (yz + wx), 1 - 2 * (xx + yy),
+    ]  # fmt: skip
+    return xp.concatenate(parts, axis=-1).reshape(*quat_wxyz.shape[:-1], 3, 3)
 
 
 def rot_to_quat(rot: Array) -> Array:

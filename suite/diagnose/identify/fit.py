@@ -293,6 +293,8 @@ def _without_median(rows: Rows) -> np.ndarray:
 
 def _median(values: np.ndarray) -> np.ndarray:
     """Return the median (C,) of the measured ones of `values` (N, C); 0 where there are none."""
+    if len(values) and np.isfinite(values).all():
+        return np.median(values, axis=0)  # many times faster than that of masked values
     return np.ma.median(np.ma.masked_invalid(values), axis=0).filled(0.0)
 
 

@@ -16,6 +16,7 @@ Changes of rotor speed are assumed small.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -100,10 +101,8 @@ def loop_rates(vehicle: Vehicle, flight: FlightGrid, numbers: Mapping[str, float
         rates = np.empty_like(inputs)
         for k, (gain, numerator) in enumerate(zip(gains, numerators, strict=True)):
             denominator = [lag_s + 0.5 * gain * half_s**2, 1.0 - gain * half_s, gain]
-            discrete: Any = cont2discrete((numerator, denominator), STEP_S, method="foh")
-            top, bottom = np.ravel(discrete[0]), discrete[1]
-            state = lfilter_zi(top, bottom) * inputs[0, k]
-            rates[:, k] = lfilter(top, bottom, inputs[:, k], zi=state)[0]
+            top, bottom, steady = discrete_filter(tuple(numerator), tuple(denominator))
+            rates[:, k] = lfilter(top, bottom, inputs[:, k], zi=steady * inputs[0, k])[0]
         return rates
 
     # First the rates without a disturbance, then the disturbance that follows from these rates.
@@ -118,3 +117,17 @@ def loop_rates(vehicle: Vehicle, flight: FlightGrid, numbers: Mapping[str, float
         disturbance[:, 0] += numbers["air_x"] * vel_b[:, 1]
         disturbance[:, 1] -= numbers["air_y"] * vel_b[:, 0]
     return linear + response(disturbance, [[lag_s, 1.0]] * 3)
+
+
+@lru_cache(maxsize=256)
+def discrete_filter(
+    numerator: tuple[float, ...], denominator: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a transfer function's filter at the grid's step: numerator, denominator and state.
+
+    The input is linear between points, and the state is that of a constant input of 1. The filters
+    are kept, as all flights share them and a fit's differences change one number at a time.
+    """
+    discrete: Any = cont2discrete((numerator, denominator), STEP_S, method="foh")
+    top, bottom = np.ravel(discrete[0]), discrete[1]
+    return top, bottom, lfilter_zi(top, bottom)

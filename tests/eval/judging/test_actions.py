@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import permutations
 
 import numpy as np
@@ -82,13 +83,19 @@ def test_flights_of_other_kinds_of_action_become_logs(kind, second, tmp_path):
 
 @pytest.mark.parametrize("kind", ["ctbr", "motors"])
 def test_worlds_fly_commands_and_motors_alike(kind):
-    policy, rules = climbing(kind), Rules(time_limit_s=0.6)
-    ours = flown(policy, "mujoco", straight(height=30.0), rules)
-    assert ours.v_max > 0.5
-    for world, off in (("reference", 0.0), ("rotorpy", 0.05)):
-        theirs = flown(policy, world, straight(height=30.0), rules)
-        np.testing.assert_allclose(end_of(theirs), end_of(ours), rtol=0, atol=off, err_msg=world)
-        assert theirs.v_max == pytest.approx(ours.v_max, abs=off)
+    policy = climbing(kind)
+    for world, limit_s, off_m, off_m_s in (
+        ("reference", 0.6, 0.0, 0.0),
+        ("rotorpy", 0.4, 0.002, 0.015),
+    ):
+        rules = Rules(time_limit_s=limit_s)
+        ours, theirs = (
+            flown(policy, one, straight(height=30.0), rules) for one in ("mujoco", world)
+        )
+        assert ours.v_max > 0.2
+        ends = end_of(theirs), end_of(ours)
+        np.testing.assert_allclose(*ends, rtol=0, atol=off_m, err_msg=world)
+        assert theirs.v_max == pytest.approx(ours.v_max, abs=off_m_s)
 
 
 @pytest.mark.slow
@@ -213,11 +220,14 @@ def test_gravity_and_frames_show_in_flight_or_in_made_up_observations():
         assert ("or its state or image has other units" in doubt.fix) == ambiguous
 
 
+shipped = cache(load_policy)
+
+
 @pytest.mark.parametrize("order", list(permutations(range(3))))
 def test_any_order_of_the_actions_axes_is_named_and_shipped_policies_have_none(order):
     expected = [] if order == (0, 1, 2) else ["action_order"]
     for name in ("race", "race-small", "race-paper"):
-        policy = load_policy(name)
+        policy = shipped(name)
 
         def model(state, image, hidden, model=policy.model):
             action, hidden = model(state, image, hidden)

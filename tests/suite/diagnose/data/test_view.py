@@ -37,7 +37,7 @@ def form_of(time_s, width_s=0.2):
 
 
 def test_views_and_identification_use_the_log_without_the_faults_of_the_vehicle_file():
-    (log,) = flights(1, 0, 6.0)
+    (log,) = flights(1, 0, 4.0)
     vehicle = with_effects(
         VEHICLE, lever_arm=((0.05, -0.02, 0.04),), gyro_bias=((0.1, 0.0, -0.05),)
     )
