@@ -257,7 +257,7 @@ def with_fixes(log: FlightLog, readings: Readings) -> FlightLog:
     rows = {"time": log.time_s, **signals_of(columns, signals)}
     attitude = {"quat": filled(log.time_s, rows["quat"])} if "quat" in rows else {}
     corrected = read_rows(rows | attitude, readings)
-    if attitude:  # missing attitudes serve other signals, but stay missing
+    if "quat" in corrected:  # missing attitudes serve other signals, but stay missing
         corrected["quat"] = read_rows({"time": log.time_s, "quat": rows["quat"]}, readings)["quat"]
     for group, names in signals.items():
         if group in rows and group not in corrected:
