@@ -148,7 +148,11 @@ def test_all_four_are_used_by_commands(installed, tmp_path, root):
     fly = "eval --policy race-paper --track staircase --trials 1 --time-limit-s 1"
     lines = ["effects", "tracks", "import flight.simlog --no-fix --out flight.parquet"]
     fly += " --workers 1 --simulator"
-    lines += [f"{fly} coarse --out coarse", f"{fly} mujoco --vehicle finned.toml --out finned"]
+    lines += [
+        f"{fly} coarse --out coarse",
+        f"{fly} mujoco --out plain",
+        f"{fly} mujoco --vehicle finned.toml --out finned",
+    ]
     effects, tracks, imported, *_ = suite(lines, installed, tmp_path)
     assert list(effects["effects"])[-1] == "fin_drag"
     assert tracks["families"]["staircase"] == {
@@ -158,11 +162,11 @@ def test_all_four_are_used_by_commands(installed, tmp_path, root):
     assert imported["rows"] == 200
     run = json.loads((tmp_path / "coarse" / "run.json").read_text())
     assert "coarse" in json.dumps(run)
-    ends = [
+    coarse, plain, finned = (
         pq.read_table(tmp_path / name / "trials.parquet")["pos_x"][0].as_py()
-        for name in ("coarse", "finned")
-    ]
-    assert ends[0] != ends[1], "each flies otherwise"
+        for name in ("coarse", "plain", "finned")
+    )
+    assert plain not in (coarse, finned), "simulator and effect each change the flight"
 
 
 def test_jitted_batch_of_products_then_a_reduction():
