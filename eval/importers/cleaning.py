@@ -88,10 +88,7 @@ def _keep(
 
 
 def check_evenness(recording: Recording, fix: bool) -> Recording:
-    """Return the recording with jittery stamps spaced evenly, and with the findings.
-
-    Without `fix` the jitter is only reported.
-    """
+    """Return the recording with jittery stamps spaced evenly if `fix`, and with the findings."""
     signals, findings, tested = dict(recording.signals), [], set[str]()
     for name, (time_s, _) in recording.signals.items():
         if name not in MEASURED or name in tested:
@@ -138,10 +135,7 @@ def without_far(recording: Recording) -> Recording:
 
 
 def without_lost(recording: Recording) -> Recording:
-    """Return the recording without poses that stand still while the gyro turns: tracking is lost.
-
-    On the ground a pose may repeat; without a gyro none counts as lost.
-    """
+    """Return the recording without poses that stand still while the gyro turns (tracking lost)."""
     signals, rate = dict(recording.signals), recording.signals.get("rate")
     for name in TEXTS:
         if rate is None or not _is_long(recording, name):
@@ -255,10 +249,7 @@ def check_delay(recording: Recording, fix: bool) -> Recording:
 
 
 def airborne(recording: Recording) -> tuple[tuple[float, float], list[Finding]]:
-    """Return the first and the last time in flight [s], and a finding.
-
-    A time is infinite where the log starts or ends in flight, or has no signal of the motors.
-    """
+    """Return the first and the last time in flight [s], infinite where unknown, and a finding."""
     no_limits = (-np.inf, np.inf)
     effort = _motor_effort(recording)
     if effort is None:

@@ -49,9 +49,8 @@ def recording_of(
 ) -> Recording:
     """Return the signals of the file at `path` by `mapping`.
 
-    The path is for messages, and to locate the text file of the mapping. `find` returns the times
-    and values of columns, `missing` the error text for a missing one. Of the options, `source`,
-    `mass` and `vehicle` are used.
+    `find` returns the times and values of columns, `missing` the error text for a missing one. Of
+    the options, `source`, `mass`, `vehicle` and `fix` are used.
 
     Raises:
         FlightLogError: for a column that the mapping needs and the file lacks.
@@ -132,10 +131,7 @@ def recording_of(
 def _first_alternative(
     alternatives: tuple[Column, ...], find: Find, source: str
 ) -> tuple[Column, Part | None]:
-    """Return the first alternative that the file has, with its samples.
-
-    The alternatives of `source` are tried first. Without any, the samples are None.
-    """
+    """Return the first alternative that the file has, those of `source` first, and its samples."""
     for column in sorted(alternatives, key=lambda c: bool(source) and c.source != source):
         if (part := find(column.names)) is not None:
             return column, part
@@ -145,9 +141,9 @@ def _first_alternative(
 def _estimates(
     mapping: LogMap, used_columns: Mapping[str, Column], find: Find, name: str
 ) -> dict[str, Part]:
-    """Return the on-board estimates of signals taken from motion capture, as columns to keep.
+    """Return the on-board estimates of signals from motion capture, as columns to keep.
 
-    Only estimates in the flight log's axes are kept: a velocity in world axes.
+    Only those in the flight log's axes are kept: of velocities, those in world axes.
     """
     estimates = {}
     for signal in ESTIMATED:
@@ -203,9 +199,9 @@ def _is_world(signal: str, column: Column) -> bool:
 
 
 def _change_axes(signals: dict[str, Signal], signal: str, column: Column) -> None:
-    """Rotate a signal into the flight log's axes by the attitude, in place; without one, drop it.
+    """Rotate a signal into the flight log's axes in place; without an attitude, drop it.
 
-    An acceleration in world axes is kept as `acc_w_x`, ... where there is no attitude.
+    An acceleration in world axes is then kept as `acc_w_x`, ...
     """
     time_s, value = signals[signal]
     if signal == "acc" and not column.gravity:
@@ -237,7 +233,7 @@ def _per_mass(signals: dict[str, Signal], file_mass: Any, options: ImportOptions
 def _text_file(path: Path, mapping: LogMap) -> tuple[dict[str, Any], list[Finding]]:
     """Return metadata from the text file next to the log (`LogMap.text_file`), and a note.
 
-    The metadata has the file's entries under `beside`, and the vehicle's `mass` [kg] if present.
+    Its entries are under `beside`, and the vehicle's mass [kg] under `mass`, if present.
     """
     if not mapping.text_file:
         return {}, []
@@ -267,16 +263,12 @@ def _number_or_text(text: str) -> float | str:
 def check_angles(
     angles: Signal, quat_of: Callable[[np.ndarray], np.ndarray], rate: Signal, fix_order: bool
 ) -> tuple[np.ndarray | None, list[Finding]]:
-    """Return corrected angles (N, 3) [rad], None where the given ones are kept, and the finding.
+    """Return corrected `angles` (N, 3) [rad], None to keep them, and the finding.
 
-    Another order must explain its rates better than other axes of the gyro do. Another unit is only
-    reported, since small angles in a wrong unit look like a gyro in a wrong unit.
-
-    Args:
-        angles: roll, pitch and yaw as read from the file [rad].
-        quat_of: converts angles to quaternions wxyz (N, 4) in the log's frames.
-        rate: body rates of the gyro [rad/s].
-        fix_order: correct the order; False: only report it.
+    `angles` are roll, pitch and yaw as read [rad], and `quat_of` converts such to quaternions wxyz
+    (N, 4) in the log's frames. Another order, corrected with `fix_order`, must explain them better
+    than other axes of the gyro do. Another unit is only reported, since small angles in a wrong
+    unit look like a gyro in a wrong unit.
     """
     time_s, value = angles
     if len(time_s) < 4:

@@ -180,10 +180,7 @@ class Diagnosis:
 
 
 def main_of(findings: Sequence[Finding]) -> Finding:
-    """Return a finding with names, or any if none has; of these, the best explainable one.
-
-    That is the one of whose error a black box explains most.
-    """
+    """Return a finding with names, or any if none has; of these, that a black box explains best."""
     return max(findings, key=lambda one: (bool(one.names), one.remaining.explainable))
 
 
@@ -193,11 +190,9 @@ def tested_in(findings: Sequence[Finding], flights: SourceSet) -> tuple[TestedEf
 
 
 def verdict_on(findings: Sequence[Finding], named: bool, limits: Thresholds) -> Verdict:
-    """Return the verdict.
+    """Return the verdict by the `deciding` findings; `named` is whether an effect was named.
 
-    It follows from the findings that are `deciding`. `named` is whether the search or a separate
-    test named an effect. An oscillating force (swing) always counts as unexplained, since no fitted
-    parameter reproduces it.
+    An oscillating force (swing) always counts as unexplained, since no parameter reproduces it.
     """
     swings = [one.remaining.swing for one in findings if one.remaining.swing]
     worst = max((one.remaining for one in deciding(findings)), key=lambda one: one.share)
@@ -210,10 +205,9 @@ def verdict_on(findings: Sequence[Finding], named: bool, limits: Thresholds) -> 
 
 
 def deciding(findings: Sequence[Finding]) -> list[Finding]:
-    """Return the findings whose remaining error decides the verdict.
+    """Return the findings whose remaining error decides: those with more than noise, or the main.
 
-    They are those with more than noise among the findings with named effects, or among all if none
-    names an effect; without any, it is the main finding.
+    They are among the findings with named effects, or among all if none names an effect.
     """
     judged = [one for one in findings if one.names] or findings
     return [one for one in judged if one.remaining.structured] or [main_of(findings)]

@@ -31,10 +31,7 @@ MEASURES = {
 
 
 def trajectories_for(result: Mapping[str, Any]) -> tuple[list[Trajectory], list[str]]:
-    """Return the flights that separate named effects from their alternatives, and advice in words.
-
-    `result` is the content of diagnosis.json.
-    """
+    """Return the flights that separate effects from their alternatives, and advice in words."""
     trajectories, words = list[Trajectory](), list[str]()
     for effect in result["effects"]:
         if effect["alternatives"]:
@@ -79,10 +76,7 @@ def remove_plan(folder: Path) -> None:
 def write_plan(folder: Path, ways: Sequence[Trajectory], words: Sequence[str]) -> dict[str, Any]:
     """Write plan.json and the set points of each flight into `folder`; without flights, nothing.
 
-    An earlier plan in it is removed. `words` are advice for people, which the plan contains.
-
-    Returns:
-        The content of plan.json.
+    An earlier plan in it is removed. Returned is the content of plan.json, with the advice `words`.
     """
     remove_plan(folder)
     if not ways:
@@ -222,27 +216,18 @@ SEPARATIONS: tuple[Separation, ...] = (
 
 
 def separations_of(names: Iterable[str]) -> list[Separation]:
-    """Return the entries of `SEPARATIONS` whose two effects are both in `names`.
-
-    A composite (several effects as one candidate) counts as its effects.
-    """
+    """Return the entries of `SEPARATIONS` for the effects in `names`, some of them composites."""
     wanted = {effect for name in names for effect in effects_in(name)}
     return [entry for entry in SEPARATIONS if wanted.issuperset(entry.pair)]
 
 
 def plan_for(names: Iterable[str]) -> list[Trajectory]:
-    """Return the trajectories that separate the effects `names`, each once.
-
-    Without an entry in `SEPARATIONS`, these are the trajectories with the fastest changes.
-    """
+    """Return the trajectories that separate the effects `names`, or else the fastest ones."""
     separating = [way for entry in separations_of(names) for way in entry.separating]
     return list(dict.fromkeys(separating or [_RANGE, _SWEEP, _CHIRP, _FAST_WOBBLE]))
 
 
 def advice(name: str, rival: str) -> str:
-    """Return a line for people: how to fly to separate the effect `name` from `rival`.
-
-    `rival` is an alternative to the effect.
-    """
+    """Return a line for people: how to fly to separate the effect `name` from a `rival`."""
     entries = separations_of((name, rival))
     return f"{name} from {rival}: {entries[0].words if entries else OTHERWISE}"

@@ -34,8 +34,6 @@ SCHEMA = 1
 def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     """Diagnose flights in files, write the results, and return the content of diagnosis.json.
 
-    `console` is for progress and warnings.
-
     Raises:
         ValueError: if flights or vehicle file cannot be used.
     """

@@ -102,10 +102,7 @@ class Blackbox:
         return all(name in self.units for name in names)
 
     def values(self, names: list[str], factor: Mapping[str, float]) -> np.ndarray:
-        """Return columns (N, C) in the suite's unit.
-
-        The columns are named without units. `factor` maps the unit in the file to the factor to the
-        suite's unit.
+        """Return the columns `names` (without units) times their units' factors, (N, C).
 
         Raises:
             FlightLogError: for a column that is missing, has an unknown unit, or is not numeric.
@@ -219,7 +216,7 @@ def _motors(box: Blackbox, poles: int) -> dict[str, np.ndarray]:
 def decode(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], list[Finding]]:
     """Return the columns of the longest log of the raw file at `path`, its settings, and notes.
 
-    The columns have the names of `blackbox_decode`; an unusual unit in brackets ends a name.
+    The columns are named as by `blackbox_decode`; an unusual unit in brackets ends a name.
 
     Raises:
         FlightLogError: where the decoder is not installed, or nothing can be decoded.

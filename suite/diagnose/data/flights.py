@@ -147,10 +147,10 @@ def _calibrated(
 ) -> SmoothedFlight:
     """Return a flight whose model is corrected for measured rotor speeds, if these drive a torque.
 
-    Noise in a model's input makes every slope smaller (errors in variables), as more inertia or
-    less thrust would. The expected true input, given the measured one, does not (regression
-    calibration; Carroll et al. 2006, Measurement Error in Nonlinear Models, Ch. 4). The torque
-    between the rows of the log is added (see `torque_between_rows`).
+    Noise in a model's input makes every slope smaller, as more inertia would. The expected true
+    input, given the measured one, does not (regression calibration; Carroll et al. 2006,
+    Measurement Error in Nonlinear Models, Ch. 4). The torque between rows is added
+    (`torque_between_rows`).
     """
     if view.in_world or rotors.noise is None or not len(flight.form.middle_s):
         return flight
@@ -168,7 +168,7 @@ def _calibrated(
 def _floor(view: View, flights: Sequence[SmoothedFlight], logs: Sequence[FlightLog]) -> np.ndarray:
     """Return the noise (3,) of the mean accelerations, from differences of neighbouring rows.
 
-    Only rows of the signal itself count, by `logs`, the flights before the interpolation.
+    Only the signal's own rows count, by `logs`, the flights before the interpolation.
     """
     power = []
     for flight, log in zip(flights, logs, strict=True):
@@ -197,7 +197,7 @@ SMOOTH_S = 0.1
 def completed(log: FlightLog) -> FlightLog:
     """Return `log` with a missing attitude from its path, and missing rates from the attitude.
 
-    A flight without position and accelerometer gets a constant pose, as only its rotation is used.
+    Without position and accelerometer only rotation is used, so the pose is constant.
 
     Raises:
         ValueError: for a log without positions and without rates.
@@ -231,10 +231,9 @@ def leaning(log: FlightLog) -> np.ndarray:
 
 
 def turning_of(time_s: np.ndarray, quat_wxyz: np.ndarray) -> np.ndarray:
-    """Return the body rates (T, 3) of attitudes (T, 4), from each row's two neighbours [rad/s].
+    """Return the body rates (T, 3) [rad/s] by the neighbours of each row of attitudes (T, 4).
 
-    Rows without an attitude are left out before. NaN in these, in the first and the last row, and
-    next to a hole.
+    NaN without an attitude, in the first and the last row that has one, and next to a hole.
     """
     rate_b = np.full((len(quat_wxyz), 3), np.nan)
     own = np.flatnonzero(np.isfinite(quat_wxyz).all(axis=1))
@@ -266,10 +265,9 @@ class ActingRotors(NamedTuple):
 def acting_rotors(
     log: FlightLog, vehicle: Vehicle, limits: Thresholds = THRESHOLDS
 ) -> ActingRotors:
-    """Return the rotor speeds of `log`, measured or from commands.
+    """Return the rotor speeds of `log`, measured or from commands, in every row but in holes.
 
-    They are interpolated to every row, but not across holes (long times without a value). Commanded
-    speeds pass through the vehicle's delay and rotor lag.
+    Commanded speeds pass through the vehicle's delay and rotor lag.
 
     Raises:
         ValueError: if no signal gives the rotor speeds.
@@ -303,10 +301,9 @@ def acting_rotors(
 
 
 def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:
-    """Return the rotor speeds (N, 4) that follow commanded ones `wanted` (N, 4).
+    """Return the rotor speeds (N, 4) behind commanded ones `wanted` (N, 4); NaN where these are.
 
-    A command is held until the next row. It acts after the vehicle's delay, and the speeds follow
-    with a first-order lag. They are NaN where the command is.
+    A command holds until the next row, and acts after the vehicle's delay and first-order lag.
     """
     constants = make_plant(vehicle, LONGEST_S).constants
     command_time_s = log.time_s - float(constants.delay)

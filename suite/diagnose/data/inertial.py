@@ -107,9 +107,9 @@ def posed(logs: Sequence[FlightLog]) -> list[FlightLog]:
 def _fitted(flights: Sequence[Sequence[_Piece]]) -> np.ndarray:
     """Fit the parameters of all pieces in place, and return the drag (3,) that they share.
 
-    The start of a piece stays fixed while the parameters of the previous piece change: coupled
-    starts make the rounds diverge in long flights. The noise of the force and the random walk of
-    the tilt are estimated as well, the walk by expectation maximisation (Dempster et al. 1977).
+    A piece's start stays fixed: coupled starts make the rounds diverge in long flights. Noise of
+    the force and random walk of the tilt are estimated as well, the walk by expectation
+    maximisation (Dempster et al. 1977).
     """
     drag, noise = DRAG, FORCE_NOISE
     pieces = [piece for flight in flights for piece in flight]
@@ -237,10 +237,7 @@ class _Piece:
         return rot_w, self.vel + vel + moved
 
     def off(self, drag: np.ndarray, rot_w: np.ndarray, vel_w: np.ndarray) -> np.ndarray:
-        """Return the residuals (M, 2) of the mean forces along body x and y for `drag` [m/s^2].
-
-        A residual is the measured mean force minus the force of the drag at the pose of `flown`.
-        """
+        """Return the residuals (M, 2) of mean forces along body x and y [m/s^2] for `drag`."""
         vel_b = (np.swapaxes(rot_w, 1, 2) @ vel_w[..., None])[:, :2, 0]
         drag_xy = drag[:2] + drag[2] * np.linalg.norm(vel_w, axis=1)[:, None]
         return self.means(self.acc_b[:, :2] - self.numbers[9:11] + drag_xy * vel_b)
@@ -248,8 +245,8 @@ class _Piece:
     def sides(self, drag: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the linear equations of a round: their matrix (R, P + 3) and right side (R,).
 
-        Their unknowns are the changes of the P parameters and of the three coefficients of the
-        drag. The first rows are the mean forces, the last P rows the priors of the parameters.
+        Unknown are the changes of the P parameters and of the drag's coefficients. The first rows
+        are the mean forces, the last P rows the priors of the parameters.
         """
         rot_w, vel_w = self.flown()
         to_body = np.swapaxes(rot_w, 1, 2)

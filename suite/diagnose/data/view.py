@@ -54,10 +54,7 @@ class FlightRows(NamedTuple):
 def rows_of(
     log: FlightLog, vehicle: Vehicle, rotor_speed: np.ndarray, limits: Thresholds = THRESHOLDS
 ) -> FlightRows:
-    """Return the rows of `log` with rotor speeds `rotor_speed` (N, 4) [rad/s].
-
-    Rows on the ground, and rows near them in time, are not `good`.
-    """
+    """Return the rows of `log` with rotor speeds (N, 4) [rad/s]; near the ground none is `good`."""
     rot_w = log.rot_w
     signals = (log.pos_w, log.vel_w, log.rate_b, rotor_speed)
     good = np.isfinite(np.concatenate(signals, axis=1)).all(axis=1)
@@ -195,8 +192,8 @@ def weak_form(
     """Return bumps of `width_s`, half a width apart, without a bad row or a hole inside.
 
     Rows are at `time_s` (N,) [s]; `good` (N,) bool says which can be used, and those further apart
-    than `hole_s` [s] are a hole. With `slope`, the weight is -w'(t) in place of the bump w(t). Then
-    `mean` takes accelerations to means of their derivatives, and `change` takes positions to mean
+    than `hole_s` are a hole. With `slope`, the weight is -w'(t) in place of the bump w(t): `mean`
+    takes accelerations to means of their derivatives, and `change` takes positions to mean
     accelerations.
     """
     span = np.diff(time_s)

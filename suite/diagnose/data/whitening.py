@@ -80,9 +80,9 @@ def make_whitening(
 def orthonormal(matrix: np.ndarray, singular: float) -> tuple[np.ndarray, np.ndarray]:
     """Return Q and upper triangular R of `matrix` (..., M, F), M much larger than F.
 
-    Cholesky's factor of the Gram matrix is used twice (CholeskyQR2; Yamamoto et al. 2015), since it
-    is faster for so tall a matrix than Householder's reflections. The latter are used where a
-    column nearly depends on the others, with an independent share of less than `singular`.
+    Cholesky's factor of the Gram matrix is used twice (CholeskyQR2; Yamamoto et al. 2015), faster
+    than Householder's reflections. These are used where a column has an independent share of less
+    than `singular`.
     """
     size = np.maximum(np.linalg.norm(matrix, axis=-2, keepdims=True), 1e-300)
     base, upper = matrix / size, np.swapaxes(size, -1, -2) * np.eye(matrix.shape[-1])
@@ -101,9 +101,8 @@ def orthonormal(matrix: np.ndarray, singular: float) -> tuple[np.ndarray, np.nda
 def rotor_spread(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> float:
     """Return the standard deviation of the rotor speeds' errors as nuisance parameters [rad/s].
 
-    If measured speeds are the input, their errors are linear between knots 0.1 s apart. White noise
-    of the rows is equivalent to knot errors that are smaller by the root of the number of rows per
-    knot. Otherwise the errors are those at the start of each window.
+    Errors of measured speeds as the input are linear between knots 0.1 s apart. They are smaller
+    than the white noise of the rows by the root of the rows per knot.
     """
     start = np.asarray(windows.start_rotor_error)
     if start.all():

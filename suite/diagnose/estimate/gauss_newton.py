@@ -23,8 +23,8 @@ def solve(
 ) -> np.ndarray:
     """Return the change (K,) of K parameters, from `low` to `high`, that lowers chi-square most.
 
-    `hessian` is J'J and `gradient` J'r. `scale` (K,) is the usual size of each parameter: in these
-    units the equations are well conditioned.
+    `hessian` is J'J and `gradient` J'r. In units of `scale` (K,), the usual size of each parameter,
+    the equations are well conditioned.
 
     Raises:
         ValueError: for values that are not finite.
@@ -56,8 +56,8 @@ def gauss_newton_step(
 ) -> tuple[np.ndarray, float]:
     """Return the best change (K,) of the parameters, and the expected fall of chi-square.
 
-    `equations` are along the K fitted parameters, computed at `theta` (P,). `inside` (B,) bool says
-    which stretches are fitted; all are if not given.
+    `equations` are along the K fitted parameters, computed at `theta` (P,). Only the stretches
+    `inside` (B,) bool are fitted, if given.
     """
     hessian, gradient = equations.sums(inside)
     indices = np.array(equations.along, dtype=int)

@@ -54,7 +54,7 @@ class Evidence(ABC):
         return Evaluation(self, at, self.linearise(at))
 
     def misfit_as_noise(self, best: Evaluation) -> Evidence | None:
-        """Return this evidence with the whole residual of the `best` model as its noise.
+        """Return this evidence with the residual of the `best` model as its noise.
 
         None if that residual is measurement noise only.
         """
@@ -67,13 +67,10 @@ class Evidence(ABC):
         rounds: int | None = None,
         known: Block | None = None,
     ) -> Evaluation:
-        """Fit the parameters at `indices` and the nuisance parameters of every stretch.
+        """Fit the parameters at `indices` and the nuisance parameters; return the best evaluation.
 
-        At most `rounds` Gauss-Newton steps are taken from `start`, by default those of the limits.
+        At most `rounds` Gauss-Newton steps (default: those of the limits) are taken from `start`.
         `known` is the block at `start`, if it was computed before.
-
-        Returns:
-            This evidence, evaluated at the best estimate.
         """
         limits, space, places = self.limits, self.space, np.array(indices, dtype=int)
         low, high = space.array("low")[places], space.array("high")[places]
@@ -118,8 +115,8 @@ class Evidence(ABC):
     ) -> list[CandidateScore]:
         """Return the scores of candidates, each fitted with the `named` parameters, best first.
 
-        `current` is this evidence, evaluated along all parameters. A candidate without any effect
-        on the flights gets no score.
+        `current` is along all parameters. A candidate without any effect on the flights has no
+        score.
         """
         equations = current.block.equations
         along = list(equations.along)
@@ -178,7 +175,7 @@ def validation_groups(flight: np.ndarray) -> np.ndarray:
 def flights_agree(gains: np.ndarray) -> bool:
     """Return whether all flights, or all but one, have positive `gains` (G,).
 
-    The sum without the largest gain must be positive, too. Fewer than three flights always agree.
+    So must have their sum without the largest gain. Fewer than three flights always agree.
     """
     if len(gains) < 3:
         return True

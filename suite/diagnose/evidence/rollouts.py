@@ -116,7 +116,7 @@ def start_estimate(
 ) -> Estimate:
     """Return the parameters `theta` (P,), or the vehicle file's, with the true start states.
 
-    Logged poses have a delay, an effect (the clock offset) in `theta`. Over the delay, position and
+    Logged poses have a delay, an effect (the clock offset) in `theta`. Over it, position and
     attitude change by velocity and rates, and the velocity by the acceleration.
     """
     theta = model.space.array("start") if theta is None else theta
@@ -162,8 +162,7 @@ def trusted(
     """Return `windows`, each shortened to the time in which the model stays near the flight.
 
     Further away the linearisation does not hold: the model may have tipped over or be below the
-    ground. With the named effects it stays near for longer, and so windows become longer.
-    `residual` (W, N, 19) is measured - simulated.
+    ground. `residual` (W, N, 19) is measured - simulated.
     """
     error = np.abs(residual)
     height = np.maximum(np.asarray(windows.row.pos_w)[..., 2], 0.0)
@@ -203,8 +202,8 @@ def rollout_evidence(
 def is_hopeless(model: RolloutModel, linear: Linearisation, limits: Thresholds) -> bool:
     """Return whether even a fit of all parameters leaves the rollouts far from the flights.
 
-    The fit uses `linear`, which has slopes along all parameters. It is inexact for large effects,
-    so if its error is too large, some windows are fitted with the full model.
+    It uses `linear`, along all parameters. If its error is too large, which may be because effects
+    are large, some windows are fitted with the full model.
     """
     evidence, block = rollout_evidence(model, linear, limits)
 
@@ -241,10 +240,7 @@ class RolloutModel:
         voltage: bool,
         integrator: str = "continuous",
     ) -> None:
-        """Prepare the rollout of `vehicle` with the parameters of `space`.
-
-        The other arguments are those of `fly_windows`.
-        """
+        """Prepare the rollout of `vehicle`; for the other arguments see `fly_windows`."""
         self.space = space
         self.size = len(space.entries)
         self.free = STATE + 4 * (KNOTS if rotor_input else 1)
@@ -266,7 +262,7 @@ class RolloutModel:
     def respond(self, at: Estimate, windows: FlightWindows) -> tuple[Linearisation, Flown]:
         """Return residuals and slopes along disturbances, and the states (W, KNOTS, ...) at knots.
 
-        A disturbance is a force [m/s^2] and torque [rad/s^2] in body axes at one of the knots.
+        These are a force [m/s^2] and torque [rad/s^2] in body axes at one of the knots each.
         """
         with jax.enable_x64(True):
             parts = [

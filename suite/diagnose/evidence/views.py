@@ -126,8 +126,7 @@ class ViewEvidence(Evidence):
     ) -> float | None:
         """Return the share of the error that a candidate explains; see `Evidence`.
 
-        None if a value is at a physical bound, if flights disagree, if fast changes contradict the
-        candidate, or if the share is too small.
+        None at a physical bound, if flights disagree, if fast changes do, or for a small share.
         """
         theta, fitted = after.at.theta, after.block
         assert isinstance(before, ViewBlock) and isinstance(fitted, ViewBlock)
@@ -166,9 +165,9 @@ def _attenuated(series: np.ndarray, reliability: np.ndarray) -> np.ndarray:
 
 
 def view_candidates(among: Sequence[Candidate], block: Block) -> list[Candidate]:
-    """Return the candidates that change a view's accelerations, without faults of sensors.
+    """Return the candidates of which each effect changes a view's accelerations, not a sensor.
 
-    Each effect of a composite has to change them, alone or through another effect.
+    An effect of a composite may act through another one.
     """
     acts, acting_through_others = block.acts(), carried(among)
 

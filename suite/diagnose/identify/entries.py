@@ -122,9 +122,8 @@ def with_entries(
 ) -> tuple[Vehicle, list[Number], list[str]]:
     """Enter identified numbers into a vehicle.
 
-    Returns:
-        The vehicle, the entries with the values that its file has, and a line for people for each
-        value that had to differ from the fitted one. A delay of 0 is removed from the entries.
+    Returned are the vehicle, the entries as its file has them (without a delay of 0), and a line
+    for people for each value that had to differ from the fitted one.
     """
     numbers, notes = [], []
     for entry in entries:
@@ -170,9 +169,8 @@ def with_entry(vehicle: Vehicle, entry: Number) -> Vehicle:
 def with_reachable_speed(vehicle: Vehicle, speeds: Sequence[np.ndarray]) -> Vehicle:
     """Return a vehicle whose rotors are fast enough to hover.
 
-    If its `speed_max` is too low for that, it is replaced by the 99th percentile of the measured
-    rotor speeds; the highest speed of a log may be an outlier. `speeds` has one array (G, 4) for
-    each flight [rad/s].
+    If `speed_max` is too low, it becomes the 99th percentile of the measured `speeds` (G, 4)
+    [rad/s] of all flights; the highest may be an outlier.
     """
     try:
         check_vehicle(vehicle)

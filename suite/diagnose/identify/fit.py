@@ -173,8 +173,8 @@ class ResidualEvidence(Evidence):
     def weighed(self, at: Estimate) -> ResidualEvidence:
         """Return this evidence with weights of the residuals at the estimate `at`.
 
-        A weight is one over the variance of the channel's noise. If the noise is estimated, it is
-        lower for an outlier (Huber 1964).
+        A weight is one over the noise variance, and lower for an outlier (Huber 1964) if the noise
+        is estimated.
         """
         errors = [np.abs(_without_median(row)) for row in self.rows(at.theta)]
         if self.noise is not None:
@@ -237,10 +237,10 @@ def fit(
 ) -> Fitted:
     """Return the numbers that minimise `residuals`, with intervals.
 
-    A number that is not identifiable may be wrong by its `max_half_width`; the intervals of the
-    others include the effect of that. The numbers `held` and `known` keep their start; another fit
-    has identified the latter. `noise` (C,) is the standard deviation of the residuals by channel;
-    by default it is estimated. `fixed` has the values of numbers that are not among `unknowns`.
+    A number that is not identifiable may be wrong by its `max_half_width`, which the intervals of
+    the others include. The numbers `held` and `known` (by another fit) keep their start. `noise`
+    (C,) is the standard deviation of the residuals by channel, or else is estimated. `fixed` are
+    the values of numbers that are not among `unknowns`.
 
     Raises:
         NoWholeWindow: if the residuals have no window.

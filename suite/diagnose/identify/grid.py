@@ -72,8 +72,8 @@ class FlightGrid(NamedTuple):
     def form(self, width_s: float, needs: Sequence[str], slope: bool = False) -> WeakForm:
         """Return the weights of the windows of `width_s` with all signals of `needs`.
 
-        With `slope`, the windows are for slopes of the signals, see `weak_form`. No window begins
-        in the first `MEMORY_S`, where commands from before the first row still act.
+        For `slope` see `weak_form`. No window begins in the first `MEMORY_S`, where commands from
+        before the first row still act.
         """
         good = self.time_s >= MEMORY_S
         for name in needs:
@@ -84,8 +84,7 @@ class FlightGrid(NamedTuple):
     def rows(self, attitude_of_path: bool) -> FlightRows:
         """Return the grid as rows of a view, with zeros for rotor speeds and for missing values.
 
-        With `attitude_of_path`, an attitude that was not measured is the one that the path requires
-        (`LEANING`). Its yaw is arbitrary.
+        With `attitude_of_path`, a missing attitude is `LEANING`, whose yaw is arbitrary.
         """
         signals, count = self.signals, len(self.time_s)
         zeros, no_speed, good = np.zeros((count, 3)), np.zeros((count, 4)), np.ones(count, bool)
@@ -154,8 +153,7 @@ def _complete_rows(values: np.ndarray) -> int:
 def _held(time_s: np.ndarray, values: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
     """Return commands held from row to row, as means (G, ...) over each step of the grid.
 
-    A command changes at the time of a row, usually between two grid points. Its values at the grid
-    points would show the change too late.
+    They change between grid points, so that their values there would be too late.
     """
     flat = np.asarray(values.reshape(len(values), -1), dtype=float)
     ends_s, out = np.append(grid_s, grid_s[-1] + STEP_S), np.empty((len(grid_s), flat.shape[1]))

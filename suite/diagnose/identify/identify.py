@@ -83,16 +83,12 @@ class Identified:
 
 
 def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] = ()) -> Identified:
-    """Estimate the numbers of `vehicle` that `logs` identify.
+    """Estimate the numbers of `vehicle` that `logs` identify, with intervals.
 
     Args:
         logs: flights of one vehicle; incomplete ones are used for the numbers that they allow.
-        vehicle: vehicle from which the fits start; a number that is not identifiable keeps its
-            value.
-        leave: parts not to fit: any of drag, motors, inertia, lag, loop.
-
-    Returns:
-        The vehicle with the identified numbers, and their intervals.
+        vehicle: the start of the fits; a number that is not identifiable keeps its value.
+        leave: parts not to fit, of `PARTS`.
 
     Raises:
         ValueError: if no signal drives the model in all flights, or no fit has a complete window.
@@ -214,8 +210,8 @@ class _Fits:
     def with_known_thrust(self, flights: list[FlightGrid]) -> list[FlightGrid]:
         """Return the flights in which the motors' thrust is known best, and remember the others.
 
-        The thrust of a motor command depends on the battery. For this drive, flights without a
-        voltage are therefore left out if other flights have one.
+        It depends on the battery for motor commands: flights without a voltage are then left out if
+        others have one.
         """
         with_voltage = [flight for flight in flights if flight.has("voltage")]
         if self.drive != "pwm" or not with_voltage:
@@ -241,7 +237,7 @@ class _Fits:
     def identified(
         self, original: Vehicle, logs: Sequence[FlightLog], lacking: Sequence[str]
     ) -> Identified:
-        """Return the result of all fits to `logs`; `original` is the vehicle before any change.
+        """Return the result of all fits to `logs`, from the unchanged vehicle `original`.
 
         `lacking` has a line for people for each number that was not fitted.
         """

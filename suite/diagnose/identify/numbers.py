@@ -122,8 +122,8 @@ def not_attempted(
 ) -> list[str]:
     """Return a line for people for each number that was not fitted, with the missing signal.
 
-    The fits of `fitted` are force, torque, rotors and loop. `broken` names fits for which the logs
-    have the columns, but no complete window.
+    The fits of `fitted` are force, torque, rotors and loop; those of `broken` had no complete
+    window.
     """
 
     def any_has(name: str) -> bool:
@@ -205,7 +205,7 @@ def notes_on(
     start: Vehicle,
     identified: Vehicle,
 ) -> list[str]:
-    """Return lines for people on what was done with flights and vehicle beyond the fitted numbers.
+    """Return lines for people on what was done apart from the fits.
 
     `without_voltage` names the flights without a voltage, if others have one.
     """

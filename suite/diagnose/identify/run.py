@@ -33,11 +33,8 @@ def identify_files(
 ) -> dict[str, Any]:
     """Estimate the parameters of a vehicle from log files, and write its file.
 
-    The parts `leave` (of `PARTS`) are not fitted. The interface faults `accept` (wrong units,
-    signs, clocks) do not stop the command.
-
-    Returns:
-        The JSON object that `--json` prints.
+    The parts `leave` (of `PARTS`) are not fitted, and the interface faults `accept` do not stop the
+    command. Returned is the JSON object that `--json` prints.
 
     Raises:
         ValueError: if flights or vehicle cannot be used.

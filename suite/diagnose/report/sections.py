@@ -31,10 +31,7 @@ def logs_section(logs: Sequence[FlightLog]) -> Section:
 
 
 def _facts(log: FlightLog) -> tuple[str, ...]:
-    """Return the table row of a log.
-
-    The row has the share of the log's rows that are incomplete: they lack a state or a command.
-    """
+    """Return the table row of a log, with the share of its rows that lack a state or a command."""
     optional = {
         "commands": log.thrust_cmd is not None,
         "velocity": not log.velocity_derived,
@@ -217,10 +214,7 @@ def residual_section(result: Mapping[str, Any]) -> Section:
 
 
 def evidence_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section:
-    """Return a table of the gaps on held-out flights.
-
-    They are those of the vehicle as given, with the named effects, and with a wrong effect.
-    """
+    """Return a table of the gaps on held-out flights: as given, named, and with a wrong effect."""
     main = diagnosis.main
     gaps = {"as given": main.before}
     if main.control is not None:

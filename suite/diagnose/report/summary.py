@@ -256,10 +256,9 @@ class Component(NamedTuple):
 
 
 def in_digits(number: float, interval: Sequence[float]) -> str:
-    """Return `number` rounded to the second significant digit of its interval's half-width.
+    """Return `number` to the second significant digit of half the `interval` (value, low, high).
 
-    `interval` is (value, low, high). Small numbers, and those with no digit behind the point, are
-    written with an exponent.
+    Small numbers, and those with no digit behind the point, are written with an exponent.
     """
     half, size = 0.5 * (interval[2] - interval[1]), max(abs(n) for n in interval)
     if half <= 0.0 or not np.isfinite(half):

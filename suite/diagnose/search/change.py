@@ -42,10 +42,10 @@ from suite.diagnose.thresholds import Thresholds
 
 
 def _motion_inputs(task: ViewEvidence, theta: np.ndarray) -> np.ndarray:
-    """Return the inputs (M, 9) of a regression that explains a model's error by the motion.
+    """Return the inputs (M, 9) of a regression of a model's error on the motion, without means.
 
     They are the velocity, the speed times the velocity, and the model's accelerations at `theta`
-    (P,), which stand for an error of its gain or delay; all without each flight's mean.
+    (P,), which stand for an error of its gain or delay.
     """
     motion = []
     for flight in task.flights:
@@ -78,9 +78,9 @@ def fit_balance(reference: ViewEvidence) -> np.ndarray:
 def less_reference_residual(
     reference: ViewEvidence, theta: np.ndarray, flights: Sequence[SmoothedFlight]
 ) -> ViewEvidence:
-    """Return the evidence of `flights`, from which the reference flights' residual is subtracted.
+    """Return the evidence of `flights` less the residual of `reference` at `theta` (P,).
 
-    That residual, at `theta` (P,), is described by its mean and a ridge regression on the motion.
+    That is its mean and a ridge regression on the motion.
     """
     data, inputs = reference.residuals(theta), _motion_inputs(reference, theta)
     deviation = centred(data.residual, data.flight)
@@ -122,8 +122,7 @@ class RotorSpread:
     ) -> np.ndarray:
         """Return draws (D, 3) of the estimated variance over the true one, by axis of `view`.
 
-        All axes have the same true variance here. Where the estimate is too small by chance, any
-        change seems too large, which the draws take into account.
+        Where the estimate is too small by chance, any change seems too large.
         """
         freedom = np.concatenate(list(self.freedom_along.values()))
         square = rng.chisquare(np.maximum(freedom, 1e-9), (limits.change_draws, len(freedom)))
@@ -142,7 +141,7 @@ def _moderated(
 def rotor_gain(task: ViewEvidence) -> np.ndarray:
     """Return the accelerations (3,) by a relative change of a rotor's thrust, in the view's unit.
 
-    Along each axis this is the root of the sum of the four rotors' squared accelerations.
+    It is the root of the sum of the four rotors' squares.
     """
     space = task.model.space
     weak_motor = [i for i, entry in enumerate(space.entries) if entry.effect == "weak_motor"]
@@ -203,10 +202,7 @@ class ChangeEvidence(ViewEvidence):
     def scores(
         self, current: Evaluation, named: Sequence[int], among: Sequence[Candidate], seed: int
     ) -> list[CandidateScore]:
-        """Return the scores of all candidates close to the best, best first, see `Evidence`.
-
-        The means of few flights contain little information: nearly every candidate is close.
-        """
+        """Return the scores of all candidates close to the best, as most are with few means."""
         block, theta = current.block, current.at.theta
         assert isinstance(block, ViewBlock) and self.weights
         weights = self.weights if named else self.exact_weights
@@ -285,10 +281,7 @@ def within_flights(data: ViewData) -> ViewData:
 
 
 def equations_by_flight(inside: ViewData, scatter: np.ndarray) -> NormalEquations:
-    """Return the normal equations of each flight alone, along all parameters.
-
-    `inside` is from `within_flights`; `scatter` (3,) is the noise along each axis.
-    """
+    """Return the normal equations of each flight alone, with the noise `scatter` (3,) by axis."""
     numbers, place = np.unique(inside.flight, return_inverse=True)
     residual, slope = inside.residual / scatter, inside.slope / scatter[:, None]
     along, start_s = range(slope.shape[2]), np.zeros(len(numbers))
@@ -306,8 +299,7 @@ def search_motion_change(
 ) -> SearchResult | None:
     """Return the candidate that has changed since `reference`; None where none is significant.
 
-    Its parameters are total values, not changes. Both sets need at least two flights. Bonferroni's
-    correction counts the searched `views`.
+    Its parameters are totals. Each set needs two flights; `views` are those that are searched.
     """
     start, limits, space = fit_balance(reference), task.limits, task.space
     sets = [within_flights(one.residuals(start, None)) for one in (reference, task)]

@@ -62,9 +62,7 @@ class Errors(NamedTuple):
 
 
 def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
-    """Return the errors of the estimate in `log` relative to the reference.
-
-    The estimate is late by `late_s` [s]; it is compared with the reference so much earlier.
+    """Return the errors of the estimate in `log` relative to the reference `late_s` [s] earlier.
 
     Raises:
         FlightLogError: if the log has no estimate, no reference for it, or is too short.
@@ -117,10 +115,7 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
 
 
 def rotation_between(rot_w: np.ndarray, other_w: np.ndarray) -> np.ndarray:
-    """Return rotation vectors (T, 3) from `rot_w` to `other_w` in body axes [rad]; NaN is kept.
-
-    Both (T, 3, 3) are rotations from body to world.
-    """
+    """Return rotation vectors (T, 3) from `rot_w` to `other_w` (T, 3, 3), in body axes [rad]."""
     relative = np.matmul(np.swapaxes(rot_w, -1, -2), other_w)
     good = np.isfinite(relative).all(axis=(1, 2))
     rotation_b = np.full((len(relative), 3), np.nan)
@@ -139,10 +134,7 @@ def _estimate(log: FlightLog, group: str) -> np.ndarray | None:
 
 
 def _differentiated(values: np.ndarray, step_s: float) -> np.ndarray:
-    """Return the time derivative of `values` (T, C); NaN near missing values.
-
-    It is the slope of a parabola that is fitted to `SLOPE_ROWS` rows.
-    """
+    """Return the time derivative of `values` (T, C), by parabolas; NaN near missing values."""
     if len(values) < SLOPE_ROWS:
         return np.full_like(values, np.nan)
     slope = savgol_filter(values, SLOPE_ROWS, 2, deriv=1, delta=step_s, axis=0, mode="nearest")
@@ -239,10 +231,7 @@ def _neglected_drag(flights: Sequence[Errors]) -> tuple[Interval, Interval]:
 
 
 def _lean(flight: Errors, lasts_s: float) -> np.ndarray:
-    """Return the attitude error (T, 3) in body axes for a drag of 1/s, see `drag_tilt`.
-
-    `lasts_s` is the correlation time [s].
-    """
+    """Return the attitude error (T, 3) in body axes for a drag of 1/s, see `drag_tilt`."""
     lean_w = follow_lag(np.nan_to_num(flight.lean_w), flight.step_s, lasts_s)
     return to_local(flight.rot_w, lean_w[-len(flight.value) :])
 
@@ -255,10 +244,7 @@ def _without_scale(flight: Errors, scale: float) -> np.ndarray:
 
 
 def _size(values: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the RMS (C,) of errors (T, C) of each flight about the flight's mean.
-
-    It serves as noise of a fit, which explains a small part of the errors.
-    """
+    """Return the RMS (C,) of errors (T, C) about each flight's mean, as the noise of a fit."""
     known = [np.ma.masked_invalid(one) for one in values]
     squares = np.ma.concatenate([(one - one.mean(axis=0)) ** 2 for one in known])
     return np.maximum(np.sqrt(squares.mean(axis=0)).filled(1.0), 1e-150)

@@ -89,10 +89,9 @@ def fit_sensors(logs: Sequence[FlightLog]) -> Fitted:
 
 
 def held_out(logs: Sequence[FlightLog]) -> dict[str, HeldOut]:
-    """Compare a model that was fitted to half of the flights with the other half.
+    """Compare a model that was fitted to half of the flights with the other half, both ways.
 
-    Both halves are held out in turn. The result has the larger difference, by axis. It is empty for
-    a single flight.
+    The result has the larger difference, by axis. It is empty for a single flight.
     """
     worst: dict[str, HeldOut] = {}
     for half in (0, 1) if len(logs) > 1 else ():
@@ -171,9 +170,7 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
     """Fit a sensors model to the estimates in flight logs, and write its file.
 
     A log without an estimate gives a warning, as does each fault that the checks of a log find.
-
-    Returns:
-        The JSON object that `--json` prints.
+    Returned is the JSON object that `--json` prints.
 
     Raises:
         ValueError: if no log has both an estimate and a reference, or no axis has enough data.

@@ -27,12 +27,9 @@ sum of the half-widths of their 95 % intervals."""
 def examine(
     source: Source, earlier: Sequence[Finding], say: Callable[[str], None], seed: int
 ) -> tuple[Finding, list[str]]:
-    """Search for named effects with one source, and test them.
+    """Search for named effects with one source, and test them; return the finding and warnings.
 
     Effects that contradict the first of the `earlier` findings are left out.
-
-    Returns:
-        The finding, and warnings for people.
     """
     # Search. If an earlier source contradicts some of the effects, search again without them.
     # (Not if a change since reference flights is searched for, as `names_small` shows.)
@@ -107,10 +104,7 @@ def examine(
 
 
 def without_names(finding: Finding, seed: int) -> Finding:
-    """Return `finding` without its named effects, if these leave most of the gap.
-
-    All of the error then counts as unexplained.
-    """
+    """Return `finding` without its named effects: all of the error counts as unexplained."""
     bare, with_names = finding.search.refitted(()), finding.remaining
     remaining = finding.source.remaining(bare, (finding.before, finding.before), seed)
     # Without the names an error of the model may oscillate. A swing (an oscillating force) counts
@@ -131,12 +125,11 @@ def confirmed(
 
     If the error stays above the noise floor, model errors bias every parameter. An effect then has
     to lower the squared error by a share of the remaining error. An effect is kept if the held-out
-    flights are not sensitive to it, such as the ground effect in high flights. `after` is the gap
-    with all named effects.
+    flights are not sensitive to it, such as the ground effect in high flights.
 
     Returns:
-        The result with the confirmed effects, the gap with them, the gap without each of them (by
-        its label), and the labels of the withdrawn effects.
+        The result with the confirmed effects, the gap with them (at first `after`), the gap without
+        each of them (by its label), and the labels of the withdrawn effects.
     """
     withdrawn, limits = list[str](), source.limits
     while found.named:
@@ -173,12 +166,12 @@ def relevant_part(
 ) -> tuple[SearchResult, Gap, dict[str, EffectSize], list[tuple[str, EffectSize]]]:
     """Leave out the effects below the threshold of relevance.
 
-    If all named effects together are below it, only faults of the log may be named. `gaps` are the
-    gap without any named effect and the gap with all of them.
+    If all named effects together are below it, only faults of the log may be named. `gaps` are
+    those without any named effect and with all of them.
 
     Returns:
-        The result with the relevant effects, the gap with them, the sizes of these effects by name,
-        and the names and sizes of the effects that were left out.
+        The result with the relevant effects, the gap with them, their sizes by name, and the names
+        and sizes of the effects that were left out.
     """
     (before, after), left_out = gaps, list[tuple[str, EffectSize]]()
     all_are_small: bool | None = None
@@ -203,10 +196,9 @@ def relevant_part(
 
 
 def control(source: Source, found: SearchResult) -> tuple[str, Gap] | None:
-    """Return label and gap of a wrong effect, or None if there is none.
+    """Return label and gap of the best effect that is neither named nor an alternative, if any.
 
-    It is the best effect that is neither named nor an alternative. Its gap shows how much an effect
-    that is surely wrong would lower the error.
+    Its gap shows how much an effect that is surely wrong would lower the error.
     """
     excluded = {candidate.name for candidate in found.candidates}
     alternatives = [label for named in found.named for label in named.rivals]
@@ -238,8 +230,7 @@ def _without_each(source: Source, found: SearchResult) -> dict[str, Gap]:
 def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate, str]]:
     """Return the named effects of `found` that the evidence of `by` contradicts, and both values.
 
-    Each effect is fitted to that evidence, together with the effects that `by` names. It is
-    contradicted if a parameter differs significantly from its value in `found`.
+    Fitted to that evidence, with the effects that `by` names, a parameter differs significantly.
     """
     refused = []
     widths = dict(zip(found.indices, found.half_widths(), strict=True))
@@ -263,13 +254,10 @@ def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate,
 
 
 def one_cause(findings: Sequence[Finding]) -> tuple[tuple[Finding, ...], list[str]]:
-    """Remove names so that each cause is named once.
+    """Return the findings with each cause named once, and a warning for each removed name.
 
     If two sources name the same effect, the name with the relatively narrower interval is kept. An
     effect is removed if one of its alternatives is named by another source.
-
-    Returns:
-        The findings with the remaining names, and a warning for each removed name.
     """
     kept, warnings = list(findings), list[str]()
     for index, finding in enumerate(kept):

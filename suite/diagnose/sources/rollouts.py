@@ -185,10 +185,9 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
 
 
 def can_fly(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
-    """Return whether rollouts of these flights can be simulated.
+    """Return whether the logs have all signals of the state, and an input of rollouts.
 
-    The logs need all signals of the state, and measured rotor speeds or commands to a rate loop
-    without integrators and filters (whose state is unknown).
+    That is measured rotor speeds, or commands to a rate loop without integrators and filters.
     """
     return not any(
         log.partial
@@ -207,11 +206,7 @@ def _check_count(count: int, limits: Thresholds) -> None:
 
 
 def _finite(linear: Linearisation, limits: Thresholds) -> np.ndarray:
-    """Return which windows (W,) the model simulates without divergence.
-
-    Raises:
-        ValueError: if the model diverges in all windows.
-    """
+    """Return which windows (W,) the model simulates without divergence; a ValueError if none."""
     residual = linear.residual
     is_finite = np.asarray(np.isfinite(residual).all(axis=(1, 2)))
     is_finite &= np.isfinite(linear.slope).all(axis=(1, 2, 3))

@@ -155,9 +155,8 @@ class Source(ABC):
     def is_worse(self, before: Gap, after: Gap) -> bool:
         """Return whether held-out flights contradict effects that change the gap to `after`.
 
-        `before` is the gap without the effects. Both the total error and the error within flights
-        have to grow: a held-out flight with another trim (constant offset) may raise the total
-        alone.
+        Total error and error within flights both have to grow: a held-out flight with another trim
+        (constant offset) may raise the total alone.
         """
         rise = float(after.energy.sum()) - float(before.energy.sum())
         return after.total >= before.total and rise >= 0.0
@@ -166,17 +165,12 @@ class Source(ABC):
         """Return whether held-out flights are sensitive to `candidate` at its fitted size."""
         return False
 
-    def is_relevant(self, gap: Gap) -> bool:
-        """Return whether `gap` may exceed the noise by a relevant amount."""
-        return True
-
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
         """Return the sizes of the named effects on these flights, by the effect's name.
 
-        The entry `TOGETHER` is for all of them at once: their changes may cancel. Each entry is the
-        size and the upper end of its 95 % interval, which is zero if the model's own error may be
-        the whole effect. The result is empty if the size has no physical unit;
-        then no effect counts as too small.
+        Each entry is the size and the upper end of its 95 % interval, zero if the model's own error
+        may be the whole effect. The entry `TOGETHER` is for all at once, as changes may cancel.
+        Without a physical unit there are none, and no effect counts as too small.
         """
         return {}
 
@@ -195,13 +189,11 @@ def sizes_by_effect(
     size_of: Callable[..., EffectSize],
     model_error: float | np.ndarray = 0.0,
 ) -> dict[str, tuple[EffectSize, EffectSize]]:
-    """Return the size of each named effect and the upper end of its 95 % interval, by name.
+    """Return the sizes of the named effects, see `Source.sizes`.
 
-    The entry `TOGETHER` is for all of them at once. The upper end is zero if the model's own error
-    may be the whole effect (see `beyond_error`). `slope` (..., K) are derivatives of the flights'
-    errors by the K named parameters. `size_of` takes a change of these errors to its size, or with
-    a number of standard errors to its upper limit. The model's own numerical error may change the
-    parameters by `model_error` (K,); this is subtracted before the upper end is computed.
+    `slope` (..., K) are derivatives of the flights' errors by the K named parameters; for `size_of`
+    see `upper_size`. The model's own numerical error may change the parameters by `model_error`
+    (K,); this is subtracted before the upper end is computed.
     """
     entries, width = found.last.evidence.space.entries, found.half_widths()
     change = (found.estimate.theta - found.start.theta)[found.indices]
@@ -285,10 +277,7 @@ class Finding:
         return self.search.estimate.theta
 
     def removed(self, names: Sequence[NamedEffect]) -> float:
-        """Return the share of the gap that `names` remove when they are added last.
-
-        All of `names` belong to one effect.
-        """
+        """Return the share of the gap that `names`, all of one effect, remove when added last."""
         without = max(self.without[named.candidate.label].rms for named in names)
         total = max(self.before.rms - self.before.floor, LEAST_GAP)
         return min(max((without - self.after.rms) / total, 0.0), 1.0)

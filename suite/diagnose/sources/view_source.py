@@ -137,11 +137,10 @@ class ViewSource(Source):
     def _unexplained_force(self, theta: np.ndarray, gap: Gap, seed: int) -> float:
         """Return the force [m/s^2] that remains within held-out flights, or 0 if insignificant.
 
-        The error has to exceed the noise and a least force significantly. The least force is the
-        threshold of relevance or, if larger, a multiple of the flights' constant offsets (trims),
-        which show the accuracy of attitude and thrust in the logs. The torque has no such test,
-        since noise of the rotor speeds dominates its remaining error. `gap` is the gap at the
-        parameters `theta` (P,).
+        `gap` is the gap at `theta` (P,). It has to exceed noise and a least force significantly:
+        the threshold of relevance or, if larger, a multiple of the flights' constant offsets
+        (trims), which show the accuracy of attitude and thrust in the logs. The torque has no such
+        test, since noise of the rotor speeds dominates its remaining error.
         """
         assert self.all_flights is not None
         data, limits = self.all_flights.residuals(theta), self.limits
@@ -183,10 +182,7 @@ class ViewSource(Source):
         return Shares(closed, np.maximum(explainable, closed), beyond, variance, spread)
 
     def series(self, found: SearchResult) -> Series:
-        """Return the stretch of a held-out flight that the named effects change most.
-
-        If nothing is named, it is the stretch with the largest error. See `Source`.
-        """
+        """Return the stretch that the named effects change most, or else that of most error."""
         before = self.held.residuals(found.start.theta)
         after = self.held.residuals(found.estimate.theta)
         shares = self._shares(found)
@@ -247,8 +243,8 @@ RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> np.ndarray:
     """Return the weights (K, 3) with which `inputs` (M, K) explain `error` (M, 3) best.
 
-    They are those of a ridge regression, chosen in cross-validation over flights, of which each
-    flight's mean (its trim) is no part. A single flight is split into thirds.
+    They are those of a ridge regression without flights' means (trims), chosen in cross-validation
+    over flights or thirds of one.
     """
     groups = validation_groups(flight)
     inputs, error = centred(inputs, flight), centred(error, flight)
@@ -286,10 +282,7 @@ PATTERNS = np.array([[1, 1, 1, 1], [-1, -1, 1, 1], [-1, 1, 1, -1], [1, -1, 1, -1
 
 
 def inputs_of(flight: SmoothedFlight) -> np.ndarray:
-    """Return the inputs (M, K) of the black box for one flight: signals and their products.
-
-    They are the means over the windows of the products on each row.
-    """
+    """Return the inputs (M, K) of the black box: means of a flight's signals and their products."""
     rows, vel_b = flight.rows, flight.rows.vel_b
     thrust = rows.rotor_speed**2
     thrust = thrust / np.maximum(thrust.mean(), 1e-9)

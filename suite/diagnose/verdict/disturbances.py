@@ -85,10 +85,7 @@ class Spectrum(NamedTuple):
 
 
 def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
-    """Return the oscillation in the residual force of `task` at the parameters `theta` (P,).
-
-    None where there is none, or where the view does not contain both horizontal axes.
-    """
+    """Return the oscillation in the residual force of `task` at `theta` (P,), if there is one."""
     if not {0, 1} <= set(task.view.axes):
         return None
     data, limits = task.residuals(theta), task.limits
@@ -127,9 +124,9 @@ def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
 
 
 def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None:
-    """Return the spectrum of one flight; None where it is too short for one, or has many holes.
+    """Return the spectrum of a flight with the residual force `residual_b` (M, 3) [m/s^2].
 
-    `residual_b` (M, 3) is its residual force in body axes [m/s^2].
+    None where it is too short for one, or has many holes.
     """
     middle_s = flight.form.middle_s
     if len(middle_s) < LEAST_MEANS:
@@ -219,10 +216,9 @@ def _peak_shares(
 def find_turbulence(
     model: RolloutModel, theta: np.ndarray, disturbance: DisturbanceEquations
 ) -> tuple[TestedEffect, float] | None:
-    """Return the random wind that explains the residual of `model` at `theta` (P,), or None.
+    """Return the random wind that explains the residual, and its log-likelihood over none; or None.
 
     None also without a drag that transmits it, with a better random force, or by outliers alone.
-    With the wind comes the logarithm of the likelihood ratio of this wind to no wind.
     """
     transmission, limits = _wind_transmission(model, theta, disturbance.knot), disturbance.limits
     if np.abs(transmission).max() < 1e-6:
@@ -283,7 +279,7 @@ def _wind_transmission(model: RolloutModel, theta: np.ndarray, knot: Flown) -> n
 
 
 def _wind_root(knot: Flown, length_m: float) -> np.ndarray:
-    """Return a matrix root (W, 3 KNOTS, 3 KNOTS) of the covariance of a wind of intensity 1 m/s.
+    """Return a root (W, 3 KNOTS, 3 KNOTS) of the covariance of a wind of intensity 1 m/s.
 
     The correlation decays exponentially with the distance flown over the length scale `length_m`.
     """
@@ -311,8 +307,8 @@ def _has_outliers(
     """Return whether the disturbance has heavier tails than a normal wind of this `size`.
 
     The fourth power of a normal variable of variance 1 has mean 3 and variance 96; the measured
-    mean may exceed 3 by `tail` standard errors. A force that acts only at some places or speeds has
-    a higher mean. With fewer than eight directions that contain information the result is False.
+    mean may exceed 3 by `tail` standard errors. A force at some places or speeds has a higher one.
+    With fewer than eight directions that contain information the result is False.
     """
     information, gradient = diagonalised(equations.hessian, equations.gradient, root)
     informed = size**2 * information > 1.0

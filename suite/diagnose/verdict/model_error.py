@@ -26,8 +26,8 @@ from suite.diagnose.thresholds import Thresholds
 def with_model_error(linear: Linearisation, coarser: np.ndarray, limits: Thresholds) -> Thresholds:
     """Return `limits` with the lower limits of the noise raised to the model's error.
 
-    `linear` has the residuals of W windows, and slopes along all parameters and start numbers.
-    `coarser` (W, N, 19) are the residuals with longer steps and fewer rotor speeds.
+    `linear` has slopes along all parameters and start numbers; `coarser` (W, N, 19) are the
+    residuals with longer steps and fewer rotor speeds.
     """
     noise = measured_noise(linear, limits)
     whitening = make_whitening(linear, noise, limits)
@@ -40,10 +40,8 @@ def with_held_commands(
     """Return `limits` with the noise raised to the error of held commands; None without the error.
 
     Body rates and rotor speeds follow a command at once. So their residuals, relative to their
-    change with `fewer`, limit the error's share of that change. With a small share, the log has
-    every command.
-
-    Args: see `with_model_error`; `fewer` are the residuals with every second command.
+    change with `fewer` (every second command), limit the error's share of that change. With a small
+    share, the log has every command. For `linear` see `with_model_error`.
     """
     noise = measured_noise(linear, limits)
     whitening = make_whitening(linear, noise, limits)
@@ -71,10 +69,9 @@ def with_held_commands(
 def beyond_error(change: np.ndarray, error: np.ndarray, width: np.ndarray) -> bool:
     """Return whether an effect, or a shape of the residual, is more than the model's own error.
 
-    It is if a 95 % interval, widened by the error at both ends, does not contain zero. Where no
-    parameter is significant by itself, one has to change by more than the error. All are (K,):
-    `change` is fitted parameters minus those of the vehicle file. The model's own error may change
-    them by `error`. `width` are the half-widths of their 95 % intervals.
+    It is if a 95 % interval of `change` (K,), of half-width `width`, does not contain zero when it
+    is widened by `error` at both ends. Where no parameter is significant by itself, one has to
+    change by more than the error.
     """
     distance = np.abs(change)
     least = width if (distance > width).any() else 0.0
@@ -96,10 +93,10 @@ def _difference(linear: Linearisation, other: np.ndarray) -> np.ndarray:
 def _rms(
     errors: np.ndarray, linear: Linearisation, noise: Noise, whitening: Whitening
 ) -> np.ndarray:
-    """Return the RMS (6,) of the unexplained part of `errors` (W, N, 19), by sensor.
+    """Return the RMS (6,) by sensor (of `SLICES`) of the part that no start state explains.
 
-    Unexplained is what no change of the start state gives. The entries are those of `SLICES`, in
-    units of the channels; 0 where nothing was measured. Windows with NaN are left out.
+    `errors` are (W, N, 19). It is in units of the channels, 0 where nothing was measured. Windows
+    with NaN are left out.
     """
     known = np.isfinite(errors).all(axis=(1, 2), keepdims=True)
     errors = np.where(known, errors, 0.0)

@@ -81,10 +81,7 @@ def disturbance_equations(
 def residual_structure(
     equations: DisturbanceEquations, fold: np.ndarray, seed: int = 0
 ) -> ResidualStructure:
-    """Test the residual for structure, by both tests.
-
-    `fold` (W,) is the cross-validation fold of each window; one fold is left out at a time.
-    """
+    """Test the residual by both tests; `fold` (W,) are the folds of the windows."""
     # From forces and torques at the knots to coefficients of the shapes.
     hessian, gradient = _along(equations, equations.unit)
     size = np.sqrt(np.maximum(np.einsum("wjj->j", hessian), 1e-12))
@@ -108,10 +105,10 @@ def beyond_model_error(
     coarse: DisturbanceEquations,
     share: float,
 ) -> ResidualStructure:
-    """Return `structure` without the significant shapes that the model's own error may explain.
+    """Return `structure` without the shapes that the model's own error may explain.
 
-    `coarse` has fewer rotor speeds or commands as input, which makes the error larger. The `share`
-    of the change of a shape's coefficients counts as the error.
+    `coarse` has fewer rotor speeds or commands as input, and thus more of the error. The `share` of
+    the change of a shape's coefficients counts as the error.
     """
 
     def error_of(columns: Sequence[int], value: np.ndarray) -> np.ndarray:
@@ -143,8 +140,7 @@ def _size(
 ) -> EffectSize:
     """Return the RMS force and torque that the best of `shapes` adds, without the fit's noise.
 
-    The model's own error is subtracted from the coefficients; `error_of` returns it for columns and
-    their coefficients.
+    The model's own error, which `error_of` gives for columns and coefficients, is subtracted.
     """
     if not shapes or shapes[0].p_value > equations.limits.shape_p_value:
         return EffectSize(0.0, 0.0, None)
@@ -169,10 +165,7 @@ def _along(equations: DisturbanceEquations, unit: np.ndarray) -> tuple[np.ndarra
 def diagonalised(
     hessian: np.ndarray, gradient: np.ndarray, root: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return information and gradient (W, J) along the independent directions of root @ normal.
-
-    `hessian` (W, K, K) and `gradient` (W, K) are those of a disturbance; `root` is (..., K, J).
-    """
+    """Return information and gradient (W, J) along independent directions of `root` (..., K, J)."""
     information, vectors = np.linalg.eigh(root.mT @ hessian @ root)
     return information, (vectors.mT @ (root.mT @ gradient[..., None]))[..., 0]
 
@@ -283,10 +276,7 @@ def _shapes(knot: Flown, start_s: np.ndarray) -> tuple[np.ndarray, list[Candidat
 
 
 def _hats(scalar: np.ndarray) -> list[np.ndarray]:
-    """Return hat functions (piecewise linear bumps) of `scalar` (W, KNOTS), each (W, KNOTS).
-
-    They stand on six quantiles of the scalar.
-    """
+    """Return hat functions of `scalar` (W, KNOTS), each (W, KNOTS), on six of its quantiles."""
     corners = np.unique(np.quantile(scalar, np.linspace(0.0, 1.0, 6)))
     return [np.interp(scalar, corners, heights) for heights in np.eye(len(corners))]
 
