@@ -52,8 +52,7 @@ DRIFT_MAX = 2e-3
 DRIFT = 2e-4
 """Largest relative drift of two sound crystals; a larger one is reported as a fault."""
 ROTATION_DEG = 15.0
-"""Rotation between the body frames above which it is corrected [deg]; a smaller one may be a
-tilt of the markers."""
+"""Rotation between body frames that is corrected [deg]; less may be a tilt of markers."""
 
 
 @dataclass(frozen=True)

@@ -45,8 +45,7 @@ samples if that is longer."""
 FASTER = 0.6
 """A signal is smoothed if the time between its samples is below this share of a row's period."""
 LOST = 0.8
-"""A row gets no velocity if the nearest velocity sample is further away than this many times the
-time between velocity samples."""
+"""A row gets no velocity if the nearest sample is further away than this many of their steps."""
 SLOWER = 1.5
 """A signal is slower than the rows if its time between samples exceeds this many row periods."""
 

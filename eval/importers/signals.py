@@ -56,8 +56,7 @@ class Recording:
     findings: tuple[Finding, ...] = ()
     """Results of the checks so far."""
     motor_side: tuple[tuple[float, float], ...] | None = None
-    """Positions of the file's motors 1 to 4, (x forward, y left), in any length unit; None: the
-    motors have the vehicle's order."""
+    """Positions (x forward, y left) of motors 1 to 4 in any unit; None: the vehicle's order."""
     about: Mapping[str, Any] = field(default_factory=dict)
     """Metadata of the file: firmware, airframe, start."""
     has_seconds: bool = False

@@ -52,8 +52,8 @@ def trajectories_for(result: Mapping[str, Any]) -> tuple[list[Trajectory], list[
 SCHEMA = 1
 """Version of plan.json."""
 COLUMNS = ("time", *(f"{stem}_{axis}" for stem in ("pos", "vel", "acc") for axis in "xyz"), "yaw")
-"""Columns of a CSV: time [s]; position [m], velocity [m/s] and acceleration [m/s^2] in the world
-frame; yaw [rad]."""
+"""Columns of a CSV: time [s]; world position [m], velocity [m/s], acceleration [m/s^2]; yaw
+[rad]."""
 NAME = "plan.json"
 
 
@@ -130,8 +130,7 @@ class Separation:
     separating: tuple[Trajectory, ...]
     """Further flights that separate them."""
     measure: tuple[str, ...] = ()
-    """Further measurements that separate them: `motor` (rotor speeds), `voltage`, or `scale`
-    (weighing the vehicle)."""
+    """Further measurements that do: `motor` (rotor speeds), `voltage` or `scale` (weighing)."""
 
 
 SEPARATIONS: tuple[Separation, ...] = (

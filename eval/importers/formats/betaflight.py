@@ -41,8 +41,7 @@ MISSING = (
 )
 """Reason of the error if the decoder is not installed."""
 MOTOR_SIDE = ((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
-"""Positions of motors 1 to 4 (x forward, y left): rear right, front right, rear left, front
-left."""
+"""Motors 1 to 4 (x forward, y left): rear right, front right, rear left, front left."""
 DSHOT, PULSES = (48.0, 2047.0), (1000.0, 2000.0)
 """Least and largest motor output, in steps of DShot or as pulses [us]."""
 ABOUT = {"Firmware revision": "firmware", "Craft name": "craft", "Board information": "board"}

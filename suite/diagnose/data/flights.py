@@ -47,8 +47,7 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.rotation import rot_to_quat
 
 SLOW_WIDTH_S = 1.0
-"""Width of the bumps (smooth weights over time) where rates come from a path, which shows them only
-as means over a second [s]."""
+"""Width of the bumps (smooth weights over time) where rates come from a path [s]."""
 
 
 @dataclass(frozen=True)
@@ -256,8 +255,7 @@ class ActingRotors(NamedTuple):
     each: bool
     """Whether the speed of each rotor is known. From a collective thrust only the sum is known."""
     noise: np.ndarray | None = None
-    """(N, 4) simulated noise of the same size as that of the measured speeds [rad/s]; None if the
-    speeds were not measured."""
+    """(N, 4) simulated noise like that of measured speeds [rad/s]; None without measured ones."""
     spacing_s: float = 0.0
     """Time between the rows of the measured speeds [s]."""
 

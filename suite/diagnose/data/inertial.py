@@ -32,8 +32,7 @@ PIECE_S = 12.0
 WIDTH_S = 0.2
 """Forces are compared as means over this time [s]."""
 KNOT_S = 1.0
-"""Time between knots, at which the estimated tilt may change: errors of the gyro make the tilt
-error a random walk [s]."""
+"""Time between knots, at which the estimated tilt may change (a random walk) [s]."""
 WALK, LEAST_WALK = 0.02, 0.001
 """Standard deviation of the tilt's change at a knot: value before it is estimated, and smallest
 value [rad]. A gyro that was sampled without a filter, or interpolated, drifts far more than its
@@ -83,8 +82,8 @@ class InertialLog(FlightLog):
     """(N, 3, K) change of the drag's acceleration, in body axes, if one of the K parameters of the
     pose changes by its prior standard deviation [m/s^2]."""
     vel_noise_b: np.ndarray | None = None
-    """(N, 3, `DRAWS`) random draws of the velocity's error in body axes [m/s]. The tilt's random
-    walk causes this error."""
+    """(N, 3, `DRAWS`) draws of the velocity's error, by the tilt's random walk, in body axes
+    [m/s]."""
 
 
 def specific_force_w(log: FlightLog) -> np.ndarray | None:

@@ -31,8 +31,7 @@ MISFIT_TIMES_S = tuple(np.geomspace(0.03, 1.0, 6).tolist())
 DRIFTS = (0.0, *np.logspace(-3.0, 5.0, 17).tolist())
 """Tested sizes of the model's error: its variance after a second over the variance of the noise."""
 ESTIMATED = ("position", "attitude", "velocity")
-"""Groups of channels that come from one state estimator and have the same T. The noise of other
-sensors is white."""
+"""Groups of channels of one state estimator, which have the same T; other noise is white."""
 INTEGRATED = {"position": 2, "attitude": 2, "velocity": 1}
 """Group of channels -> how many times a force or torque is integrated to give it; others: 0."""
 LEAST_ROWS = 30

@@ -21,8 +21,7 @@ from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
 
 LONGEST_S = 0.002
-"""Approximate length of the longest step [s]. With it the integrator's error over a second is far
-below the noise."""
+"""Length of the longest step [s]: the integrator's error over 1 s is far below the noise."""
 LOST = 1.75
 """Between rows that are further apart than this multiple of the usual spacing, rows were lost."""
 

@@ -27,15 +27,13 @@ class Whitening(NamedTuple):
     weight: np.ndarray
     """(W, N, 19) 1 / noise; 0 where nothing was measured."""
     prior: np.ndarray
-    """(F - 12,) 1 / standard deviation of each error of the rotor speeds. The last F - 12 of the M
-    rows hold this prior."""
+    """(F - 12,) 1 / standard deviation of each rotor-speed error; the last F - 12 rows hold it."""
     start: np.ndarray
     """(W, M, F) orthonormal basis of the changes of the rows by the start numbers."""
     upper: np.ndarray
     """(W, F, F) upper triangular matrix from start numbers to coordinates in that basis."""
     slow: np.ndarray
-    """(W, 19, N, L) polynomials of unit length over the rows of each channel: errors that change
-    slowly over a window."""
+    """(W, 19, N, L) polynomials of unit length over the rows of each channel (slow errors)."""
     slow_freedom: np.ndarray
     """(W, 19) sum of squares along these polynomials that noise alone gives, by channel."""
     filters: Mapping[str, np.ndarray]

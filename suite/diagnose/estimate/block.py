@@ -23,8 +23,7 @@ class Estimate(NamedTuple):
     theta: np.ndarray
     """(P,) vector of the model's parameters."""
     free: np.ndarray = np.zeros((0, 0))
-    """(B, F) nuisance parameters of B stretches, such as the start state of a simulated stretch;
-    (0, 0) without any."""
+    """(B, F) nuisance parameters of B stretches, such as start states; (0, 0) without any."""
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,7 @@ class Composite(NamedTuple):
     about: str
     """Description for people."""
     carried: str | None = None
-    """Name of the effect that only acts through the others (carried by them); None where each acts
-    on its own."""
+    """Name of the effect that only acts through (is carried by) the others; None without one."""
 
 
 WIND, PASSED_ON = "constant_wind", "a wind and the drag that passes it on"

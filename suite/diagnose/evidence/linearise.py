@@ -34,8 +34,7 @@ class VehicleArrays(NamedTuple):
     nominal: Nominal
     constants: Constants
     base: dict[str, Any]
-    """Values of every effect that depends on the state alone: neither random nor with a state of
-    its own."""
+    """Values of every effect that depends on the state alone."""
     loop: Loop | None
     """A firmware's rate loop."""
 

@@ -109,8 +109,7 @@ class Weights(NamedTuple):
     memory: np.ndarray
     """(3,) autocorrelation time of the residual, as a number of moments, by axis."""
     trim: np.ndarray
-    """(3,) standard deviation of the trim (constant force or torque) from flight to flight, by
-    axis; infinite with too few flights."""
+    """(3,) standard deviation of the flights' trims by axis; infinite with too few flights."""
     base: np.ndarray | None = None
     """(3,) standard deviation of an error that all flights share, by axis; None if there is none.
     The mean of reference flights has such an error."""

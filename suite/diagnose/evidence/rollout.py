@@ -31,8 +31,7 @@ class Flown(NamedTuple):
     rotor_speed: Any
     """(B, S + 1, 4) rotor speeds [rad/s]."""
     force_b: Any
-    """(B, S + 1, 3) specific force (acceleration minus gravity) [m/s^2]; at the start, that at the
-    end of the first step."""
+    """(B, S + 1, 3) specific force [m/s^2]; at the start, that at the end of the first step."""
 
 
 def fly_windows(

@@ -223,8 +223,7 @@ def is_hopeless(model: RolloutModel, linear: Linearisation, limits: Thresholds) 
 
 
 ACC_ROW = 9
-"""The acceleration at a window's start is computed from the velocities there and in this row,
-counted among the rows with a velocity."""
+"""Row, of those with a velocity, to which the acceleration at a window's start is computed."""
 COMPILED = {"xla_cpu_use_fusion_emitters": False}
 """Options of the compiler XLA: its newer code for loops is no faster, and compiles half as fast."""
 

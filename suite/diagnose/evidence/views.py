@@ -40,8 +40,7 @@ class ViewEvidence(Evidence):
     model: ForceModel
     flights: Sequence[SmoothedFlight]
     carried: np.ndarray | None = None
-    """(M, 3) residual that follows from reference flights (is carried over from them); it is
-    subtracted."""
+    """(M, 3) residual that is carried over from reference flights, and subtracted."""
     means: bool = False
     """Whether only the mean of each flight is compared."""
     weights: Weights | None = None

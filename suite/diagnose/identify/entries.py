@@ -32,8 +32,7 @@ class Row(NamedTuple):
     needs: Sequence[str]
     """The fitted number that must be identified, for each value of the entry."""
     formula: Callable[[Mapping[str, float]], ArrayLike] | None = None
-    """Function from fitted numbers by name to the value, or the values (V,); None: that of the
-    driven vehicle."""
+    """Function from fitted numbers by name to the value(s); None: those of the driven vehicle."""
 
 
 def entries_of(driven: DrivenVehicle, fitted: Fitted, log_thrust: float = 0.0) -> list[Number]:

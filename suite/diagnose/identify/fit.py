@@ -34,8 +34,8 @@ ROUNDS = 6
 DIFFER_P = 0.05
 """P-value below which flights differ more than their blocks explain. Intervals are then wider."""
 LEAST_SIGMA, LEAST_ERROR, LEAST_WEIGHT, LEAST_VARIANCE = 1e-9, 1e-9, 1e-12, 1e-30
-"""Lower limits that avoid a division by zero: of the noise, of an error divided by the noise, of a
-sum of weights, and of a product of two standard deviations."""
+"""Lower limits of noise, of an error over it, of a sum of weights, and of two deviations'
+product."""
 
 
 class NoWholeWindow(ValueError):
@@ -57,8 +57,7 @@ class Unknown(NamedTuple):
     step: float
     """Step of the finite differences."""
     method_error: float = 0.0
-    """Half-width of the method's own error, from simulated flights without noise. Its square is
-    added to that of the interval's half-width."""
+    """Half-width of the method's own error, from simulated flights; adds to that by noise."""
 
 
 class Rows(NamedTuple):
@@ -71,8 +70,7 @@ class Rows(NamedTuple):
     offset: np.ndarray
     """(C,) bool: channels in which the flight has a free constant, such as a trim."""
     nuisance: np.ndarray | None = None
-    """(N, C, K) change of the residuals by nuisance parameters, each by its standard deviation
-    before the flight; None for none."""
+    """(N, C, K) change of the residuals by one prior standard deviation of nuisance parameters."""
 
 
 Residuals = Callable[[Mapping[str, float]], Sequence[Rows]]

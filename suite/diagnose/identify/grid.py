@@ -37,8 +37,7 @@ STEP_S = 0.004
 MEMORY_S = 0.4
 """Commands older than this have no effect [s]."""
 ROTOR_NOISE = "rotor_noise"
-"""Name of a signal: random noise as large as that of the measured rotor speeds. It is added to
-them, to see how such noise changes the model."""
+"""Signal: noise like that of the measured rotor speeds, added to see its influence."""
 LEANING = "leaning"
 """Name of a signal: the attitude that the path's acceleration requires, if none was measured."""
 IMU_ACC = "imu_acc_w"
@@ -60,8 +59,7 @@ class FlightGrid(NamedTuple):
     signals: dict[str, np.ndarray]
     """Signals (G, ...) by name: rot_w, vel_w, pos_w, rate_b, commands and rotor speeds."""
     in_turn: tuple[str, ...] = ()
-    """Names of signals of which each row has only some columns, such as the speeds of motors that
-    are read one after another."""
+    """Signals of which each row has only some columns, such as motors that are read in turn."""
     rotor_spacing_s: float = 0.0
     """Time between the measured rotor speeds [s]; 0 without any."""
 

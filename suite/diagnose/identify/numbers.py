@@ -26,8 +26,7 @@ class Number(NamedTuple):
     ci95: list[tuple[float, float] | None]
     """95 % interval of each component; None for one that is not identified."""
     follows: bool = False
-    """Whether a component is not identified but still written into the file. It is the difference
-    between an identified sum and another number, such as the delay."""
+    """Whether an unidentified component is in the file, as the rest of an identified sum."""
 
     @property
     def is_identified(self) -> bool:

@@ -103,8 +103,7 @@ def _mismatch(mismatch: Mapping[str, Any]) -> Grid:
 
 
 LEAST_P = 0.0005
-"""P-values up to this are not printed. The null distribution (without any effect) has some thousand
-draws, so smaller values are not resolved."""
+"""P-values up to this are not printed, as some thousand draws do not resolve them."""
 ALONE = (
     "All {count} candidates, each fitted alone before anything was named. The gain is the fall of "
     "the whitened squared error on stretches that were left out of its fit."

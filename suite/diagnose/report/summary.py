@@ -52,8 +52,7 @@ HEADINGS = {
     False: {False: "Wrong or missing in the vehicle file:", True: "Wrong in the logs:"},
     True: {False: "Changed in the vehicle:", True: "Changed in the logs:"},
 }
-"""Headings of named effects, by whether a change was searched for, and whether they are of the
-log."""
+"""Headings of named effects, by whether a change was searched for, and whether of the log."""
 UNTESTED = "Whether the file itself is right was not tested: for that, leave out --reference."
 CHECK = (
     "Verify the signals: a log's errors resemble physics. Read the notes of suite check: a small "
@@ -212,8 +211,7 @@ def _search_for(unexplained: Mapping[str, Any]) -> list[str]:
 
 
 LEAST_SHOWN = 0.001
-"""A smaller gap is printed as "less than" this value, in the unit of the gap (times the noise,
-m/s^2 or rad/s^2)."""
+"""A smaller gap is printed as "less than" this value, in the unit of the gap."""
 
 
 class Component(NamedTuple):

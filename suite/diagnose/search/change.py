@@ -98,8 +98,7 @@ class RotorSpread:
     """Spread from flight to flight of one unchanged vehicle, relative to a rotor's thrust."""
 
     share: float
-    """Standard deviation from flight to flight, relative to a rotor's thrust, pooled over all
-    axes."""
+    """Standard deviation between flights, relative to a rotor's thrust, pooled over all axes."""
     freedom: int
     """Degrees of freedom of this pooled estimate."""
     along: Mapping[str, np.ndarray]

@@ -26,8 +26,7 @@ class NamedEffect:
     rivals: tuple[str, ...] = ()
     """Names of the alternatives: effects that explain the flights about as well."""
     worse_by: dict[str, float] = field(default_factory=dict)
-    """How much worse another candidate in place of this effect fits, by its label: the rise of
-    chi-square plus number of parameters."""
+    """Rise of chi-square plus number of parameters with another candidate instead, by its label."""
     gains: tuple[float, ...] = ()
     """Fall of each flight's squared error, with the parameters fitted to the other flights."""
     share: float = 0.0

@@ -43,8 +43,7 @@ TINY_S = 1e-6
 LOG_RATIO = (-7.0, -0.7)
 """Bounds of log T_f / T, the fast correlation time over the slow one."""
 LONGEST_NEW = 0.3
-"""A fast correlation time below this share of the time between rows counts as 0: rows do not
-show it."""
+"""A fast correlation time below this share of the rows' distance counts as 0."""
 
 
 class Series(NamedTuple):

@@ -48,8 +48,8 @@ class Errors(NamedTuple):
     step_s: float
     """Time between rows [s]."""
     value: np.ndarray
-    """(T, 9) estimate minus reference: position in world axes [m], velocity [m/s] and attitude
-    [rad] in body axes."""
+    """(T, 9) estimate minus reference: world position [m], body velocity [m/s] and attitude
+    [rad]."""
     slope: np.ndarray
     """(T, 9) time derivative of the reference, in the same axes."""
     vel_b: np.ndarray

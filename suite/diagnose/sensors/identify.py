@@ -38,8 +38,7 @@ from suite.diagnose.sensors.errors import (
 SCHEMA = 1
 """Version of the JSON that `suite identify --sensors` prints."""
 WITHIN = 0.2
-"""A model fits if its autocorrelation differs by at most this from the measured one, at every lag
-(time difference)."""
+"""Largest difference between the autocorrelations of a model that fits and of the flights."""
 
 
 class Fitted(NamedTuple):

@@ -20,8 +20,7 @@ from suite.diagnose.sources.source import TOGETHER, TOO_SMALL, Finding, Source
 from suite.diagnose.verdict.gap import EffectSize, Gap
 
 CONTRADICTION = 1.5
-"""Two values of a parameter contradict each other if they differ by more than this many times the
-sum of the half-widths of their 95 % intervals."""
+"""Two values contradict each other if they differ by more than this many sums of half-widths."""
 
 
 def examine(

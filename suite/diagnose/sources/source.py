@@ -56,8 +56,7 @@ class Remaining(NamedTuple):
     reason: str = "that depends on no tested quantity"
     """Words after "an error": why an error above the noise floor does not count as structure."""
     explainable: float = 0.0
-    """Share of the gap that a black box (a regression without physics) explains; 0 if none was
-    fitted."""
+    """Share of the gap that a black box (regression without physics) explains; 0 without one."""
     wind: TestedEffect | None = None
     """Random wind that explains the error."""
     swing: Swing | None = None
@@ -111,8 +110,7 @@ class Source(ABC):
     horizon_s: float
     """Length of the windows over which the gap is measured [s]."""
     begin: Evaluation
-    """The fitted flights with their noise, evaluated along all parameters at the vehicle file's
-    parameters, from which the search starts."""
+    """The fitted flights with their noise, at the vehicle file's parameters, along all of them."""
     candidates: Sequence[Candidate]
     """Effects that the search tries."""
     limits: Thresholds
@@ -120,8 +118,7 @@ class Source(ABC):
     """Whether effects below the threshold of relevance are named. True for a change since reference
     flights, which is compared with the spread between flights instead."""
     small_explains: bool = False
-    """Whether the remaining error is what remains with all fitted effects, including those that are
-    too small to be named."""
+    """Whether effects that are too small to be named count as explaining the remaining error."""
     fallback: Source | None = None
     """A second source, which is searched if this one names nothing."""
 

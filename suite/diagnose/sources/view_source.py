@@ -46,8 +46,7 @@ class ViewSource(Source):
     held: ViewEvidence
     """The held-out flights."""
     floor: np.ndarray
-    """(3,) standard deviation of a mean acceleration that measurement noise causes, by body axis
-    [the view's unit]."""
+    """(3,) noise of a mean acceleration by body axis [the view's unit]."""
     reason = UNPREDICTED
     """Why an error above the noise floor does not count as structure, see `Remaining.reason`."""
     all_flights: ViewEvidence | None = None

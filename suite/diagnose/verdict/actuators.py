@@ -72,11 +72,9 @@ class ActuatorMismatch(NamedTuple):
     rms_own: float
     """RMS difference with the vehicle file's lag, and its best delay and scales [rad/s]."""
     thrust: tuple[float, float]
-    """Mean and standard deviation of measured minus commanded collective thrust, over the nominal
-    mass [m/s^2]."""
+    """Mean and standard deviation of measured minus commanded thrust over nominal mass [m/s^2]."""
     turn: tuple[tuple[float, float], ...]
-    """Mean and standard deviation of measured minus commanded angular acceleration, about body x,
-    y and z each [rad/s^2]."""
+    """The same of the angular acceleration about body x, y and z each [rad/s^2]."""
     followed: float
     """Share of the speeds' variance that the commands and the vehicle file's lag explain."""
 
