@@ -50,6 +50,8 @@ POWER = {
     **{"pwm": 1, "motor": 2, "motor_cmd": 2},
 }
 """Signals that measure the motors' effort -> exponent with which each gives the thrust."""
+Found = tuple[np.ndarray, str] | None
+"""Which samples of a signal (N,) bool to leave out, and why; None for none."""
 
 
 def clean(recording: Recording) -> Recording:
@@ -157,10 +159,6 @@ def _moves(samples: Signal) -> bool:
     if later >= len(samples.value):
         return False
     return bool(np.mean(np.any(samples.value[later:] != samples.value[:-later], axis=1)) > 0.9)
-
-
-Found = tuple[np.ndarray, str] | None
-"""Which samples of a signal (N,) bool to leave out, and why; None for none."""
 
 
 def _interpolated(quat: Signal) -> Found:

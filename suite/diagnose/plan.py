@@ -28,6 +28,23 @@ MEASURES = {
     "scale": "Better still: weigh the vehicle.",
 }
 """Advice on further measurements, by their names in `Separation.measure`."""
+SCHEMA = 1
+"""Version of plan.json."""
+COLUMNS = ("time", *(f"{stem}_{axis}" for stem in ("pos", "vel", "acc") for axis in "xyz"), "yaw")
+"""Columns of a CSV: time [s]; world position [m], velocity [m/s], acceleration [m/s^2]; yaw
+[rad]."""
+NAME = "plan.json"
+_FAST_WOBBLE = Trajectory("figure_eight", speed=6.5, size=4.0, turn="wobble")
+_SWEEP = Trajectory("speed_range", speed=8.0, size=6.0, turn="sweep")
+_CHIRP = Trajectory("chirp", speed=1.6, turn="wobble")
+_PUNCHES = Trajectory("punches", speed=4.0, size=4.0)
+_RANGE = Trajectory("speed_range", speed=9.0, size=7.0)
+_CIRCLE = Trajectory("circle", speed=3.0, size=3.0)
+_SLOW_EIGHT = Trajectory("figure_eight", speed=2.0, size=3.0)
+_HOVER = Trajectory("hover")
+_UP_DOWN = Trajectory("vertical", speed=1.5, size=1.0)
+OTHERWISE = "fly faster, with changes of thrust, speed, heading and height"
+"""Advice for effects without an entry in `SEPARATIONS`."""
 
 
 def trajectories_for(result: Mapping[str, Any]) -> tuple[list[Trajectory], list[str]]:
@@ -47,14 +64,6 @@ def trajectories_for(result: Mapping[str, Any]) -> tuple[list[Trajectory], list[
         for flight in (trajectory, replace(trajectory, direction=2.1))
     ]
     return flights, list(dict.fromkeys(words))
-
-
-SCHEMA = 1
-"""Version of plan.json."""
-COLUMNS = ("time", *(f"{stem}_{axis}" for stem in ("pos", "vel", "acc") for axis in "xyz"), "yaw")
-"""Columns of a CSV: time [s]; world position [m], velocity [m/s], acceleration [m/s^2]; yaw
-[rad]."""
-NAME = "plan.json"
 
 
 def remove_plan(folder: Path) -> None:
@@ -102,19 +111,6 @@ def write_plan(folder: Path, ways: Sequence[Trajectory], words: Sequence[str]) -
     plan = {"flights": flights, "words": list(words)}
     write_json(folder / NAME, {**plan, **stamp(SCHEMA, None)})
     return plan
-
-
-_FAST_WOBBLE = Trajectory("figure_eight", speed=6.5, size=4.0, turn="wobble")
-_SWEEP = Trajectory("speed_range", speed=8.0, size=6.0, turn="sweep")
-_CHIRP = Trajectory("chirp", speed=1.6, turn="wobble")
-_PUNCHES = Trajectory("punches", speed=4.0, size=4.0)
-_RANGE = Trajectory("speed_range", speed=9.0, size=7.0)
-_CIRCLE = Trajectory("circle", speed=3.0, size=3.0)
-_SLOW_EIGHT = Trajectory("figure_eight", speed=2.0, size=3.0)
-_HOVER = Trajectory("hover")
-_UP_DOWN = Trajectory("vertical", speed=1.5, size=1.0)
-OTHERWISE = "fly faster, with changes of thrust, speed, heading and height"
-"""Advice for effects without an entry in `SEPARATIONS`."""
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,8 @@ from tracks.geometry.rotation import rot_to_quat
 
 SLOW_WIDTH_S = 1.0
 """Width of the bumps (smooth weights over time) where rates come from a path [s]."""
+SMOOTH_S = 0.1
+"""Standard deviation of the Gaussian that smooths the velocity before it is differentiated [s]."""
 
 
 @dataclass(frozen=True)
@@ -187,10 +189,6 @@ def _floor(view: View, flights: Sequence[SmoothedFlight], logs: Sequence[FlightL
         power.append(sigma**2 * gain)
     floor = np.sqrt(np.mean(power, axis=0))
     return np.full(3, floor.mean()) if view.in_world else floor
-
-
-SMOOTH_S = 0.1
-"""Standard deviation of the Gaussian that smooths the velocity before it is differentiated [s]."""
 
 
 def completed(log: FlightLog) -> FlightLog:

@@ -15,6 +15,9 @@ from suite.diagnose.data.view import SmoothedFlight, smoothed
 from suite.diagnose.data.windows import LENGTH_S
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
+SmoothedFlights = dict[str, list[SmoothedFlight]]
+"""Flights by name of the view."""
+
 
 def choose_held_out(
     logs: Sequence[FlightLog],
@@ -49,10 +52,6 @@ def choose_held_out(
         lost = {k: (by_flight[k][informed] / total[informed]).max(initial=0.0) for k in kept}
         held.append(min(reversed(kept), key=lambda k: lost[k]))
     return ~np.isin(flight, held), [logs[int(k)].name for k in sorted(held)]
-
-
-SmoothedFlights = dict[str, list[SmoothedFlight]]
-"""Flights by name of the view."""
 
 
 def parted(

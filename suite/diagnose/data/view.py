@@ -25,6 +25,9 @@ from suite.diagnose.data.sampling import voltage_drop
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.scene import Array
 
+LEAST_ROWS = 4
+"""Smallest number of steps from row to row in a bump."""
+
 
 class FlightRows(NamedTuple):
     """N rows of one flight. A missing signal has a filled-in value, and its row is not `good`."""
@@ -239,7 +242,3 @@ def weak_form(
     middle_s = np.array(centres)
     middle_row = nearest(time_s, middle_s)
     return WeakForm(middle_s, middle_row, matrix(-bump, bump), matrix(weight, weight))
-
-
-LEAST_ROWS = 4
-"""Smallest number of steps from row to row in a bump."""

@@ -17,6 +17,16 @@ from scipy.stats import t as student
 from suite.diagnose.estimate.block import NormalEquations
 from suite.diagnose.estimate.parameters import ParameterSpace
 
+Z95 = 1.96
+"""Half-width of a normal 95 % interval, in standard deviations."""
+TINY = 1e-12
+"""Smaller information counts as none."""
+RIDGE = 1e-9
+"""Added to the scaled information. So a parameter that is not identifiable gets a wide interval; a
+pseudo-inverse would give it a narrow one."""
+FEWEST = 3
+"""Smallest number of flights whose differences are tested."""
+
 
 def solve(
     hessian: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray, scale: np.ndarray
@@ -74,17 +84,6 @@ def chi2_fall(
     if not fitted.gradient.shape[1] or np.einsum("bkk->", fitted.hessian) < TINY:
         return 0.0
     return gauss_newton_step(fitted, theta, space)[1]
-
-
-Z95 = 1.96
-"""Half-width of a normal 95 % interval, in standard deviations."""
-TINY = 1e-12
-"""Smaller information counts as none."""
-RIDGE = 1e-9
-"""Added to the scaled information. So a parameter that is not identifiable gets a wide interval; a
-pseudo-inverse would give it a narrow one."""
-FEWEST = 3
-"""Smallest number of flights whose differences are tested."""
 
 
 class Intervals(NamedTuple):

@@ -45,6 +45,11 @@ from suite.diagnose.evidence.linearise import (
 from suite.diagnose.evidence.rollout import Flown, at_knots, difference, fly_windows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
+ACC_ROW = 9
+"""Row, of those with a velocity, to which the acceleration at a window's start is computed."""
+COMPILED = {"xla_cpu_use_fusion_emitters": False}
+"""Options of the compiler XLA: its newer code for loops is no faster, and compiles half as fast."""
+
 
 @dataclass(frozen=True)
 class RolloutEvidence(Evidence):
@@ -220,12 +225,6 @@ def is_hopeless(model: RolloutModel, linear: Linearisation, limits: Thresholds) 
     at = Estimate(start, linear.offset[few])
     best = evidence.fitted(at, informed, limits.hopeless_rounds, block)
     return is_far(float((best.block.residual**2).sum()))
-
-
-ACC_ROW = 9
-"""Row, of those with a velocity, to which the acceleration at a window's start is computed."""
-COMPILED = {"xla_cpu_use_fusion_emitters": False}
-"""Options of the compiler XLA: its newer code for loops is no faster, and compiles half as fast."""
 
 
 class RolloutModel:

@@ -55,6 +55,18 @@ FORCE_ERROR = 0.05
 FORCE_OFFSETS = np.array([True, True, False])
 """Body axes along which each flight has a free constant, for its trim (error of the attitude).
 Along z a constant would be mistaken for thrust."""
+TORQUE_WIDTH_S = 0.2
+"""Width of the windows in which changes of rate are compared [s]."""
+TO_RATE_S = TORQUE_WIDTH_S / (2.0 * np.pi)
+"""Factor from an angular acceleration to the change of rate that is compared in a window. The mean
+over the window is removed: the slow part of the motors' torque only balances trim and blade
+flapping, and does not turn the body [s]."""
+NOISE_BIASED = ("inertia_x", "inertia_y", "yaw")
+"""For each body axis, the number that noise of the rotor speeds biases."""
+FORCE_NUMBERS = ("thrust", "curve", "battery")
+"""Numbers of the force fit on which the torque depends."""
+LATEST_S, LATE_STEP_S = 0.13, 0.012
+"""Largest total delay that is tried for the start of a fit, and the step between trials [s]."""
 
 
 def force_unknowns(
@@ -177,20 +189,6 @@ def _without_motion(flights: Sequence[Windows]) -> list[str]:
         total += (values[..., 0] ** 2).sum(axis=0)
         error += (values[..., 1:] ** 2).mean(axis=-1).sum(axis=0)
     return [f"drag_{axis}" for k, axis in enumerate("xy") if error[k] > MOST_ERROR * total[k]]
-
-
-TORQUE_WIDTH_S = 0.2
-"""Width of the windows in which changes of rate are compared [s]."""
-TO_RATE_S = TORQUE_WIDTH_S / (2.0 * np.pi)
-"""Factor from an angular acceleration to the change of rate that is compared in a window. The mean
-over the window is removed: the slow part of the motors' torque only balances trim and blade
-flapping, and does not turn the body [s]."""
-NOISE_BIASED = ("inertia_x", "inertia_y", "yaw")
-"""For each body axis, the number that noise of the rotor speeds biases."""
-FORCE_NUMBERS = ("thrust", "curve", "battery")
-"""Numbers of the force fit on which the torque depends."""
-LATEST_S, LATE_STEP_S = 0.13, 0.012
-"""Largest total delay that is tried for the start of a fit, and the step between trials [s]."""
 
 
 def lag_unknowns(lag_s: float, late_s: float) -> list[Unknown]:

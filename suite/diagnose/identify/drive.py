@@ -39,6 +39,12 @@ LEAST_LAG_S = 1e-4
 """A shorter lag (time constant) of the rotors counts as none [s]."""
 LEAST_VOLTS = 0.1
 """Lower measured voltages are raised to this, so that a power of them is finite [V]."""
+Accelerations = Callable[[FlightGrid, FlightRows], tuple[np.ndarray, np.ndarray]]
+"""Function that returns dv/dt in world axes and dw/dt in body axes on each row, (G, 3) each."""
+MERGED = ("motor_lag", "inertia_scale", "rate_gain")
+"""Effects that scale or replace a fitted number."""
+FITTED = ("linear_drag", "blade_flapping", "command_delay", "thrust_scale")
+"""Effects whose parameters are fitted themselves, starting from their values in the file."""
 
 
 def common_drive(flights: Sequence[FlightGrid]) -> str:
@@ -54,10 +60,6 @@ def common_drive(flights: Sequence[FlightGrid]) -> str:
         "the flights share no drive: every one needs rotor speeds, motor commands (pwm_1 to "
         "pwm_4), or a thrust command; identify flights of each kind separately"
     )
-
-
-Accelerations = Callable[[FlightGrid, FlightRows], tuple[np.ndarray, np.ndarray]]
-"""Function that returns dv/dt in world axes and dw/dt in body axes on each row, (G, 3) each."""
 
 
 @dataclass(frozen=True)
@@ -236,12 +238,6 @@ def filled(values: np.ndarray) -> np.ndarray:
     """Return `values` (G, C) in which each incomplete row repeats the last complete one."""
     rows = np.arange(len(values))
     return np.nan_to_num(hold(rows, rows, values))
-
-
-MERGED = ("motor_lag", "inertia_scale", "rate_gain")
-"""Effects that scale or replace a fitted number."""
-FITTED = ("linear_drag", "blade_flapping", "command_delay", "thrust_scale")
-"""Effects whose parameters are fitted themselves, starting from their values in the file."""
 
 
 def with_merged_effects(vehicle: Vehicle, known_motors: bool) -> Vehicle:

@@ -13,6 +13,33 @@ from suite.diagnose.identify.grid import IMU_ACC, FlightGrid
 
 DELAY = "effects.command_delay.delay"
 """Key of the command delay in a vehicle file."""
+OTHER_INERTIA = "the rotors' lag may be another, or the file is over 100 times wrong"
+"""Other reasons for which an inertia is not identifiable."""
+WHY = {
+    "thrust": "thrust: too little of the force along body z is explained",
+    "curve": "curvature of the thrust curve: the motor commands hardly change",
+    "battery": "voltage_exponent: the voltage hardly changes",
+    **{f"drag_{a}": f"drag along body {a}: too slow, or too little of it" for a in "xyz"},
+    "inertia_x": f"inertia about x: the body hardly rolls, {OTHER_INERTIA}",
+    "inertia_y": f"inertia about y: the body hardly pitches, {OTHER_INERTIA}",
+    "inertia_z": "inertia about z: the body hardly yaws, or not while it rolls and pitches",
+    "yaw": "torque_coefficient: the body hardly yaws",
+    "lag": "time_constant of the rotors: nothing fast enough is commanded",
+    "late": "command_delay: nothing fast enough is commanded",
+    "gain_x": "rate_gain about x: the body hardly rolls",
+    "gain_y": "rate_gain about y: the body hardly pitches",
+    "gain_z": "rate_gain about z: the body hardly yaws",
+}
+"""Description of each fitted number, by name, with the reason why flights may not identify it."""
+WELL_EXPLAINED, SMALL_MISFIT = 0.5, 1.0
+"""A model fits an axis if it explains this share of the measured mean square, or if the root mean
+square of the rest is below the second value: 1 m/s^2 or 1 rad/s^2."""
+MOTIONS = {"force": "acceleration along", "torque": "angular acceleration about"}
+"""Name of a fit -> what it explains."""
+NO_RATES = "no body rates and no attitude in these logs"
+"""Reason if a fit needs body rates and the logs have none."""
+NEVER_BOTH = "these logs have no stretch with both"
+"""Reason if the logs have the columns that a fit needs, but never all in one window."""
 
 
 class Number(NamedTuple):
@@ -64,35 +91,6 @@ def number_lines(numbers: Sequence[Number]) -> list[str]:
         for k, (value, span) in enumerate(zip(entry.value, entry.ci95, strict=True))
         if span is not None
     ]
-
-
-OTHER_INERTIA = "the rotors' lag may be another, or the file is over 100 times wrong"
-"""Other reasons for which an inertia is not identifiable."""
-WHY = {
-    "thrust": "thrust: too little of the force along body z is explained",
-    "curve": "curvature of the thrust curve: the motor commands hardly change",
-    "battery": "voltage_exponent: the voltage hardly changes",
-    **{f"drag_{a}": f"drag along body {a}: too slow, or too little of it" for a in "xyz"},
-    "inertia_x": f"inertia about x: the body hardly rolls, {OTHER_INERTIA}",
-    "inertia_y": f"inertia about y: the body hardly pitches, {OTHER_INERTIA}",
-    "inertia_z": "inertia about z: the body hardly yaws, or not while it rolls and pitches",
-    "yaw": "torque_coefficient: the body hardly yaws",
-    "lag": "time_constant of the rotors: nothing fast enough is commanded",
-    "late": "command_delay: nothing fast enough is commanded",
-    "gain_x": "rate_gain about x: the body hardly rolls",
-    "gain_y": "rate_gain about y: the body hardly pitches",
-    "gain_z": "rate_gain about z: the body hardly yaws",
-}
-"""Description of each fitted number, by name, with the reason why flights may not identify it."""
-WELL_EXPLAINED, SMALL_MISFIT = 0.5, 1.0
-"""A model fits an axis if it explains this share of the measured mean square, or if the root mean
-square of the rest is below the second value: 1 m/s^2 or 1 rad/s^2."""
-MOTIONS = {"force": "acceleration along", "torque": "angular acceleration about"}
-"""Name of a fit -> what it explains."""
-NO_RATES = "no body rates and no attitude in these logs"
-"""Reason if a fit needs body rates and the logs have none."""
-NEVER_BOTH = "these logs have no stretch with both"
-"""Reason if the logs have the columns that a fit needs, but never all in one window."""
 
 
 def not_identified(fitted: Mapping[str, Fitted], entries: Mapping[str, Number]) -> list[str]:

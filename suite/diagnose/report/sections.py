@@ -20,6 +20,18 @@ from tracks.common.grid import Cell, Grid, table, table_of
 
 SHOWN = 12
 """Largest number of logs in the table of logs."""
+LEAST_P = 0.0005
+"""P-values up to this are not printed, as some thousand draws do not resolve them."""
+ALONE = (
+    "All {count} candidates, each fitted alone before anything was named. The gain is the fall of "
+    "the whitened squared error on stretches that were left out of its fit."
+)
+CHANGED = (
+    "The candidates whose gain is close to the best, each fitted alone before anything was named. "
+    "The gain is the fall of the whitened squared error of the flights' means, less two for each "
+    "fitted number."
+)
+"""Explanations of the table of candidates; the second is for a change since reference flights."""
 
 
 def logs_section(logs: Sequence[FlightLog]) -> Section:
@@ -100,20 +112,6 @@ def _mismatch(mismatch: Mapping[str, Any]) -> Grid:
     ]
     note = "± is the spread over the flights."
     return table(["", ""], rows, f"Compared with the {mismatch['commanded_by']}", note)
-
-
-LEAST_P = 0.0005
-"""P-values up to this are not printed, as some thousand draws do not resolve them."""
-ALONE = (
-    "All {count} candidates, each fitted alone before anything was named. The gain is the fall of "
-    "the whitened squared error on stretches that were left out of its fit."
-)
-CHANGED = (
-    "The candidates whose gain is close to the best, each fitted alone before anything was named. "
-    "The gain is the fall of the whitened squared error of the flights' means, less two for each "
-    "fitted number."
-)
-"""Explanations of the table of candidates; the second is for a change since reference flights."""
 
 
 def candidates_section(diagnosis: Diagnosis) -> Section:

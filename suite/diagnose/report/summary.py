@@ -58,6 +58,8 @@ CHECK = (
     "Verify the signals: a log's errors resemble physics. Read the notes of suite check: a small "
     "error of a scale or a filter is a note, and stops no diagnosis."
 )
+LEAST_SHOWN = 0.001
+"""A smaller gap is printed as "less than" this value, in the unit of the gap."""
 
 
 def headline(result: Mapping[str, Any]) -> str:
@@ -208,10 +210,6 @@ def _search_for(unexplained: Mapping[str, Any]) -> list[str]:
             f"{swing['length_m']:.2g} into [effects.slung_load] of the vehicle file."
         )
     return steps
-
-
-LEAST_SHOWN = 0.001
-"""A smaller gap is printed as "less than" this value, in the unit of the gap."""
 
 
 class Component(NamedTuple):

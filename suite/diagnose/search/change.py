@@ -40,6 +40,12 @@ from suite.diagnose.evidence.views import ViewBlock, ViewEvidence, view_candidat
 from suite.diagnose.search.evaluation import NamedEffect, SearchResult
 from suite.diagnose.thresholds import Thresholds
 
+BALANCE = {"force": (("thrust_scale",),), "torque": (("com_offset",), ("torque_trim",))}
+"""Effects that are fitted to the reference flights, by view and one group after another. So the
+search for changes starts from a vehicle whose mean forces and torques are those of the real one."""
+BOUND_SHARE = 0.1
+"""Parameters may exceed their physical bounds by this share of a change, because of noise."""
+
 
 def _motion_inputs(task: ViewEvidence, theta: np.ndarray) -> np.ndarray:
     """Return the inputs (M, 9) of a regression of a model's error on the motion, without means.
@@ -55,11 +61,6 @@ def _motion_inputs(task: ViewEvidence, theta: np.ndarray) -> np.ndarray:
     data = task.residuals(theta)
     inputs = np.concatenate([np.concatenate(motion), data.value], axis=1)
     return centred(inputs, data.flight)
-
-
-BALANCE = {"force": (("thrust_scale",),), "torque": (("com_offset",), ("torque_trim",))}
-"""Effects that are fitted to the reference flights, by view and one group after another. So the
-search for changes starts from a vehicle whose mean forces and torques are those of the real one."""
 
 
 def fit_balance(reference: ViewEvidence) -> np.ndarray:
@@ -266,10 +267,6 @@ def change_evidence(
         exact_weights=weights, spread=spread, limits=limits,
     )  # fmt: skip
     return evidence.relinearise(Estimate(start))
-
-
-BOUND_SHARE = 0.1
-"""Parameters may exceed their physical bounds by this share of a change, because of noise."""
 
 
 def within_flights(data: ViewData) -> ViewData:

@@ -40,6 +40,22 @@ LEAST_S = 8.0
 """Least length of a flight; errors are correlated over seconds [s]."""
 ZERO = Interval(0.0, 0.0, 0.0)
 """A parameter that is not in the model."""
+STRETCH_S = 5.0
+"""Errors further apart than this count as independent [s]."""
+ROUNDS = 3
+"""Number of rounds of the fit; each is linearised at the delay of the round before."""
+TILT = slice(6, 9)
+"""Channels of the attitude among the errors. All three axes are fitted: if a body leans, a tilt
+about a horizontal world axis has a part about the body's z axis."""
+DELAY = Unknown("delay", 0.0, -1.0, 1.0, np.inf, 1e-3)
+SCALE = Unknown("scale", 0.0, -1.0, 1.0, np.inf, 1e-3)
+DRAG = Unknown("drag", 0.3, -2.0, 5.0, np.inf, 1e-2)
+LOG_LASTS = Unknown("log_lasts", 0.0, np.log(0.05), np.log(10.0), np.inf, 1e-2)
+"""The fitted parameters: change of the delay [s], relative scale error of the velocity, drag [1/s],
+and logarithm of the tilt's correlation time in seconds. The drag does not start at 0, where the
+correlation time has no effect."""
+LOG_LIMITS = (-20.0, 20.0)
+"""Limits of the logarithm of the correlation time's interval."""
 
 
 class Errors(NamedTuple):
@@ -139,24 +155,6 @@ def _differentiated(values: np.ndarray, step_s: float) -> np.ndarray:
         return np.full_like(values, np.nan)
     slope = savgol_filter(values, SLOPE_ROWS, 2, deriv=1, delta=step_s, axis=0, mode="nearest")
     return np.asarray(slope)
-
-
-STRETCH_S = 5.0
-"""Errors further apart than this count as independent [s]."""
-ROUNDS = 3
-"""Number of rounds of the fit; each is linearised at the delay of the round before."""
-TILT = slice(6, 9)
-"""Channels of the attitude among the errors. All three axes are fitted: if a body leans, a tilt
-about a horizontal world axis has a part about the body's z axis."""
-DELAY = Unknown("delay", 0.0, -1.0, 1.0, np.inf, 1e-3)
-SCALE = Unknown("scale", 0.0, -1.0, 1.0, np.inf, 1e-3)
-DRAG = Unknown("drag", 0.3, -2.0, 5.0, np.inf, 1e-2)
-LOG_LASTS = Unknown("log_lasts", 0.0, np.log(0.05), np.log(10.0), np.inf, 1e-2)
-"""The fitted parameters: change of the delay [s], relative scale error of the velocity, drag [1/s],
-and logarithm of the tilt's correlation time in seconds. The drag does not start at 0, where the
-correlation time has no effect."""
-LOG_LIMITS = (-20.0, 20.0)
-"""Limits of the logarithm of the correlation time's interval."""
 
 
 class Systematic(NamedTuple):

@@ -42,6 +42,8 @@ FAR = (
     "and torque are compared; check the commands' units, and the gains of the rate loop"
 )
 """Warning if rollouts cannot be used."""
+GIVEN, FITTED = "simulated as given", "simulated with the named effects"
+"""Labels of the vehicle file's model and of the fitted model, in charts and recordings."""
 
 
 class Remaining(NamedTuple):
@@ -67,10 +69,6 @@ class Remaining(NamedTuple):
     """Further entries of `gap` in diagnosis.json."""
     channels: Mapping[str, Mapping[str, Any]] = {}
     """Further entries of `gap.channels` in diagnosis.json, by group and channel."""
-
-
-GIVEN, FITTED = "simulated as given", "simulated with the named effects"
-"""Labels of the vehicle file's model and of the fitted model, in charts and recordings."""
 
 
 class Series(NamedTuple):

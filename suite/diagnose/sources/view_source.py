@@ -36,6 +36,10 @@ QUANTITIES = {"force": "acceleration", "torque": "angular acceleration"}
 UNPREDICTED = "that logged signals hardly predict"
 NO_AGREEMENT = "on which the flights do not agree"
 """Reasons why an error of a view does not count as structure, see `Remaining.reason`."""
+RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
+"""Ridge weights that are tried, relative to the weight of the data."""
+PATTERNS = np.array([[1, 1, 1, 1], [-1, -1, 1, 1], [-1, 1, 1, -1], [1, -1, 1, -1]])
+"""Sums and differences of the four rotors' thrusts: collective thrust, roll, pitch and yaw."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,10 +239,6 @@ class Shares(NamedTuple):
         return {key: float(share) if np.isfinite(share) else None for key, share in shares.items()}
 
 
-RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
-"""Ridge weights that are tried, relative to the weight of the data."""
-
-
 def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> np.ndarray:
     """Return the weights (K, 3) with which `inputs` (M, K) explain `error` (M, 3) best.
 
@@ -274,10 +274,6 @@ def closed_share(before: np.ndarray, after: np.ndarray, flight: np.ndarray) -> n
     """Return the share (3,) of the variance within flights that `before` has and `after` lacks."""
     power = (centred(before, flight) ** 2).sum(axis=0)
     return 1.0 - (centred(after, flight) ** 2).sum(axis=0) / np.maximum(power, TINY)
-
-
-PATTERNS = np.array([[1, 1, 1, 1], [-1, -1, 1, 1], [-1, 1, 1, -1], [1, -1, 1, -1]])
-"""Sums and differences of the four rotors' thrusts: collective thrust, roll, pitch and yaw."""
 
 
 def inputs_of(flight: SmoothedFlight) -> np.ndarray:

@@ -35,6 +35,10 @@ LONGEST_LAG_S, LONGEST_DELAY_S, DELAYS_TRIED = 0.15, 0.06, 9
 delays that are tried before the best is refined."""
 LONGEST_S = 60.0
 """Flight time after which no more flights are compared [s]; more adds little."""
+RATE_LOOP, LOGGED = "nominal rate loop", "logged motor commands"
+"""What commands rotor speeds: the rate loop at the measured body rates, or the log's commands."""
+LAG = "motor_lag"
+"""Name of the rotor lag in the catalogue of effects."""
 
 
 class TestedEffect(NamedTuple):
@@ -99,10 +103,6 @@ def actuator_mismatches(
     """
     mismatches = (_mismatch(source, logs, vehicle, limits) for source in (RATE_LOOP, LOGGED))
     return [mismatch for mismatch in mismatches if mismatch is not None]
-
-
-RATE_LOOP, LOGGED = "nominal rate loop", "logged motor commands"
-"""What commands rotor speeds: the rate loop at the measured body rates, or the log's commands."""
 
 
 def _stretches(
@@ -301,10 +301,6 @@ def flown_by_other_controller(
     return bool(
         error > negligible and error > limits.fitted_loop_share**2 * max(variation, negligible)
     )
-
-
-LAG = "motor_lag"
-"""Name of the rotor lag in the catalogue of effects."""
 
 
 def find_rotor_lag(

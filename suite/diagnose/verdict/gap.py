@@ -32,6 +32,9 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 DRAWS = 1000
 """Number of draws of a bootstrap."""
+FORCE_S, TORQUE_S = 0.5, 0.1
+"""Times over which an effect's mean linear and angular accelerations are computed [s]. The time for
+the angular one is short, as the rate loop soon counteracts a rotation."""
 
 
 def rms_length(vectors: np.ndarray, z: float = 0.0) -> float:
@@ -194,11 +197,6 @@ def noise_floor(slope: np.ndarray, noise: np.ndarray) -> np.ndarray:
     their `noise` (F,) to this row. The first 12 are also the noise of the row itself.
     """
     return np.sqrt(noise[:STATE] ** 2 + ((slope * noise) ** 2).sum(axis=-1))
-
-
-FORCE_S, TORQUE_S = 0.5, 0.1
-"""Times over which an effect's mean linear and angular accelerations are computed [s]. The time for
-the angular one is short, as the rate loop soon counteracts a rotation."""
 
 
 class EffectSize(NamedTuple):
