@@ -205,9 +205,10 @@ def verdict_on(findings: Sequence[Finding], named: bool, limits: Thresholds) -> 
 
 
 def deciding(findings: Sequence[Finding]) -> list[Finding]:
-    """Return the findings whose remaining error decides: those with more than noise, or the main.
+    """Return the findings whose remaining error decides the verdict, or else the main finding.
 
-    They are among the findings with named effects, or among all if none names an effect.
+    They are those with more than noise among the findings with named effects, or among all if none
+    names an effect.
     """
     judged = [one for one in findings if one.names] or findings
     return [one for one in judged if one.remaining.structured] or [main_of(findings)]

@@ -150,8 +150,7 @@ def _calibrated(
 
     Noise in a model's input makes every slope smaller, as more inertia would. The expected true
     input, given the measured one, does not (regression calibration; Carroll et al. 2006,
-    Measurement Error in Nonlinear Models, Ch. 4). The torque between rows is added
-    (`torque_between_rows`).
+    Measurement Error in Nonlinear Models, Ch. 4). Torque between rows is added, too.
     """
     if view.in_world or rotors.noise is None or not len(flight.form.middle_s):
         return flight

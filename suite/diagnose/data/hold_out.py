@@ -29,9 +29,8 @@ def choose_held_out(
     """Return for each window (W,) whether it is fitted, and the names of the held-out flights.
 
     `information` (W, K) is that of each window on each of K parameters. Held out are flights whose
-    information the others contain, too: a flight with the only chirp or the only pass near the
-    ground is fitted. The choice does not depend on the errors. Of a single flight, the end is held
-    out.
+    information the others contain, too, so not the only chirp or the only pass near the ground. The
+    choice does not depend on the errors. Of a single flight, the end is held out.
     """
     flight = np.asarray(flight)
     numbers = list(np.unique(flight))

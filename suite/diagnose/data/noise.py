@@ -295,8 +295,7 @@ def noise_of(
     """Return the standard deviation (19,) of each channel's noise in `residual` (W, N, 19).
 
     NaN where nothing was measured. A channel with too few rows in every window gets its RMS, an
-    upper limit. A polynomial is subtracted from `rows_together` rows (default:
-    `limits.noise_rows`).
+    upper limit. A polynomial is subtracted from (by default `limits.noise_rows`) rows together.
     """
     block_rows, degree = rows_together or limits.noise_rows, limits.noise_degree
     power: list[list[float]] = [[] for _ in range(CHANNELS)]

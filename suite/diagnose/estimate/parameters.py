@@ -206,8 +206,7 @@ def implausible(
 def at_bound(space: ParameterSpace, theta: np.ndarray, candidate: Candidate) -> bool:
     """Return whether a number of `candidate` in `theta` (P,) is at a physical bound.
 
-    A bound at which the effect is absent, or at which the file is, does not count: a drag may be
-    zero.
+    Bounds at which the effect is absent, or the file is, do not count: a drag may be zero.
     """
     for index in candidate.indices:
         entry, value = space.entries[index], theta[index]

@@ -38,8 +38,7 @@ class CandidateScore(NamedTuple):
 def folds_of(flight: np.ndarray, start_s: np.ndarray, folds: int = THRESHOLDS.folds) -> np.ndarray:
     """Return the cross-validation fold (W,) of each window: 0, 1, 2 and so on along every flight.
 
-    A fold is no flight, as a single one may identify a parameter, as a chirp does the rate loop's
-    gain.
+    A fold is no flight, as a single one may identify a parameter, as a chirp does a gain.
     """
     order = np.lexsort((start_s, flight))
     fold = np.empty(len(flight), int)

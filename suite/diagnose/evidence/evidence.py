@@ -115,8 +115,7 @@ class Evidence(ABC):
     ) -> list[CandidateScore]:
         """Return the scores of candidates, each fitted with the `named` parameters, best first.
 
-        `current` is along all parameters. A candidate without any effect on the flights has no
-        score.
+        `current` is along all parameters. A candidate without any effect on the flights has none.
         """
         equations = current.block.equations
         along = list(equations.along)

@@ -184,8 +184,7 @@ def _pose_whitened(
     """Return residual (M, 3) and slope (M, 3, P) of one flight, whitened by errors of its pose.
 
     These add the covariance `pose_slope pose_slope'` (M, 3, L) to the noise. So the values are
-    multiplied by the inverse root of `1 + pose_slope pose_slope'`, in units of the noise `unit`
-    (3,).
+    multiplied by the inverse root of `1 + pose_slope pose_slope'`, in units of the noise (3,).
     """
     count = residual.size
     basis, size, _ = np.linalg.svd(

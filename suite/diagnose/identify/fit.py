@@ -171,8 +171,8 @@ class ResidualEvidence(Evidence):
     def weighed(self, at: Estimate) -> ResidualEvidence:
         """Return this evidence with weights of the residuals at the estimate `at`.
 
-        A weight is one over the noise variance, and lower for an outlier (Huber 1964) if the noise
-        is estimated.
+        A weight is one over the noise variance; with estimated noise, less for an outlier (Huber
+        1964).
         """
         errors = [np.abs(_without_median(row)) for row in self.rows(at.theta)]
         if self.noise is not None:

@@ -210,8 +210,7 @@ class _Fits:
     def with_known_thrust(self, flights: list[FlightGrid]) -> list[FlightGrid]:
         """Return the flights in which the motors' thrust is known best, and remember the others.
 
-        It depends on the battery for motor commands: flights without a voltage are then left out if
-        others have one.
+        By motor commands, these are the flights with a voltage, if any have one.
         """
         with_voltage = [flight for flight in flights if flight.has("voltage")]
         if self.drive != "pwm" or not with_voltage:

@@ -119,8 +119,7 @@ def not_attempted(
 ) -> list[str]:
     """Return a line for people for each number that was not fitted, with the missing signal.
 
-    The fits of `fitted` are force, torque, rotors and loop; those of `broken` had no complete
-    window.
+    Fits are force, torque, rotors and loop; those of `broken` had no complete window.
     """
 
     def any_has(name: str) -> bool:

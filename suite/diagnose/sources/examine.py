@@ -229,7 +229,8 @@ def _without_each(source: Source, found: SearchResult) -> dict[str, Gap]:
 def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate, str]]:
     """Return the named effects of `found` that the evidence of `by` contradicts, and both values.
 
-    Fitted to that evidence, with the effects that `by` names, a parameter differs significantly.
+    Each effect is fitted to that evidence, with the effects that `by` names. It is contradicted if
+    a parameter differs significantly from its value in `found`.
     """
     refused = []
     widths = dict(zip(found.indices, found.half_widths(), strict=True))

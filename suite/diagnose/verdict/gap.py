@@ -95,7 +95,7 @@ class Gap(NamedTuple):
     def exceeds(self, before: Gap, weight: float, limits: Thresholds) -> bool:
         """Return whether the energy is significantly larger than that of `before`.
 
-        A fitted parameter raises the error of other flights by about one, even if the model is
+        A fitted parameter raises the error of other flights by about one even if the model is
         right, so the rise has to be clearly larger. `weight` makes rows in overlapping stretches
         count once.
         """
@@ -106,8 +106,7 @@ class Gap(NamedTuple):
     def _means(self, values: np.ndarray, seed: int) -> np.ndarray:
         """Return the means (DRAWS,) of bootstrap draws of `values` (W,), one of each stretch.
 
-        The values form a circle, so that each is drawn equally often. Of few, fewer are drawn
-        together.
+        The values form a circle, so that each is drawn equally often; of few, fewer together.
         """
         rng, count = np.random.default_rng(seed), len(values)
         block = max(1, min(self.together, count // 4))

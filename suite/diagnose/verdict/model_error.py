@@ -95,8 +95,7 @@ def _rms(
 ) -> np.ndarray:
     """Return the RMS (6,) by sensor (of `SLICES`) of the part that no start state explains.
 
-    `errors` are (W, N, 19). It is in units of the channels, 0 where nothing was measured. Windows
-    with NaN are left out.
+    `errors` are (W, N, 19), without windows with NaN; the RMS is 0 where nothing was measured.
     """
     known = np.isfinite(errors).all(axis=(1, 2), keepdims=True)
     errors = np.where(known, errors, 0.0)
