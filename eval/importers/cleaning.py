@@ -310,10 +310,8 @@ def _off_ground(pos: Signal, start: float, stop: float) -> tuple[float, float]:
     is_inside = (time_s >= start) & (time_s <= stop)
     if not is_inside.any():
         return start, stop
-    before, after = (
-        (time_s < start) & (time_s > start - 1.0),
-        (time_s > stop) & (time_s < stop + 1.0),
-    )
+    before = (time_s < start) & (time_s > start - 1.0)
+    after = (time_s > stop) & (time_s < stop + 1.0)
     ends = [start, stop]
     for k, near in ((0, before), (-1, after)):
         ground = float(np.median(height[near])) if near.any() else float(height[is_inside][k])

@@ -228,9 +228,8 @@ def with_names(
     fitted, effects = space.effects(theta), dict(nominal.effects)
     for name in names:
         values = (np.asarray(value, dtype=float) for value in fitted[name])
-        effects[name] = type(fitted[name])(
-            *(tuple(v.tolist()) if v.ndim else float(v) for v in values)
-        )
+        plain = (tuple(v.tolist()) if v.ndim else float(v) for v in values)
+        effects[name] = type(fitted[name])(*plain)
     effects |= {one.name: one.values for one in tested}
     ordered = {name: effects[name] for name in EFFECTS if name in effects}
     return replace(nominal, effects=MappingProxyType(ordered))

@@ -86,7 +86,6 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     if config.plan:
         result["plan"] = write_plan(out / "plan", *trajectories_for(result))
         files |= {"plan/plan.json"} if result["plan"]["flights"] else set()
-    # Write the results.
     result["findings"] = flights.findings
     result["identified"] = is_identified(config.vehicle)
     result = {**plain(result), **stamp(SCHEMA, config.seed)}

@@ -16,6 +16,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 from zlib import crc32
@@ -79,13 +80,8 @@ def read(path: Path, options: ImportOptions) -> Recording:
         guess = closest(variable, known)
         return "not logged" + (f"; did you mean {guess!r}?" if guess else "")
 
-    recording = recording_of(
-        path,
-        read_map(options.map or DEFAULT_MAP),
-        lambda variables: _find(events, variables),
-        missing,
-        options,
-    )
+    mapping = read_map(options.map or DEFAULT_MAP)
+    recording = recording_of(path, mapping, partial(_find, events), missing, options)
     findings = [*findings, *recording.findings]
     return replace(recording, findings=tuple(findings), has_seconds=True)
 

@@ -122,9 +122,8 @@ def _load(path: Path) -> Any:
             _TruncationSafeReader(io.FileIO(path)) as file,
             contextlib.redirect_stdout(io.StringIO()),
         ):
-            log: Any = ULog(
-                file, [*{t for s in _SOURCES.values() for t, *_ in s}, "actuator_motors"]
-            )
+            topics = {topic for sources in _SOURCES.values() for topic, *_ in sources}
+            log: Any = ULog(file, [*topics, "actuator_motors"])
             log.is_cut = file.is_cut
             return log
     except Exception as error:

@@ -283,15 +283,11 @@ class _Piece:
         count = len(self.time_s)
         each = np.broadcast_to(np.eye(3), (count, 3, 3))
         force_w = self._force_w(rot_w)[:, :, None]
-        tilts = np.concatenate([each, -self._integral(rot_w)], axis=2)  # by tilt and gyro bias
-        by_tilt, by_gyro = np.split(self._integral(np.cross(tilts, force_w, axis=1)), 2, axis=2)
-        by_walk = [
-            np.where((np.arange(count) >= knot)[:, None, None], by_tilt - by_tilt[knot], 0.0)[
-                ..., :2
-            ]
-            for knot in self.knots
-        ]
         by_bias = -self._integral(rot_w)
+        tilts = np.concatenate([each, by_bias], axis=2)  # by tilt and gyro bias
+        by_tilt, by_gyro = np.split(self._integral(np.cross(tilts, force_w, axis=1)), 2, axis=2)
+        row, by_xy = np.arange(count)[:, None, None], by_tilt[..., :2]
+        by_walk = [np.where(row >= knot, by_xy - by_xy[knot], 0.0) for knot in self.knots]
         return np.concatenate([by_tilt, each, by_gyro, by_bias, *by_walk], axis=2)
 
 

@@ -89,12 +89,10 @@ def with_lost_rows(time_s: np.ndarray, command: np.ndarray) -> tuple[np.ndarray,
     if not len(spacing):
         return time_s, command
     usual_spacing = float(np.median(spacing))
-    missing = np.where(
-        spacing > LOST * usual_spacing, np.rint(spacing / usual_spacing) - 1.0, 0.0
-    ).astype(int)
-    if not missing.any():
+    has_lost = spacing > LOST * usual_spacing
+    if not has_lost.any():
         return time_s, command
-    count = missing + 1
+    count = np.where(has_lost, np.rint(spacing / usual_spacing), 1.0).astype(int)
     share = np.concatenate([np.arange(n) / n for n in count] + [[0.0]])
     before = np.append(np.repeat(np.arange(len(spacing)), count), len(spacing))
     after = np.minimum(before + 1, len(spacing))

@@ -116,10 +116,7 @@ def _near(time_s: np.ndarray, marked: np.ndarray, margin_s: float) -> np.ndarray
     if not marked.any():
         return marked
     marked_s = time_s[marked]
-    place = np.searchsorted(marked_s, time_s)
-    before = np.abs(time_s - marked_s[np.maximum(place - 1, 0)])
-    after = np.abs(time_s - marked_s[np.minimum(place, len(marked_s) - 1)])
-    return np.minimum(before, after) <= margin_s
+    return np.abs(time_s - marked_s[nearest(marked_s, time_s)]) <= margin_s
 
 
 @dataclass(frozen=True)

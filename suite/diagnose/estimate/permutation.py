@@ -79,13 +79,8 @@ def permutation_test(
     low, high = unbounded if room is None else room
 
     def fitted_change(hessian: np.ndarray, gradient: np.ndarray, places: list[int]) -> np.ndarray:
-        return solve(
-            hessian[np.ix_(places, places)],
-            gradient[places],
-            low[places],
-            high[places],
-            np.ones(len(places)),
-        )
+        ends, scale = (low[places], high[places]), np.ones(len(places))
+        return solve(hessian[np.ix_(places, places)], gradient[places], *ends, scale)
 
     # In the loops below, one part of the windows is fitted and the other part (a fold) is tested.
     def gain(columns: tuple[int, ...]) -> float:
@@ -93,9 +88,8 @@ def permutation_test(
         for (fit_hessian, test_hessian), (fit_part, test_part) in zip(hessians, folds, strict=True):
             change = fitted_change(fit_hessian, gradient[fit_part].sum(0), places)
             slope = gradient[test_part].sum(0)[places]
-            total += float(
-                2 * slope @ change - change @ test_hessian[np.ix_(places, places)] @ change
-            )
+            square = change @ test_hessian[np.ix_(places, places)] @ change
+            total += float(2 * slope @ change - square)
         return total
 
     def gain_by_chance(columns: tuple[int, ...]) -> np.ndarray:

@@ -43,7 +43,12 @@ def entries_of(driven: DrivenVehicle, fitted: Fitted, log_thrust: float = 0.0) -
     # Flights show the ratio of torque to inertia about z. The uncertainty of the inertia counts if
     # the inertia is identified; otherwise the inertia is held fixed.
     identified = [name for name in INERTIAS if fitted.identifies(name)]
-    gain = np.asarray(driven.start.controller.rate_gain)
+
+    def inertia(n: Mapping[str, float]) -> np.ndarray:
+        return possible_inertia(driven.vehicle(n).inertia)
+
+    def rate_gain(n: Mapping[str, float]) -> np.ndarray:
+        return np.asarray(driven.start.controller.rate_gain) * np.exp([n[name] for name in GAINS])
 
     def twist(n: Mapping[str, float]) -> float:
         numbers = {name: n[name] for name in (*identified, "yaw")}
@@ -59,25 +64,14 @@ def entries_of(driven: DrivenVehicle, fitted: Fitted, log_thrust: float = 0.0) -
     rows = {
         "thrust": thrust,
         "drag_z": [Row("effects.linear_drag.coefficient", "1/s", DRAGS)],
-        "inertia_x": [
-            Row(
-                "inertia", "kg m^2", INERTIAS, lambda n: possible_inertia(driven.vehicle(n).inertia)
-            )
-        ],
+        "inertia_x": [Row("inertia", "kg m^2", INERTIAS, inertia)],
         "yaw": [Row("rotors.torque_coefficient", "N m/(rad/s)^2", ("yaw",), twist)],
         "late": [
             Row("rotors.time_constant", "s", ("lag",), lambda n: n["lag"]),
             # `late` is the sum of lag and delay. The delay in the file keeps the sum.
             Row(DELAY, "s", ("late",), lambda n: n["late"] - n["lag"]),
         ],
-        "gain_x": [
-            Row(
-                "controller.rate_gain",
-                "1/s",
-                GAINS,
-                lambda n: gain * np.exp([n[g] for g in GAINS]),
-            )
-        ],
+        "gain_x": [Row("controller.rate_gain", "1/s", GAINS, rate_gain)],
     }
     names = [name for name in fitted.names if name not in fitted.known]
     return [_entry(driven, fitted, row) for name in rows if name in names for row in rows[name]]

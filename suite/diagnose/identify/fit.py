@@ -216,7 +216,6 @@ class ResidualEvidence(Evidence):
             values.append(white[..., 0])
             slopes.append(white[..., 1:])
             blocks.append(np.stack([np.full(len(row.block), flight), row.block]))
-        # Number the blocks of all flights.
         places, stretch = np.unique(np.concatenate(blocks, axis=1), axis=1, return_inverse=True)
         residual, slope = np.concatenate(values), np.concatenate(slopes)
         flight_of, block = places

@@ -97,7 +97,6 @@ class FlightGrid(NamedTuple):
 
 def grid_of(log: FlightLog) -> FlightGrid:
     """Return `log` on the grid: measurements interpolated, commands held from row to row."""
-    # Collect the signals that the log has.
     time_s = log.time_s - log.time_s[0]
     grid_s = np.arange(0.0, time_s[-1], STEP_S)
     values = {name: getattr(log, name) for name in (*MEASURED, *HELD)}

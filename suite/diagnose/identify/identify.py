@@ -256,26 +256,20 @@ class _Fits:
         # Blade flapping needs the results of both fits, and motors whose thrust is known.
         known_motors = self.drive in KNOWN_MOTORS and {"force", "torque"} <= {*results}
         if known_motors and "drag" not in self.leave:
-            fits = (results["force"], results["torque"])
-            perturbed = perturbed_vehicles(vehicle, self.driven, *fits)
+            force, torque = results["force"], results["torque"]
+            perturbed = perturbed_vehicles(vehicle, self.driven, force, torque)
             with_voltage = [log for log in logs if log.name not in self.without_voltage]
             flapping = flapping_of(with_voltage, vehicle, perturbed)
-            vehicle, more, further = with_entries(vehicle, [flapping] if flapping else [])
-            numbers, notes = [*numbers, *more], [*notes, *further]
+            vehicle, more, more_notes = with_entries(vehicle, [flapping] if flapping else [])
+            numbers, notes = [*numbers, *more], [*notes, *more_notes]
+        fits = [name for name in ("force", "torque") if name in results]
+        further = notes_on(self.flights, self.without_voltage, original, vehicle)
         return Identified(
             vehicle,
             tuple(numbers),
             (*not_identified(results, by_key), *lacking),
             self.drive,
-            {
-                name: results[name].residual_rms.tolist()
-                for name in ("force", "torque")
-                if name in results
-            },
+            {name: results[name].residual_rms.tolist() for name in fits},
             tuple(flight.name for flight in self.flights),
-            (
-                *misfit_notes(results),
-                *notes_on(self.flights, self.without_voltage, original, vehicle),
-                *notes,
-            ),
+            (*misfit_notes(results), *further, *notes),
         )

@@ -58,7 +58,6 @@ def identify_files(
             f"{start.name} has {', '.join(unmodelled)}: the fits do not model them, so the "
             "estimates include their share, and they stay in the file; start without them"
         )
-    # Fit, and write the file.
     identified = identify(logs, start, leave)
     counted = _counted(len(identified.flights))
     lines = [f"From {vehicle} {MADE_BY}, {counted} ({identified.drive}); 95 % intervals:"]

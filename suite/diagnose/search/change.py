@@ -214,10 +214,8 @@ class ChangeEvidence(ViewEvidence):
         slope = whitened(block.data, weights)[1]
         ratios = self.spread.variance_ratios(self.view.name, self.limits, rng)
         views = len(self.spread.along)  # Bonferroni's correction for the views
-        p_values = [
-            min(views * p, 1.0)
-            for p in corrected_p_values(gains, slope, groups, named, ratios, rng)
-        ]
+        by_view = corrected_p_values(gains, slope, groups, named, ratios, rng)
+        p_values = [min(views * p, 1.0) for p in by_view]
         scores = [
             CandidateScore(candidate, gain - 2.0 * len(candidate.indices), p_value, 0.0)
             for candidate, gain, p_value in zip(among, gains, p_values, strict=True)

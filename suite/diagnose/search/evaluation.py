@@ -75,7 +75,7 @@ def with_secants(current: Evaluation, among: Sequence[Candidate]) -> Block:
         column = block.along.index(index)
         tangent = block.slope[..., column]
         fall = float((tangent * block.residual).sum()) ** 2 / max(float((tangent**2).sum()), TINY)
-        least, secant = float((block.residual**2).sum()) - fall, None
+        least = float((block.residual**2).sum()) - fall
         for value in entries[index].tried:
             if value == start[index]:
                 continue
@@ -84,15 +84,10 @@ def with_secants(current: Evaluation, among: Sequence[Candidate]) -> Block:
             far = evidence.linearise(Estimate(theta, at.free), ())
             chi2, change = float((far.residual**2).sum()), value - start[index]
             if chi2 < least:  # never where the model diverges
-                least = chi2
-                secant = (
-                    (block.residual - far.residual) / change,
-                    (block.free - far.free) / change,
-                )
-        if secant is not None:
-            slope, free_slope = block.slope.copy(), block.free_slope.copy()
-            slope[..., column], free_slope[..., column] = secant
-            block = replace(block, slope=slope, free_slope=free_slope)
+                least, slope, free_slope = chi2, block.slope.copy(), block.free_slope.copy()
+                slope[..., column] = (block.residual - far.residual) / change
+                free_slope[..., column] = (block.free - far.free) / change
+                block = replace(block, slope=slope, free_slope=free_slope)
     return block
 
 

@@ -47,7 +47,6 @@ class Clock(NamedTuple):
 
 def clock_of(log: FlightLog) -> Clock:
     """Return the shift between the times of gyro and reference in a flight."""
-    # Compute how badly the rates match, for each block and shift.
     no_shift = Clock(np.zeros(1), np.zeros(1))
     grid = np.arange(log.time_s[0], log.time_s[-1], STEP_S)
     size = round(BLOCK_S / STEP_S)
@@ -69,7 +68,6 @@ def clock_of(log: FlightLog) -> Clock:
         # A rate is a mean over 2 * SPAN_ROWS grid steps, so only one of so many is independent.
         cost = misfit / (2.0 * variance * 2 * SPAN_ROWS)
         path = _most_probable(cost, change)
-    # Keep the path if it is significant.
     gain = (cost[:, zero] - cost[all_blocks, path]).sum()
     shift_s = shifts_s[path]
     row_s = float(np.median(np.diff(log.time_s)))

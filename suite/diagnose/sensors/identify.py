@@ -174,7 +174,6 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
     Raises:
         ValueError: if no log has both an estimate and a reference, or no axis has enough data.
     """
-    # Read the logs, and leave out those that have no estimate or no reference.
     checked = read_checked(flights, CheckContext(), list(FAULTS), partial=True)
     used, seconds, refused = [], 0.0, []
     for log in checked.logs:
@@ -202,7 +201,6 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
             "no axis of the estimate has two stretches of 5 s without a hole; fly longer, or log "
             "the estimate and the reference in the same rows"
         )
-    # Write the file, with a header that states all intervals.
     parameters = parameters_of(fitted)
     header = [f"An on-board estimate against a reference in {len(used)} flights; 95 % intervals:"]
     if clocks_s:

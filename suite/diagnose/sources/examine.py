@@ -49,8 +49,7 @@ def examine(
     if not found.named and source.fallback:
         by_fallback = source.fallback.search(say, seed)
         source, found = (source.fallback, by_fallback) if by_fallback.named else (source, found)
-    # Test on held-out flights: first all named effects together, then (in rollouts) each
-    # one alone.
+    # Test on held-out flights: first all named effects together, then (in rollouts) each alone.
     before = after = source.gap(found, found.start.theta)
     if found.named:
         after = source.gap(found, found.estimate.theta)
@@ -69,14 +68,12 @@ def examine(
     if too_small:
         without = _without_each(source, found)
     for name, size in too_small:
-        is_relevant = size.relevant(source.limits)
         reason = "too small to matter"
-        if is_relevant:
+        if size.relevant(source.limits):
             reason = "no larger than the model's own error, or the other effects cancel it"
         warnings.append(f"{name}: left out, {reason}: {size.words()}")
     if not source.small_explains:
         explained = found, (before, after)
-    # Analyse the remaining error.
     remaining = source.remaining(*explained, seed)
     if too_small and source.small_explains and not remaining.wind:
         remaining = remaining._replace(reason=TOO_SMALL)

@@ -66,7 +66,6 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
         raise ValueError("rollouts cannot find a change since reference flights; views can")
     if given.references or not (given.chosen or can_fly(logs, vehicle)):
         return None
-    # Choose the input of the model: commands or measured rotor speeds.
     integrator = integrator_of(logs, given.integrator)
     rotor_input, warnings = rotors_are_input(logs, given.drive, vehicle), list[str]()
     is_open = given.drive == "auto" and not rotor_input

@@ -91,7 +91,6 @@ def by_views(given: DiagnosisInput) -> SourceSet:
         untested = [UNTESTED.format("some logs are partial")]
     elif references and len(next(iter(fitted.values()))) < 2:
         untested = [UNTESTED.format("this needs 3 new flights or more, as one is held out")]
-    # Make one source for each view.
     sources = []
     for name in fitted:
         one = evidence[name]

@@ -89,10 +89,8 @@ def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
     if not {0, 1} <= set(task.view.axes):
         return None
     data, limits = task.residuals(theta), task.limits
-    every = (
-        _spectrum(flight, data.residual[data.flight == k]) for k, flight in enumerate(task.flights)
-    )
-    spectra = [spectrum for spectrum in every if spectrum is not None]
+    residuals = (data.residual[data.flight == k] for k in range(len(task.flights)))
+    spectra = [one for one in map(_spectrum, task.flights, residuals) if one is not None]
     if not spectra:
         return None
     shortest_s, longest_s = 0.6, 3.5  # periods of pendulums of 0.1 to 3 m
@@ -110,11 +108,8 @@ def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
     # Reject a peak that is not significant, small, or small next to the acceleration there.
     centre_hz = float(frequency_hz[best])
     force_ratio, share = _peak_shares(spectra, centre_hz, [one[width, best] for one in heights])
-    if (
-        p_value > limits.swing_p_value
-        or share < limits.swing_share
-        or force_ratio < limits.swing_driven
-    ):
+    is_small = share < limits.swing_share or force_ratio < limits.swing_driven
+    if p_value > limits.swing_p_value or is_small:
         return None
     # 95 % interval by the profile likelihood.
     likely = frequency_hz[gain[width] >= largest - limits.profile_fall]

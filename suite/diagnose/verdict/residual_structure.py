@@ -85,16 +85,10 @@ def residual_structure(
     # From forces and torques at the knots to coefficients of the shapes.
     hessian, gradient = _along(equations, equations.unit)
     size = np.sqrt(np.maximum(np.einsum("wjj->j", hessian), 1e-12))
-    scores = permutation_test(
-        equations.shapes,
-        hessian / np.outer(size, size),
-        gradient / size,
-        [shape.indices for shape in equations.shapes],
-        (),
-        fold,
-        seed,
-        limits=equations.limits,
-    )
+    scaled = (hessian / np.outer(size, size), gradient / size)
+    shapes, limits = equations.shapes, equations.limits
+    groups = [shape.indices for shape in shapes]
+    scores = permutation_test(shapes, *scaled, groups, (), fold, seed, limits=limits)
     coloured = {axis: _energy_p_value(equations, i) for i, axis in enumerate(AXES)}
     return ResidualStructure(scores, coloured, _size(equations, scores))
 
@@ -258,10 +252,8 @@ def _shapes(knot: Flown, start_s: np.ndarray) -> tuple[np.ndarray, list[Candidat
         along_b[..., i, None] * unit_axes[i] for along_b in motion for i in range(3)
     ])  # fmt: skip
     for label, scalar in (("thrust", thrust), ("climb", vel_w[..., 2]), ("height", pos_w[..., 2])):
-        add(
-            f"force along body z, by the {label}",
-            [h[..., None] * unit_axes[2] for h in _hats(scalar)],
-        )
+        along_z = [hat[..., None] * unit_axes[2] for hat in _hats(scalar)]
+        add(f"force along body z, by the {label}", along_z)
     # Forces along world axes, everywhere or near a place.
     world = np.concatenate([axes_b, np.zeros_like(axes_b)], axis=-2)
     add("force along fixed directions", [world[..., i] for i in range(3)])
