@@ -27,8 +27,7 @@ from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.actuators import TestedEffect
 from suite.diagnose.verdict.disturbances import Swing
-from suite.diagnose.verdict.gap import EffectSize, Gap, upper_size
-from suite.diagnose.verdict.model_error import beyond_error, less_error
+from suite.diagnose.verdict.gap import EffectSize, Gap, beyond_error, less_error, upper_size
 
 LEAST_GAP = 1e-9
 """Lower limit of a gap minus its noise floor in a division, in the gap's unit."""

@@ -265,3 +265,20 @@ def upper_size(
     )
     total_drift = None if size.drift is None else size.drift + drift
     return EffectSize(size.force + force, size.torque + torque, total_drift)
+
+
+def beyond_error(change: np.ndarray, error: np.ndarray, width: np.ndarray) -> bool:
+    """Return whether an effect, or a shape of the residual, is more than the model's own error.
+
+    It is if a 95 % interval of `change` (K,), of half-width `width`, does not contain zero when it
+    is widened by `error` at both ends. Where no parameter is significant by itself, one has to
+    change by more than the error.
+    """
+    distance = np.abs(change)
+    least = width if (distance > width).any() else 0.0
+    return bool((distance - error > least).any())
+
+
+def less_error(change: np.ndarray, error: np.ndarray | float) -> np.ndarray:
+    """Return `change` (K,) moved towards zero by the model's own `error`, at most to zero."""
+    return np.sign(change) * np.maximum(np.abs(change) - error, 0.0)

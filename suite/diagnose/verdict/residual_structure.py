@@ -26,8 +26,7 @@ from suite.diagnose.estimate.permutation import CandidateScore, permutation_test
 from suite.diagnose.evidence.rollout import Flown
 from suite.diagnose.evidence.rollouts import RolloutEvidence
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict.gap import EffectSize
-from suite.diagnose.verdict.model_error import beyond_error, less_error
+from suite.diagnose.verdict.gap import EffectSize, beyond_error, less_error
 
 AXES = ("force x", "force y", "force z", "torque x", "torque y", "torque z")
 
