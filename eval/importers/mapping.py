@@ -94,7 +94,7 @@ def recording_of(
             parts.setdefault(quat, (time_s, from_euler(value)))
             used_columns.setdefault(quat, Column((), ()))
     parts = {
-        signal: _in_log_frame(signal, time_s, value, used_columns[signal], mapping)
+        signal: (time_s, _in_log_frame(signal, value, used_columns[signal], mapping))
         for signal, (time_s, value) in parts.items()
     }
     parts |= _estimates(mapping, used_columns, find, name)
@@ -114,8 +114,7 @@ def recording_of(
     if "quat" in euler and not has_quat and {"quat", "rate"} <= signals.keys():
 
         def quat_of(angles: np.ndarray) -> np.ndarray:
-            quat, column = from_euler(angles), used_columns["quat"]
-            return _in_log_frame("quat", signals["quat"].time_s, quat, column, mapping)[1]
+            return _in_log_frame("quat", from_euler(angles), used_columns["quat"], mapping)
 
         angles, _ = make_signal(euler["quat"][0], euler["quat"][1], name, "quat")
         assert angles is not None
@@ -153,8 +152,8 @@ def _estimates(
             part = find(column.names) if column.source == "estimate" else None
             if part is None or _is_world(signal, column) != (signal == "vel"):
                 continue
-            part = _in_log_unit(part, column, name)
-            time_s, value = _in_log_frame(signal, *part, column, mapping)
+            time_s, value = _in_log_unit(part, column, name)
+            value = _in_log_frame(signal, value, column, mapping)
             value = continuous(value) if signal == "quat" else value
             for k, column_name in enumerate(GROUPS[signal]):
                 estimates[f"{KEPT}{ESTIMATE}{column_name}"] = (time_s, value[:, k : k + 1])
@@ -175,22 +174,19 @@ def _in_log_unit(part: Part, column: Column, name: str) -> Part:
     return time_s, value
 
 
-def _in_log_frame(
-    signal: str, time_s: np.ndarray, value: np.ndarray, column: Column, mapping: LogMap
-) -> Part:
-    """Return a signal in a z-up world or forward-left-up body.
+def _in_log_frame(signal: str, value: np.ndarray, column: Column, mapping: LogMap) -> np.ndarray:
+    """Return samples in a z-up world or forward-left-up body.
 
     A vector in world axes remains in world axes, and one in body axes in body axes.
     """
-    world_axes = signal == "pos" or (signal in ("vel", "rate", "acc") and _is_world(signal, column))
     if signal in ("quat", "cmd_quat"):
         quat = conjugate(value) if column.inverse else value
-        return time_s, attitude(quat, mapping.world, mapping.body)
-    if world_axes:
-        return time_s, world_vector(value, mapping.world)
+        return attitude(quat, mapping.world, mapping.body)
+    if signal == "pos" or (signal in ("vel", "rate", "acc") and _is_world(signal, column)):
+        return world_vector(value, mapping.world)
     if signal in ("vel", "rate", "acc", "cmd_rate", "cmd_torque"):
-        return time_s, body_vector(value, mapping.body)
-    return time_s, value
+        return body_vector(value, mapping.body)
+    return value
 
 
 def _is_world(signal: str, column: Column) -> bool:

@@ -35,17 +35,6 @@ class CandidateScore(NamedTuple):
     """Gain that the best of all candidates reaches by chance with a probability of 1 %."""
 
 
-def folds_of(flight: np.ndarray, start_s: np.ndarray, folds: int = THRESHOLDS.folds) -> np.ndarray:
-    """Return the cross-validation fold (W,) of each window: 0, 1, 2 and so on along every flight.
-
-    A fold is no flight, as a single one may identify a parameter, as a chirp does a gain.
-    """
-    order = np.lexsort((start_s, flight))
-    fold = np.empty(len(flight), int)
-    fold[order] = np.arange(len(flight)) % folds
-    return fold
-
-
 def permutation_test(
     among: Sequence[Candidate],
     hessian: np.ndarray,

@@ -18,7 +18,7 @@ import numpy as np
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.gauss_newton import gauss_newton_step, intervals95
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
-from suite.diagnose.estimate.permutation import CandidateScore, folds_of, permutation_test
+from suite.diagnose.estimate.permutation import CandidateScore, permutation_test
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 LEAST_ERROR = 1e-9
@@ -132,8 +132,15 @@ class Evidence(ABC):
         )
 
     def folds(self, block: Block) -> np.ndarray:
-        """Return the fold (B,) of each stretch; cross-validation leaves out one fold at a time."""
-        return folds_of(block.flight, block.start_s, self.limits.folds)
+        """Return the fold (B,) of each stretch; cross-validation leaves out one fold at a time.
+
+        They are 0, 1, 2 and so on along every flight. A fold is no flight, as a single one may
+        identify a parameter, as a chirp (a command of rising frequency) does a rate loop's gain.
+        """
+        order = np.lexsort((block.start_s, block.flight))
+        fold = np.empty(len(order), int)
+        fold[order] = np.arange(len(order)) % self.limits.folds
+        return fold
 
     def explained_share(
         self, before: Block, after: Evaluation, candidate: Candidate, gains: np.ndarray

@@ -30,7 +30,6 @@ from suite.diagnose.data.windows import (
 )
 from suite.diagnose.estimate.gauss_newton import TINY, Z95, solve
 from suite.diagnose.estimate.parameters import Candidate
-from suite.diagnose.estimate.permutation import folds_of
 from suite.diagnose.evidence.evidence import Evaluation
 from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.rollouts import (
@@ -210,13 +209,11 @@ class RolloutSource(Source):
         self, found: SearchResult, seed: int
     ) -> tuple[ResidualStructure, TestedEffect | None]:
         """Return the structure in the remaining error, and the wind that may cause it."""
-        evidence, limits = of_rollouts(found.last), self.limits
-        windows = evidence.trusted
-        equations = disturbance_equations(evidence, windows, found.estimate)
-        fold = folds_of(windows.flight, windows.start_s, limits.folds)
-        residual = residual_structure(equations, fold, seed)
+        evidence = of_rollouts(found.last)
+        equations = disturbance_equations(evidence, evidence.trusted, found.estimate)
+        residual = residual_structure(equations, evidence.folds(found.last.block), seed)
         wind = self._wind(found, equations, residual)
-        is_significant = any(s.p_value <= limits.shape_p_value for s in residual.shapes)
+        is_significant = any(s.p_value <= self.limits.shape_p_value for s in residual.shapes)
         if self.coarser is not None and is_significant:
             coarse = disturbance_equations(evidence, self.coarser, found.estimate)
             residual = beyond_model_error(residual, equations, coarse, self.coarser_share)
