@@ -257,9 +257,7 @@ class ActingRotors(NamedTuple):
     """Time between the rows of the measured speeds [s]."""
 
 
-def acting_rotors(
-    log: FlightLog, vehicle: Vehicle, limits: Thresholds = THRESHOLDS
-) -> ActingRotors:
+def acting_rotors(log: FlightLog, vehicle: Vehicle, limits: Thresholds) -> ActingRotors:
     """Return the rotor speeds of `log`, measured or from commands, in every row but in holes.
 
     Commanded speeds pass through the vehicle's delay and rotor lag.

@@ -41,9 +41,7 @@ class Whitening(NamedTuple):
     independent, after a division by the standard deviation."""
 
 
-def make_whitening(
-    linear: Linearisation, noise: Noise, limits: Thresholds = THRESHOLDS
-) -> Whitening:
+def make_whitening(linear: Linearisation, noise: Noise, limits: Thresholds) -> Whitening:
     """Return the whitening of the windows in `linear` by `noise`.
 
     The last F slopes in `linear` must be those along the start numbers.

@@ -161,9 +161,7 @@ def rollouts_along(
     return model, windows, start_estimate(model, windows)
 
 
-def trusted(
-    windows: FlightWindows, residual: np.ndarray, limits: Thresholds = THRESHOLDS
-) -> FlightWindows:
+def trusted(windows: FlightWindows, residual: np.ndarray, limits: Thresholds) -> FlightWindows:
     """Return `windows`, each shortened to the time in which the model stays near the flight.
 
     Further away the linearisation does not hold: the model may have tipped over or be below the
