@@ -81,7 +81,7 @@ def chi2_fall(
 ) -> float:
     """Return the fall of chi-square, to first order, by a fit of the parameters at `columns`."""
     fitted = equations.take(sorted(set(columns)))
-    if not fitted.gradient.shape[1] or np.einsum("bkk->", fitted.hessian) < TINY:
+    if np.einsum("bkk->", fitted.hessian) < TINY:
         return 0.0
     return gauss_newton_step(fitted, theta, space)[1]
 
@@ -124,9 +124,6 @@ def intervals95(
         prior: (K,) information on each parameter in addition to that of the flights.
     """
     count, size = equations.gradient.shape
-    if not size:
-        empty = np.zeros((0, 0))
-        return Intervals(np.zeros(0), empty, empty)
     prior = np.zeros(size) if prior is None else prior
     hessian = equations.hessian.sum(axis=0) + np.diag(prior)
     gradient = equations.gradient

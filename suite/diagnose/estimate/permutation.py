@@ -83,8 +83,6 @@ def permutation_test(
 
     def gain_by_chance(columns: tuple[int, ...]) -> np.ndarray:
         total, places = np.zeros(draws), list(columns)
-        if not places:
-            return total
         for (fit_hessian, test_hessian), (fit_part, test_part) in zip(hessians, drawn, strict=True):
             chosen = np.ix_(places, places)
             fit_hessian, test_hessian = fit_hessian[chosen], test_hessian[chosen]
