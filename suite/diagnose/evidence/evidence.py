@@ -105,11 +105,6 @@ class Evidence(ABC):
         """Argument `differ_p` of `intervals95`: 1 if each flight is one random draw, else 0."""
         return 1.0
 
-    @property
-    def name_p_value(self) -> float:
-        """Probability that a step of the search names an effect although there is none."""
-        return self.limits.name_p_value
-
     def scores(
         self, current: Evaluation, named: Sequence[int], among: Sequence[Candidate], seed: int
     ) -> list[CandidateScore]:

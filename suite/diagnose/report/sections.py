@@ -135,7 +135,8 @@ def candidates_section(diagnosis: Diagnosis) -> Section:
         words += (
             f" P is the probability that the best of all candidates gains as much by chance, left "
             f"out up to {LEAST_P:g}. Effects are named one after another while p is at most "
-            f"{finding.search.judged.evidence.name_p_value:g}; then all are refitted jointly."
+            f"{finding.search.judged.evidence.limits.name_p_value:g}; then all are refitted "
+            "jointly."
         )
         if scores[0].chance > 0.0:
             words += f" By chance the best gain is above {scores[0].chance:.1f} once in 100."

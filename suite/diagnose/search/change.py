@@ -190,11 +190,6 @@ class ChangeEvidence(ViewEvidence):
         """(3,) standard deviation of flights' means, without errors of the gains."""
         return self.exact_weights.trim
 
-    @property
-    def name_p_value(self) -> float:
-        """Probability that a step of the search names a change although nothing has changed."""
-        return self.limits.change_p_value
-
     def estimate_noise(self, at: Estimate) -> Evaluation:
         """Evaluate this evidence with its noise unchanged, since it is known; see `Evidence`."""
         return self.relinearise(at)
@@ -259,7 +254,7 @@ def change_evidence(
     with_gain_error = weights._replace(trim=np.hypot(trim, task.limits.gain_error * mean_change))
     # The means contain little information: every candidate that explains them is an alternative,
     # even one that explains much less than the best (a share of 1 switches that limit off).
-    limits = replace(task.limits, rival_share=1.0)
+    limits = replace(task.limits, rival_share=1.0, name_p_value=task.limits.change_p_value)
     evidence = ChangeEvidence(
         task.view, task.model, flights, task.carried, True, with_gain_error,
         exact_weights=weights, spread=spread, limits=limits,

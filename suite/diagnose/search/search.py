@@ -128,7 +128,7 @@ def _best_candidate(
         shortlist = [
             c
             for c, score in scores.items()
-            if score.p_value <= evidence.name_p_value and score.gain >= least
+            if score.p_value <= limits.name_p_value and score.gain >= least
         ]
     # ... that could be the best to first order, and of the single effects only the first few.
     equations, theta = current.block.equations, current.at.theta
@@ -167,13 +167,13 @@ def _best_candidate(
     explained = chi2_before - chi2_fall(equations, theta, space, others) - lowest
     allowed = max(min(limits.rival_chi2, limits.rival_share * explained), 0.0)
     close = [trial for trial in trials if trial.cost - lowest <= allowed]
-    significant = [trial for trial in close if trial.name.p_value <= evidence.name_p_value]
+    significant = [trial for trial in close if trial.name.p_value <= limits.name_p_value]
     if not significant and tested:
         # A large effect is not linear, and its score without it may be wrong: test it at its fit.
         at_fit = [trial for trial in close if trial.name.candidate == tested]
         p_values = [_p_value_at_fit(task, current, others, unnamed, trial) for trial in at_fit]
         significant = [
-            trial for trial, p in zip(at_fit, p_values, strict=True) if p <= evidence.name_p_value
+            trial for trial, p in zip(at_fit, p_values, strict=True) if p <= limits.name_p_value
         ]
     if not significant:
         return None
