@@ -119,7 +119,10 @@ def normal_equations(
     flight: np.ndarray | None = None,
     along: tuple[int, ...] = (),
 ) -> NormalEquations:
-    """Return the normal equations of `slope` (B, M, K) and `residual` (B, M)."""
+    """Return the normal equations of `slope` (B, M, K) and `residual` (B, M).
+
+    Without `along`, column k is along parameter k.
+    """
     transposed, along = np.swapaxes(slope, 1, 2), along or tuple(range(slope.shape[2]))
     gradient = (transposed @ residual[..., None])[..., 0]
     return NormalEquations(transposed @ slope, gradient, (residual**2).sum(axis=1), flight, along)

@@ -121,7 +121,7 @@ def refuse_own_motion(vehicle: Vehicle) -> None:
 def make_space(vehicle: Vehicle) -> ParameterSpace:
     """Return the space of all numbers that flights of `vehicle` can identify.
 
-    There are no random effects, effects with a state, known constants, and unseen components.
+    It has no random effects, effects with a state, known constants, and unseen components.
 
     Raises:
         ValueError: for a vehicle whose file has an effect with a motion of its own.

@@ -164,9 +164,9 @@ def _attenuated(series: np.ndarray, reliability: np.ndarray) -> np.ndarray:
 
 
 def view_candidates(among: Sequence[Candidate], block: Block) -> list[Candidate]:
-    """Return the candidates of which each effect changes a view's accelerations, not a sensor.
+    """Return the candidates that change a view's accelerations, without faults of sensors.
 
-    An effect of a composite may act through another one.
+    Each effect of a composite has to change them, alone or through another effect.
     """
     acts, acting_through_others = block.acts(), carried(among)
 

@@ -241,9 +241,10 @@ def filled(values: np.ndarray) -> np.ndarray:
 
 
 def with_merged_effects(vehicle: Vehicle, known_motors: bool) -> Vehicle:
-    """Return `vehicle`, which flies as before, without the effects that scale a fitted number.
+    """Return `vehicle` with its effects that scale a fitted number merged into that number.
 
-    Otherwise they would scale it once more. With `known_motors`, this includes `thrust_scale`.
+    It flies as before. Otherwise they would scale the fitted number once more. With `known_motors`,
+    `thrust_scale` is one of them.
 
     Raises:
         ValueError: if a merged number is not allowed in a vehicle file, such as the thrust of

@@ -127,7 +127,7 @@ def gap_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def effects_json(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Return an entry for each named effect; one for several motors, separate tests last."""
+    """Return an entry for each named effect (one for several motors), separate tests last."""
     searched = [
         _effect(finding, name, [named for named in finding.names if named.candidate.name == name])
         for finding in diagnosis.findings
