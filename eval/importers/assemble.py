@@ -252,10 +252,9 @@ def _notes_on_rates(recording: Recording, time_s: np.ndarray) -> list[Finding]:
 def _notes_on_ends(
     recording: Recording, within: tuple[float, float], origin_s: float
 ) -> list[Finding]:
-    """Return notes on signals that begin later or end earlier than the others.
+    """Return notes on signals that begin late or end early, of the times `within` [s].
 
-    Only the times `within` are wanted (on the recording's clock); `origin_s` is the file's first
-    sample [s].
+    Both are on the recording's clock, on which the file begins at `origin_s`.
     """
     times = {n: recording.signals[n].time_s for n in SIGNAL_TEXTS if n in recording.signals}
     first_s = max(within[0], min(t[0] for t in times.values()))
@@ -273,10 +272,7 @@ def _notes_on_ends(
 
 
 def _drop_half_commands(rows: dict[str, np.ndarray], partial: bool) -> list[Finding]:
-    """Remove an incomplete command in place: a thrust without rates or torques, or the reverse.
-
-    A partial log keeps a thrust without rates.
-    """
+    """Remove a thrust without rates or torques (unless `partial`), or the reverse, in place."""
     for name in ("cmd_thrust", "cmd_rate", "cmd_torque"):
         if name in rows and not np.isfinite(rows[name]).any():
             del rows[name]
@@ -302,10 +298,7 @@ def _columns(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def usable_for(rows: dict[str, np.ndarray], missing: list[str]) -> Finding:
-    """Return the finding that lists what a log without the groups `missing` identifies.
-
-    `rows` are as `rows_at` returns them, and `missing` are keys of `GROUP_TEXTS`.
-    """
+    """Return what a log without the groups `missing` (of `GROUP_TEXTS`) identifies by `rows`."""
     no_pose = "pos" in missing and "quat" in missing
     identifiable = [
         quantity

@@ -50,6 +50,8 @@ POWER = {
     **{"pwm": 1, "motor": 2, "motor_cmd": 2},
 }
 """Signals that measure the motors' effort -> exponent with which each gives the thrust."""
+Found = tuple[np.ndarray, str] | None
+"""Which samples of a signal (N,) bool to leave out, and why; None for none."""
 
 
 def clean(recording: Recording) -> Recording:
@@ -88,10 +90,7 @@ def _keep(
 
 
 def check_evenness(recording: Recording, fix: bool) -> Recording:
-    """Return the recording with jittery stamps spaced evenly, and with the findings.
-
-    Without `fix` the jitter is only reported.
-    """
+    """Return the recording with jittery stamps spaced evenly if `fix`, and with the findings."""
     signals, findings, tested = dict(recording.signals), [], set[str]()
     for name, (time_s, _) in recording.signals.items():
         if name not in MEASURED or name in tested:
@@ -138,10 +137,7 @@ def without_far(recording: Recording) -> Recording:
 
 
 def without_lost(recording: Recording) -> Recording:
-    """Return the recording without poses that stand still while the gyro turns: tracking is lost.
-
-    On the ground a pose may repeat; without a gyro none counts as lost.
-    """
+    """Return the recording without poses that stand still while the gyro turns (tracking lost)."""
     signals, rate = dict(recording.signals), recording.signals.get("rate")
     for name in TEXTS:
         if rate is None or not _is_long(recording, name):
@@ -163,10 +159,6 @@ def _moves(samples: Signal) -> bool:
     if later >= len(samples.value):
         return False
     return bool(np.mean(np.any(samples.value[later:] != samples.value[:-later], axis=1)) > 0.9)
-
-
-Found = tuple[np.ndarray, str] | None
-"""Which samples of a signal (N,) bool to leave out, and why; None for none."""
 
 
 def _interpolated(quat: Signal) -> Found:
@@ -255,10 +247,7 @@ def check_delay(recording: Recording, fix: bool) -> Recording:
 
 
 def airborne(recording: Recording) -> tuple[tuple[float, float], list[Finding]]:
-    """Return the first and the last time in flight [s], and a finding.
-
-    A time is infinite where the log starts or ends in flight, or has no signal of the motors.
-    """
+    """Return the first and the last time in flight [s], infinite where unknown, and a finding."""
     no_limits = (-np.inf, np.inf)
     effort = _motor_effort(recording)
     if effort is None:
@@ -321,10 +310,8 @@ def _off_ground(pos: Signal, start: float, stop: float) -> tuple[float, float]:
     is_inside = (time_s >= start) & (time_s <= stop)
     if not is_inside.any():
         return start, stop
-    before, after = (
-        (time_s < start) & (time_s > start - 1.0),
-        (time_s > stop) & (time_s < stop + 1.0),
-    )
+    before = (time_s < start) & (time_s > start - 1.0)
+    after = (time_s > stop) & (time_s < stop + 1.0)
     ends = [start, stop]
     for k, near in ((0, before), (-1, after)):
         ground = float(np.median(height[near])) if near.any() else float(height[is_inside][k])

@@ -30,10 +30,10 @@ def order_motors(
     motor_side: Sequence[tuple[float, float]] | None,
     vehicle: Vehicle | None,
 ) -> list[Finding]:
-    """Sort `motor`, `motor_cmd` and `pwm` of `rows` into the vehicle's order, in place.
+    """Sort motor signals of `rows` (see `rows_at`) into the vehicle's order, in place.
 
-    For the `rows` see `eval.importers.rows`. `motor_side` has (x forward, y left) of the file's
-    motors 1 to 4; None: already in order. Without a vehicle, the order is that of the shipped ones.
+    `motor_side` has (x forward, y left) of the file's motors 1 to 4; None: they are in order.
+    Without a vehicle, the order is that of the shipped ones.
     """
     if motor_side is None or not ({"motor", "motor_cmd", "pwm"} & rows.keys()):
         return []
@@ -55,10 +55,10 @@ def order_motors(
 def thrust_command(
     rows: dict[str, np.ndarray], options: ImportOptions, by_acc: bool = True
 ) -> list[Finding]:
-    """Replace `throttle` of `rows` by `cmd_thrust` [m/s^2] in place, where possible.
+    """Replace `throttle` of `rows` (see `rows_at`) by `cmd_thrust` [m/s^2] in place, if known.
 
-    For the `rows` see `eval.importers.rows`. Without `vehicle` and `full_thrust` in `options`, the
-    thrust is fitted to the accelerometer, unless `by_acc` is false, since that is in doubt.
+    Without `vehicle` and `full_thrust` in `options`, the thrust is fitted to the accelerometer,
+    unless `by_acc` is false, since that is in doubt.
     """
     if "cmd_thrust" in rows or "throttle" not in rows:
         return []
@@ -115,10 +115,9 @@ def _full_thrust(
 
 
 def _fit_full_thrust(throttle: np.ndarray, acc_z: np.ndarray) -> tuple[float, float]:
-    """Return thrust per mass at full throttle, and the standard deviation of the residual [m/s^2].
+    """Return thrust per mass at full throttle, and the residual's standard deviation [m/s^2].
 
-    The full thrust is the median ratio of the accelerometer's z to the throttle. The standard
-    deviation comes from a median too, so outliers do not count. Both are NaN for too few samples.
+    Both are by medians, so outliers do not count, and NaN for too few samples.
     """
     usable = np.isfinite(acc_z) & np.isfinite(throttle) & (throttle > 0.02) & (throttle <= 1.5)
     if np.sum(usable) <= 100:
@@ -129,11 +128,10 @@ def _fit_full_thrust(throttle: np.ndarray, acc_z: np.ndarray) -> tuple[float, fl
 
 
 def rates_wanted(rows: dict[str, np.ndarray], vehicle: Vehicle | None) -> list[Finding]:
-    """Replace `cmd_quat` (commanded attitudes) of `rows` by `cmd_rate` [rad/s], in place.
+    """Replace `cmd_quat` (commanded attitudes) of `rows` (see `rows_at`) by `cmd_rate` [rad/s].
 
-    A rate command that `rows` have already is kept. The rate is the attitude gain times the
-    rotation vector from the attitude to the set point, clipped to the vehicle's `rate_max`. Without
-    a vehicle the set points are dropped, with a doubt. For the `rows` see `eval.importers.rows`.
+    A rate command in `rows` is kept. The rate is the attitude gain times the rotation vector to the
+    set point, clipped to the vehicle's `rate_max`. Without a vehicle the set points are dropped.
     """
     if "cmd_quat" not in rows:
         return []

@@ -94,10 +94,9 @@ def rotation_vector(quat_wxyz: np.ndarray) -> np.ndarray:
 def rates_between(
     time_s: np.ndarray, quat_wxyz: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the time from each row to the one `count` rows later, and the mean body rate.
+    """Return spans [s] from each row to `count` rows later, and mean body rates (N - count, 3).
 
-    `time_s` (N,) [s], unit quaternions (N, 4) from body to world. The results have N - count rows:
-    spans of time [s], and body rates (N - count, 3) [rad/s].
+    `time_s` (N,) [s], unit quaternions (N, 4) from body to world; rates in rad/s.
     """
     span_s = time_s[count:] - time_s[:-count]
     relative = multiply(conjugate(quat_wxyz[:-count]), quat_wxyz[count:])

@@ -49,9 +49,8 @@ def recording_of(
 ) -> Recording:
     """Return the signals of the file at `path` by `mapping`.
 
-    The path is for messages, and to locate the text file of the mapping. `find` returns the times
-    and values of columns, `missing` the error text for a missing one. Of the options, `source`,
-    `mass` and `vehicle` are used.
+    `find` returns the times and values of columns, `missing` the error text for a missing one. Of
+    the options, `source`, `mass`, `vehicle` and `fix` are used.
 
     Raises:
         FlightLogError: for a column that the mapping needs and the file lacks.
@@ -95,7 +94,7 @@ def recording_of(
             parts.setdefault(quat, (time_s, from_euler(value)))
             used_columns.setdefault(quat, Column((), ()))
     parts = {
-        signal: _in_log_frame(signal, time_s, value, used_columns[signal], mapping)
+        signal: (time_s, _in_log_frame(signal, value, used_columns[signal], mapping))
         for signal, (time_s, value) in parts.items()
     }
     parts |= _estimates(mapping, used_columns, find, name)
@@ -115,8 +114,7 @@ def recording_of(
     if "quat" in euler and not has_quat and {"quat", "rate"} <= signals.keys():
 
         def quat_of(angles: np.ndarray) -> np.ndarray:
-            quat, column = from_euler(angles), used_columns["quat"]
-            return _in_log_frame("quat", signals["quat"].time_s, quat, column, mapping)[1]
+            return _in_log_frame("quat", from_euler(angles), used_columns["quat"], mapping)
 
         angles, _ = make_signal(euler["quat"][0], euler["quat"][1], name, "quat")
         assert angles is not None
@@ -132,10 +130,7 @@ def recording_of(
 def _first_alternative(
     alternatives: tuple[Column, ...], find: Find, source: str
 ) -> tuple[Column, Part | None]:
-    """Return the first alternative that the file has, with its samples.
-
-    The alternatives of `source` are tried first. Without any, the samples are None.
-    """
+    """Return the first alternative that the file has, those of `source` first, and its samples."""
     for column in sorted(alternatives, key=lambda c: bool(source) and c.source != source):
         if (part := find(column.names)) is not None:
             return column, part
@@ -145,9 +140,9 @@ def _first_alternative(
 def _estimates(
     mapping: LogMap, used_columns: Mapping[str, Column], find: Find, name: str
 ) -> dict[str, Part]:
-    """Return the on-board estimates of signals taken from motion capture, as columns to keep.
+    """Return the on-board estimates of signals from motion capture, as columns to keep.
 
-    Only estimates in the flight log's axes are kept: a velocity in world axes.
+    Only those in the flight log's axes are kept: of velocities, those in world axes.
     """
     estimates = {}
     for signal in ESTIMATED:
@@ -157,8 +152,8 @@ def _estimates(
             part = find(column.names) if column.source == "estimate" else None
             if part is None or _is_world(signal, column) != (signal == "vel"):
                 continue
-            part = _in_log_unit(part, column, name)
-            time_s, value = _in_log_frame(signal, *part, column, mapping)
+            time_s, value = _in_log_unit(part, column, name)
+            value = _in_log_frame(signal, value, column, mapping)
             value = continuous(value) if signal == "quat" else value
             for k, column_name in enumerate(GROUPS[signal]):
                 estimates[f"{KEPT}{ESTIMATE}{column_name}"] = (time_s, value[:, k : k + 1])
@@ -179,22 +174,19 @@ def _in_log_unit(part: Part, column: Column, name: str) -> Part:
     return time_s, value
 
 
-def _in_log_frame(
-    signal: str, time_s: np.ndarray, value: np.ndarray, column: Column, mapping: LogMap
-) -> Part:
-    """Return a signal in a z-up world or forward-left-up body.
+def _in_log_frame(signal: str, value: np.ndarray, column: Column, mapping: LogMap) -> np.ndarray:
+    """Return samples in a z-up world or forward-left-up body.
 
     A vector in world axes remains in world axes, and one in body axes in body axes.
     """
-    world_axes = signal == "pos" or (signal in ("vel", "rate", "acc") and _is_world(signal, column))
     if signal in ("quat", "cmd_quat"):
         quat = conjugate(value) if column.inverse else value
-        return time_s, attitude(quat, mapping.world, mapping.body)
-    if world_axes:
-        return time_s, world_vector(value, mapping.world)
+        return attitude(quat, mapping.world, mapping.body)
+    if signal == "pos" or (signal in ("vel", "rate", "acc") and _is_world(signal, column)):
+        return world_vector(value, mapping.world)
     if signal in ("vel", "rate", "acc", "cmd_rate", "cmd_torque"):
-        return time_s, body_vector(value, mapping.body)
-    return time_s, value
+        return body_vector(value, mapping.body)
+    return value
 
 
 def _is_world(signal: str, column: Column) -> bool:
@@ -203,9 +195,9 @@ def _is_world(signal: str, column: Column) -> bool:
 
 
 def _change_axes(signals: dict[str, Signal], signal: str, column: Column) -> None:
-    """Rotate a signal into the flight log's axes by the attitude, in place; without one, drop it.
+    """Rotate a signal into the flight log's axes in place; without an attitude, drop it.
 
-    An acceleration in world axes is kept as `acc_w_x`, ... where there is no attitude.
+    An acceleration in world axes is then kept as `acc_w_x`, ...
     """
     time_s, value = signals[signal]
     if signal == "acc" and not column.gravity:
@@ -237,7 +229,7 @@ def _per_mass(signals: dict[str, Signal], file_mass: Any, options: ImportOptions
 def _text_file(path: Path, mapping: LogMap) -> tuple[dict[str, Any], list[Finding]]:
     """Return metadata from the text file next to the log (`LogMap.text_file`), and a note.
 
-    The metadata has the file's entries under `beside`, and the vehicle's `mass` [kg] if present.
+    Its entries are under `beside`, and the vehicle's mass [kg] under `mass`, if present.
     """
     if not mapping.text_file:
         return {}, []
@@ -267,16 +259,12 @@ def _number_or_text(text: str) -> float | str:
 def check_angles(
     angles: Signal, quat_of: Callable[[np.ndarray], np.ndarray], rate: Signal, fix_order: bool
 ) -> tuple[np.ndarray | None, list[Finding]]:
-    """Return corrected angles (N, 3) [rad], None where the given ones are kept, and the finding.
+    """Return corrected `angles` (N, 3) [rad], None to keep them, and the finding.
 
-    Another order must explain its rates better than other axes of the gyro do. Another unit is only
-    reported, since small angles in a wrong unit look like a gyro in a wrong unit.
-
-    Args:
-        angles: roll, pitch and yaw as read from the file [rad].
-        quat_of: converts angles to quaternions wxyz (N, 4) in the log's frames.
-        rate: body rates of the gyro [rad/s].
-        fix_order: correct the order; False: only report it.
+    `angles` are roll, pitch and yaw as read [rad], and `quat_of` converts such to quaternions wxyz
+    (N, 4) in the log's frames. Another order, corrected with `fix_order`, must explain them better
+    than other axes of the gyro do. Another unit is only reported, since small angles in a wrong
+    unit look like a gyro in a wrong unit.
     """
     time_s, value = angles
     if len(time_s) < 4:

@@ -122,7 +122,7 @@ class LogMap:
 
 
 def map_file(path: Path) -> Path:
-    """Return the mapping file that `path` names: a file, or a shipped one by its name.
+    """Return the path of a mapping file, or of a shipped one by its name.
 
     Raises:
         ValueError: for a name that is neither a file nor a shipped mapping.

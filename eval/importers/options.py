@@ -42,7 +42,6 @@ class ImportOptions:
     partial: bool = False
     """Accept a log without position, attitude, rates or commands."""
     read: Readings = ()
-    """Conversions of signals before any check, such as a changed sign: see
-    `eval.logs.faults.reading`."""
+    """Conversions of signals before any check, see `eval.logs.faults.reading`."""
     fix: bool = True
     """Correct faults with overwhelming evidence; False: only report them."""

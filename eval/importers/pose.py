@@ -52,8 +52,7 @@ DRIFT_MAX = 2e-3
 DRIFT = 2e-4
 """Largest relative drift of two sound crystals; a larger one is reported as a fault."""
 ROTATION_DEG = 15.0
-"""Rotation between the body frames above which it is corrected [deg]; a smaller one may be a
-tilt of the markers."""
+"""Rotation between body frames that is corrected [deg]; less may be a tilt of markers."""
 
 
 @dataclass(frozen=True)
@@ -209,11 +208,10 @@ def _align_pose(
 
 
 def align(quat: Signal, rate: Signal, name: str, mirrored: bool = False) -> Alignment:
-    """Return the alignment of the attitude `quat` with the gyro `rate`.
+    """Return the alignment of `quat` (wxyz, body to world) with the gyro `rate` [rad/s].
 
-    Quaternions are wxyz, body to world, on the pose's clock; rates are in rad/s on the log's clock.
-    With `mirrored`, a reflection is fitted instead of a rotation (one axis of the gyro is
-    inverted).
+    Each is on its own clock. With `mirrored`, a reflection is fitted instead of a rotation (one
+    axis of the gyro is inverted).
 
     Raises:
         FlightLogError: where either signal is too short or has too few samples.
@@ -288,10 +286,7 @@ def _refine(
 
 
 def _pose_rates(quat: Signal) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean body rates over spans of `SPAN_S`: middles of the spans (K,) [s], rates (K, 3).
-
-    The rates are in rad/s.
-    """
+    """Return middles (K,) [s] of spans of `SPAN_S`, and their mean body rates (K, 3) [rad/s]."""
     value = continuous(quat.value / np.linalg.norm(quat.value, axis=1, keepdims=True))
     step = median_step(quat.time_s)
     count = max(1, round(SPAN_S / step))
@@ -340,10 +335,7 @@ def _kabsch(source: np.ndarray, target: np.ndarray, mirrored: bool) -> np.ndarra
 
 
 def _huber_weights(residual: np.ndarray) -> np.ndarray:
-    """Return Huber's weights (3 K,) for residuals (K, 3), which reduce the effect of outliers.
-
-    The three residuals of a row have the same weight.
-    """
+    """Return Huber's weights (3 K,) for residuals (K, 3), the same for the three of a row."""
     size = np.linalg.norm(residual - np.median(residual, axis=0), axis=1)
     limit = 2.5 * max(float(np.median(size)), 1e-9)
     return np.repeat(np.minimum(1.0, limit / np.maximum(size, 1e-12)), 3)

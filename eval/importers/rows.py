@@ -45,8 +45,7 @@ samples if that is longer."""
 FASTER = 0.6
 """A signal is smoothed if the time between its samples is below this share of a row's period."""
 LOST = 0.8
-"""A row gets no velocity if the nearest velocity sample is further away than this many times the
-time between velocity samples."""
+"""A row gets no velocity if the nearest sample is further away than this many of their steps."""
 SLOWER = 1.5
 """A signal is slower than the rows if its time between samples exceeds this many row periods."""
 
@@ -55,7 +54,7 @@ def rows_at(recording: Recording, time_s: np.ndarray) -> dict[str, np.ndarray]:
     """Return the rows: `time` (T,) from 0 [s] and every signal as (T, C), NaN where unknown.
 
     Signals slower than the rows are interpolated; `sampled_rows` returns which rows are samples.
-    The recording holds at least one of pos, quat and rate; `time_s` (T,) is on its clock [s].
+    `time_s` (T,) is on the clock of the recording, which has a signal of `NEEDED` [s].
     """
     rows = {"time": time_s - time_s[0]}
     for name, samples in recording.signals.items():
@@ -88,7 +87,7 @@ def row_times(
     within: tuple[float, float] = (-np.inf, np.inf),
     origin_s: float | None = None,
 ) -> np.ndarray:
-    """Return the rows' times (T,) on the recording's clock [s].
+    """Return the rows' times (T,) on the clock of a recording with pos, quat or rate [s].
 
     Args:
         recording: holds at least one of pos, quat and rate.
@@ -159,10 +158,9 @@ def row_times(
 def sampled_rows(recording: Recording, time_s: np.ndarray) -> Mapping[str, np.ndarray]:
     """Return which rows (T,) bool hold a sample, for each signal that is slower than the rows.
 
-    A sample belongs to the row nearest to it. But if a row of the slowest signal is within half the
-    time between samples, the sample belongs to that row, so that some rows have all signals. A
-    velocity that is fast enough, but has gaps, is listed too. `time_s` (T,) is on the recording's
-    clock [s].
+    A sample belongs to the nearest row, or to a row of the slowest signal within half the time
+    between samples, so that some rows have all signals. A fast velocity with gaps is listed too.
+    `time_s` (T,) is on the recording's clock [s].
     """
     row_step, is_sample = median_step(time_s), {}
     slowest_rows = nearest(time_s, recording.signals[slowest(recording)].time_s)
@@ -194,8 +192,8 @@ def nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 def measured(samples: Signal, time_s: np.ndarray, smooth: bool) -> np.ndarray:
     """Return a measured signal at `time_s` (T,) as (T, C), NaN in gaps and beyond the ends.
 
-    `time_s` is on the signal's clock [s]. It is interpolated by a cubic spline (`smooth`) or
-    linearly; linearly it is averaged over a row's period where it is faster than the rows.
+    It is interpolated by a cubic spline (`smooth`) or linearly; linearly it is averaged over a
+    row's period where it is faster than the rows.
     """
     value = continuous(samples.value) if smooth and samples.value.shape[1] == 4 else samples.value
     step, row_step = median_step(samples.time_s), median_step(time_s)
@@ -220,10 +218,9 @@ def measured(samples: Signal, time_s: np.ndarray, smooth: bool) -> np.ndarray:
 
 
 def held(samples: Signal, time_s: np.ndarray) -> np.ndarray:
-    """Return a command, which holds its value between samples, for rows at `time_s` (T,) as (T, C).
+    """Return a command held between samples, for rows at `time_s` (T,) as (T, C).
 
-    Where the command changes within a row's period, the row gets its mean over that period. Rows
-    before the first sample and long after the last one are NaN.
+    A row gets the mean over its period, and NaN before the first sample and long after the last.
     """
     t, v = samples.time_s, samples.value
     last_sample = np.searchsorted(t, time_s, side="right") - 1
@@ -257,10 +254,7 @@ def unchanged(samples: Signal, time_s: np.ndarray) -> np.ndarray:
 
 
 def turn_axes(signals: dict[str, Signal], name: str, to_world: bool) -> None:
-    """Rotate a signal from body to world axes by the attitude, in place, or the other way round.
-
-    Samples without an attitude are left out, and the signal where none has one.
-    """
+    """Rotate a signal from body to world axes, or back, in place; drop what has no attitude."""
     time_s, value = signals.pop(name)
     if "quat" not in signals:
         return
@@ -281,19 +275,10 @@ def continuous(quat_wxyz: np.ndarray) -> np.ndarray:
 
 
 def smoothed(t: np.ndarray, v: np.ndarray, query_s: np.ndarray, width_s: float) -> np.ndarray:
-    """Return samples smoothed by a local parabola (Savitzky and Golay 1964).
+    """Return samples (N, C) at `t` (N,) smoothed by local parabolas, at `query_s` (M,): (M, C).
 
-    A mean would flatten a curved signal; a parabola follows it and averages the noise as well.
-    Where fewer than three samples are in the window, the samples are interpolated linearly.
-
-    Args:
-        t: (N,) increasing times of the samples [s].
-        v: (N, C) samples.
-        query_s: (M,) times of the results [s].
-        width_s: width of the window around each of these times [s].
-
-    Returns:
-        The values of the parabolas, (M, C).
+    A mean would flatten a curved signal (Savitzky and Golay 1964). Where fewer than three samples
+    are in a window of `width_s`, they are interpolated linearly. All times in s.
     """
     first = np.searchsorted(t, query_s - 0.5 * width_s)
     count = np.searchsorted(t, query_s + 0.5 * width_s, side="right") - first
@@ -313,18 +298,10 @@ def smoothed(t: np.ndarray, v: np.ndarray, query_s: np.ndarray, width_s: float) 
 
 
 def averaged(t: np.ndarray, v: np.ndarray, query_s: np.ndarray, width_s: float) -> np.ndarray:
-    """Return moving averages of linearly interpolated samples.
+    """Return moving averages (M, C), over `width_s` about `query_s` (M,), of samples (N, C) at `t`.
 
-    Near the ends of the samples the window shrinks so that it stays centred.
-
-    Args:
-        t: (N,) increasing times of the samples [s].
-        v: (N, C) samples.
-        query_s: (M,) centres of the windows [s].
-        width_s: width of the windows [s].
-
-    Returns:
-        The means over the windows, (M, C).
+    Samples are interpolated linearly; near their ends the window shrinks about its centre. All
+    times in s.
     """
     area = 0.5 * np.diff(t)[:, None] * (v[1:] + v[:-1])
     integral_at_t = np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(area, axis=0)])

@@ -56,8 +56,7 @@ class Recording:
     findings: tuple[Finding, ...] = ()
     """Results of the checks so far."""
     motor_side: tuple[tuple[float, float], ...] | None = None
-    """Positions of the file's motors 1 to 4, (x forward, y left), in any length unit; None: the
-    motors have the vehicle's order."""
+    """Positions (x forward, y left) of motors 1 to 4 in any unit; None: the vehicle's order."""
     about: Mapping[str, Any] = field(default_factory=dict)
     """Metadata of the file: firmware, airframe, start."""
     has_seconds: bool = False
@@ -73,7 +72,7 @@ def make_signal(
 ) -> tuple[Signal | None, Finding | None]:
     """Return the finite samples with increasing time (None without any), and a note on the others.
 
-    `time_s` (N,) is NaN where unknown [s]. Samples, (N,) or (N, C), with a NaN are left out.
+    `time_s` is (N,) [s], samples are (N,) or (N, C); NaN where unknown.
 
     Raises:
         FlightLogError: where time decreases too often (two flights in one file, or a wrong
@@ -114,8 +113,6 @@ def make_signal(
 def collect(parts: Mapping[str, Part], file: str) -> tuple[dict[str, Signal], tuple[Finding, ...]]:
     """Return the signals that have samples, and findings on samples that were left out.
 
-    `parts` are by the signals' names.
-
     Raises:
         FlightLogError: where a signal of `NEEDED` is unusable; another unusable signal is dropped.
     """
@@ -146,7 +143,7 @@ def collect(parts: Mapping[str, Part], file: str) -> tuple[dict[str, Signal], tu
 
 
 def _without_placeholders(pos: np.ndarray) -> tuple[np.ndarray, list[Finding]]:
-    """Return positions (N, 3) in any unit, NaN where a number stands for "unknown", and the notes.
+    """Return positions (N, 3) with NaN where a number stands for "unknown", and the notes.
 
     Such a position is zero or recurs exactly, and the steps to it and from it are far.
     """
@@ -175,9 +172,7 @@ def _without_placeholders(pos: np.ndarray) -> tuple[np.ndarray, list[Finding]]:
 
 
 def with_readings(recording: Recording, readings: Readings) -> Recording:
-    """Return the recording with its signals converted, such as by a changed sign or order.
-
-    For the `readings` see `eval.logs.faults.reading`.
+    """Return the recording with converted signals, see `eval.logs.faults.reading`.
 
     Raises:
         ValueError: for a conversion that needs an attitude, where the recording has none.

@@ -180,10 +180,7 @@ class Diagnosis:
 
 
 def main_of(findings: Sequence[Finding]) -> Finding:
-    """Return a finding with names, or any if none has; of these, the best explainable one.
-
-    That is the one of whose error a black box explains most.
-    """
+    """Return a finding with names, or any if none has; of these, that a black box explains best."""
     return max(findings, key=lambda one: (bool(one.names), one.remaining.explainable))
 
 
@@ -193,11 +190,9 @@ def tested_in(findings: Sequence[Finding], flights: SourceSet) -> tuple[TestedEf
 
 
 def verdict_on(findings: Sequence[Finding], named: bool, limits: Thresholds) -> Verdict:
-    """Return the verdict.
+    """Return the verdict by the `deciding` findings; `named` is whether an effect was named.
 
-    It follows from the findings that are `deciding`. `named` is whether the search or a separate
-    test named an effect. An oscillating force (swing) always counts as unexplained, since no fitted
-    parameter reproduces it.
+    An oscillating force (swing) always counts as unexplained, since no parameter reproduces it.
     """
     swings = [one.remaining.swing for one in findings if one.remaining.swing]
     worst = max((one.remaining for one in deciding(findings)), key=lambda one: one.share)
@@ -210,10 +205,10 @@ def verdict_on(findings: Sequence[Finding], named: bool, limits: Thresholds) -> 
 
 
 def deciding(findings: Sequence[Finding]) -> list[Finding]:
-    """Return the findings whose remaining error decides the verdict.
+    """Return the findings whose remaining error decides the verdict, or else the main finding.
 
     They are those with more than noise among the findings with named effects, or among all if none
-    names an effect; without any, it is the main finding.
+    names an effect.
     """
     judged = [one for one in findings if one.names] or findings
     return [one for one in judged if one.remaining.structured] or [main_of(findings)]
@@ -233,9 +228,8 @@ def with_names(
     fitted, effects = space.effects(theta), dict(nominal.effects)
     for name in names:
         values = (np.asarray(value, dtype=float) for value in fitted[name])
-        effects[name] = type(fitted[name])(
-            *(tuple(v.tolist()) if v.ndim else float(v) for v in values)
-        )
+        plain = (tuple(v.tolist()) if v.ndim else float(v) for v in values)
+        effects[name] = type(fitted[name])(*plain)
     effects |= {one.name: one.values for one in tested}
     ordered = {name: effects[name] for name in EFFECTS if name in effects}
     return replace(nominal, effects=MappingProxyType(ordered))

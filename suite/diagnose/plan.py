@@ -28,13 +28,27 @@ MEASURES = {
     "scale": "Better still: weigh the vehicle.",
 }
 """Advice on further measurements, by their names in `Separation.measure`."""
+SCHEMA = 1
+"""Version of plan.json."""
+COLUMNS = ("time", *(f"{stem}_{axis}" for stem in ("pos", "vel", "acc") for axis in "xyz"), "yaw")
+"""Columns of a CSV: time [s]; world position [m], velocity [m/s], acceleration [m/s^2]; yaw
+[rad]."""
+NAME = "plan.json"
+_FAST_WOBBLE = Trajectory("figure_eight", speed=6.5, size=4.0, turn="wobble")
+_SWEEP = Trajectory("speed_range", speed=8.0, size=6.0, turn="sweep")
+_CHIRP = Trajectory("chirp", speed=1.6, turn="wobble")
+_PUNCHES = Trajectory("punches", speed=4.0, size=4.0)
+_RANGE = Trajectory("speed_range", speed=9.0, size=7.0)
+_CIRCLE = Trajectory("circle", speed=3.0, size=3.0)
+_SLOW_EIGHT = Trajectory("figure_eight", speed=2.0, size=3.0)
+_HOVER = Trajectory("hover")
+_UP_DOWN = Trajectory("vertical", speed=1.5, size=1.0)
+OTHERWISE = "fly faster, with changes of thrust, speed, heading and height"
+"""Advice for effects without an entry in `SEPARATIONS`."""
 
 
 def trajectories_for(result: Mapping[str, Any]) -> tuple[list[Trajectory], list[str]]:
-    """Return the flights that separate named effects from their alternatives, and advice in words.
-
-    `result` is the content of diagnosis.json.
-    """
+    """Return the flights that separate effects from their alternatives, and advice in words."""
     trajectories, words = list[Trajectory](), list[str]()
     for effect in result["effects"]:
         if effect["alternatives"]:
@@ -50,14 +64,6 @@ def trajectories_for(result: Mapping[str, Any]) -> tuple[list[Trajectory], list[
         for flight in (trajectory, replace(trajectory, direction=2.1))
     ]
     return flights, list(dict.fromkeys(words))
-
-
-SCHEMA = 1
-"""Version of plan.json."""
-COLUMNS = ("time", *(f"{stem}_{axis}" for stem in ("pos", "vel", "acc") for axis in "xyz"), "yaw")
-"""Columns of a CSV: time [s]; position [m], velocity [m/s] and acceleration [m/s^2] in the world
-frame; yaw [rad]."""
-NAME = "plan.json"
 
 
 def remove_plan(folder: Path) -> None:
@@ -79,10 +85,7 @@ def remove_plan(folder: Path) -> None:
 def write_plan(folder: Path, ways: Sequence[Trajectory], words: Sequence[str]) -> dict[str, Any]:
     """Write plan.json and the set points of each flight into `folder`; without flights, nothing.
 
-    An earlier plan in it is removed. `words` are advice for people, which the plan contains.
-
-    Returns:
-        The content of plan.json.
+    An earlier plan in it is removed. Returned is the content of plan.json, with the advice `words`.
     """
     remove_plan(folder)
     if not ways:
@@ -110,19 +113,6 @@ def write_plan(folder: Path, ways: Sequence[Trajectory], words: Sequence[str]) -
     return plan
 
 
-_FAST_WOBBLE = Trajectory("figure_eight", speed=6.5, size=4.0, turn="wobble")
-_SWEEP = Trajectory("speed_range", speed=8.0, size=6.0, turn="sweep")
-_CHIRP = Trajectory("chirp", speed=1.6, turn="wobble")
-_PUNCHES = Trajectory("punches", speed=4.0, size=4.0)
-_RANGE = Trajectory("speed_range", speed=9.0, size=7.0)
-_CIRCLE = Trajectory("circle", speed=3.0, size=3.0)
-_SLOW_EIGHT = Trajectory("figure_eight", speed=2.0, size=3.0)
-_HOVER = Trajectory("hover")
-_UP_DOWN = Trajectory("vertical", speed=1.5, size=1.0)
-OTHERWISE = "fly faster, with changes of thrust, speed, heading and height"
-"""Advice for effects without an entry in `SEPARATIONS`."""
-
-
 @dataclass(frozen=True)
 class Separation:
     """The names of two effects, advice for people, and flights that separate them or do not."""
@@ -136,8 +126,7 @@ class Separation:
     separating: tuple[Trajectory, ...]
     """Further flights that separate them."""
     measure: tuple[str, ...] = ()
-    """Further measurements that separate them: `motor` (rotor speeds), `voltage`, or `scale`
-    (weighing the vehicle)."""
+    """Further measurements that do: `motor` (rotor speeds), `voltage` or `scale` (weighing)."""
 
 
 SEPARATIONS: tuple[Separation, ...] = (
@@ -222,27 +211,18 @@ SEPARATIONS: tuple[Separation, ...] = (
 
 
 def separations_of(names: Iterable[str]) -> list[Separation]:
-    """Return the entries of `SEPARATIONS` whose two effects are both in `names`.
-
-    A composite (several effects as one candidate) counts as its effects.
-    """
+    """Return the entries of `SEPARATIONS` for the effects in `names`, some of them composites."""
     wanted = {effect for name in names for effect in effects_in(name)}
     return [entry for entry in SEPARATIONS if wanted.issuperset(entry.pair)]
 
 
 def plan_for(names: Iterable[str]) -> list[Trajectory]:
-    """Return the trajectories that separate the effects `names`, each once.
-
-    Without an entry in `SEPARATIONS`, these are the trajectories with the fastest changes.
-    """
+    """Return the trajectories that separate the effects `names`, or else the fastest ones."""
     separating = [way for entry in separations_of(names) for way in entry.separating]
     return list(dict.fromkeys(separating or [_RANGE, _SWEEP, _CHIRP, _FAST_WOBBLE]))
 
 
 def advice(name: str, rival: str) -> str:
-    """Return a line for people: how to fly to separate the effect `name` from `rival`.
-
-    `rival` is an alternative to the effect.
-    """
+    """Return a line for people: how to fly to separate the effect `name` from a `rival`."""
     entries = separations_of((name, rival))
     return f"{name} from {rival}: {entries[0].words if entries else OTHERWISE}"

@@ -34,8 +34,6 @@ SCHEMA = 1
 def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     """Diagnose flights in files, write the results, and return the content of diagnosis.json.
 
-    `console` is for progress and warnings.
-
     Raises:
         ValueError: if flights or vehicle file cannot be used.
     """
@@ -88,7 +86,6 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     if config.plan:
         result["plan"] = write_plan(out / "plan", *trajectories_for(result))
         files |= {"plan/plan.json"} if result["plan"]["flights"] else set()
-    # Write the results.
     result["findings"] = flights.findings
     result["identified"] = is_identified(config.vehicle)
     result = {**plain(result), **stamp(SCHEMA, config.seed)}

@@ -115,16 +115,13 @@ class Thresholds:
     near_share: float = 0.5
     """Least linear gain of the candidates on the short list, as a share of the best gain."""
     rival_chi2: float = 9.0
-    """An alternative ("rival") is a candidate whose chi-square is less than this above the named
-    effect's (three sigma)."""
+    """Rise of chi-square above the named effect's for an alternative ("rival"; three sigma)."""
     rival_share: float = 0.25
-    """The same limit as a share of the chi-square that the named effect explains. The smaller of
-    the two limits counts."""
+    """The same as a share of the explained chi-square; the smaller limit counts."""
     settle_rounds: int = 3
     """Largest number of rounds in which named effects and alternatives are compared again."""
     trusted_horizons_s: tuple[float, ...] = (1.0, 0.5, 0.25)
-    """Allowed lengths of a window; the longest over which the linearisation is valid is used
-    [s]."""
+    """Allowed lengths of a window, of which the longest valid one is used [s]."""
     trusted_m: float = 0.15
     """Position error up to which the linearisation is valid [m]."""
     trusted_height_share: float = 0.25
@@ -146,8 +143,7 @@ class Thresholds:
     least_windows: int = 2
     """Least number of windows to fit; cross-validation leaves some out."""
     integrator_share: float = 0.6
-    """Largest time offset between pose and rates that an integrator explains, as a share of its
-    step."""
+    """Largest delay between pose and rates that an integrator explains, in its steps."""
 
     ground_thrust: float = 0.3
     """Thrust, as a share of the weight, below which a vehicle at rest is on the ground."""
@@ -177,8 +173,7 @@ class Thresholds:
     """Largest mean squared error, in noise variances, after a fit of all effects together. If it is
     exceeded, force and torque are used instead of rollouts of 1 s."""
     hopeless_windows: int = 16
-    """Number of windows of that fit with the nonlinear model, which follows if the linear fit
-    exceeds the limit."""
+    """Windows of that fit with the nonlinear model, after a linear fit above the limit."""
     hopeless_rounds: int = 6
     """Number of Gauss-Newton steps of that fit."""
     view_left_share: float = 0.1
@@ -188,8 +183,7 @@ class Thresholds:
     """An unexplained force is reported only above this many times the flights' constant offsets,
     which show the accuracy of attitude and thrust in a log."""
     unexplained_force: float = 0.5
-    """Upper limit of that threshold: an attitude error of 3 degrees, or 5 % of the weight
-    [m/s^2]."""
+    """Upper limit of it: 3 degrees of attitude, or 5 % of the weight [m/s^2]."""
     least_rotor_gain: float = 0.01
     """Smallest influence of the rotors along an axis that counts, as a share of their largest
     influence along any axis."""
@@ -234,8 +228,7 @@ class Thresholds:
     structure: float = 1.15
     """Ratio of the energy of slow errors to its expectation, above which they are not noise."""
     structure_rotor_input: float = 1.3
-    """The same if measured rotor speeds are the input, or if the log lacks commands; the noise is
-    then less certain."""
+    """The same with measured rotor speeds as the input, or if the log lacks commands."""
     above_noise: float = 1.5
     """Remaining errors above this many noise floors are reported, even if they show no structure.
     Errors of unknown rotor speeds alone may reach 1.3."""
@@ -246,8 +239,7 @@ class Thresholds:
     wind_rival_ratio: float = 8.0
     """Wind is rejected if a disturbance along the body axes has a log-likelihood higher by this."""
     wind_tail: float = 4.0
-    """Largest excess of the fourth moment of the fitted wind over that of a normal variable, in
-    standard errors."""
+    """Largest excess of the fitted wind's fourth moment over a normal one, in standard errors."""
     profile_fall: float = 1.92
     """Fall of the log-likelihood at the ends of a 95 % interval (Wilks 1938)."""
 

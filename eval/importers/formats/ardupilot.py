@@ -216,10 +216,7 @@ def _columns(rows: list[dict[str, Any]], name: str) -> Rows:
 
 
 def _outputs(parameters: Mapping[str, float]) -> list[int]:
-    """Return the numbers of the outputs of motors 1 to 4; [] if only some motors have an output.
-
-    Without any assignment in the log, these are outputs 1 to 4, ArduPilot's default.
-    """
+    """Return the outputs of motors 1 to 4: by default 1 to 4; [] if only some are assigned."""
     output_of = {parameters.get(f"SERVO{k}_FUNCTION"): k for k in range(14, 0, -1)}
     outputs = [output_of.get(float(MOTOR_1 + k)) for k in range(4)]
     assigned = [k for k in outputs if k is not None]
@@ -229,10 +226,9 @@ def _outputs(parameters: Mapping[str, float]) -> list[int]:
 
 
 def _motors(esc: Rows, outputs: list[int], findings: list[Finding]) -> dict[str, Part]:
-    """Return rotor speeds [rad/s] of motors 1 to 4, whose numbers of outputs are `outputs`.
+    """Return rotor speeds [rad/s] of motors 1 to 4 on `outputs`, at the times of the first ESC.
 
-    Motor controllers (ESCs) have instances in the order of their outputs. Speeds are interpolated
-    to the times of the first motor's ESC.
+    Motor controllers (ESCs) have instances in the order of their outputs.
     """
     name = "Instance" if "Instance" in esc else "I"
     instances = sorted(set(esc.get(name, np.zeros(0)).tolist()))

@@ -41,8 +41,7 @@ MISSING = (
 )
 """Reason of the error if the decoder is not installed."""
 MOTOR_SIDE = ((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
-"""Positions of motors 1 to 4 (x forward, y left): rear right, front right, rear left, front
-left."""
+"""Motors 1 to 4 (x forward, y left): rear right, front right, rear left, front left."""
 DSHOT, PULSES = (48.0, 2047.0), (1000.0, 2000.0)
 """Least and largest motor output, in steps of DShot or as pulses [us]."""
 ABOUT = {"Firmware revision": "firmware", "Craft name": "craft", "Board information": "board"}
@@ -102,10 +101,7 @@ class Blackbox:
         return all(name in self.units for name in names)
 
     def values(self, names: list[str], factor: Mapping[str, float]) -> np.ndarray:
-        """Return columns (N, C) in the suite's unit.
-
-        The columns are named without units. `factor` maps the unit in the file to the factor to the
-        suite's unit.
+        """Return the columns `names` (without units) times their units' factors, (N, C).
 
         Raises:
             FlightLogError: for a column that is missing, has an unknown unit, or is not numeric.
@@ -219,7 +215,7 @@ def _motors(box: Blackbox, poles: int) -> dict[str, np.ndarray]:
 def decode(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], list[Finding]]:
     """Return the columns of the longest log of the raw file at `path`, its settings, and notes.
 
-    The columns have the names of `blackbox_decode`; an unusual unit in brackets ends a name.
+    The columns are named as by `blackbox_decode`; an unusual unit in brackets ends a name.
 
     Raises:
         FlightLogError: where the decoder is not installed, or nothing can be decoded.

@@ -16,6 +16,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 from zlib import crc32
@@ -79,13 +80,8 @@ def read(path: Path, options: ImportOptions) -> Recording:
         guess = closest(variable, known)
         return "not logged" + (f"; did you mean {guess!r}?" if guess else "")
 
-    recording = recording_of(
-        path,
-        read_map(options.map or DEFAULT_MAP),
-        lambda variables: _find(events, variables),
-        missing,
-        options,
-    )
+    mapping = read_map(options.map or DEFAULT_MAP)
+    recording = recording_of(path, mapping, partial(_find, events), missing, options)
     findings = [*findings, *recording.findings]
     return replace(recording, findings=tuple(findings), has_seconds=True)
 
@@ -151,11 +147,11 @@ def decode(data: bytes, name: str) -> tuple[dict[str, dict[str, np.ndarray]], li
 
 
 def unpack_quaternion(packed: np.ndarray) -> np.ndarray:
-    """Return quaternions wxyz (N, 4) from the firmware's 32-bit form, accurate to about 0.1 deg.
+    """Return quaternions wxyz (N, 4) from the firmware's 32-bit integers (N,), to about 0.1 deg.
 
-    The two highest bits are the index of the largest component of x, y, z, w. It is positive and
-    not stored, because the norm is 1. The other three follow in order, each as a sign bit and nine
-    bits of magnitude in units of 1 / (511 sqrt(2)). `packed` are (N,) 32-bit integers.
+    The two highest bits are the index of the largest of x, y, z, w, which is positive and not
+    stored, as the norm is 1. The others follow, each as a sign bit and nine bits of magnitude in
+    units of 1 / (511 sqrt(2)).
     """
     bits = packed.astype(np.uint64)
     largest = (bits >> np.uint64(30)).astype(np.int64)

@@ -91,8 +91,7 @@ class _TruncationSafeReader(io.BufferedReader):
     """A file reader that keeps pyulog from an endless loop in a truncated file.
 
     After an invalid message pyulog seeks back by the length of its body. If the file ends within
-    the body, pyulog has read fewer bytes than that, and would parse the same bytes again and again.
-    This reader corrects the seek by the bytes that are missing.
+    the body, it would parse the same bytes again and again. This reader corrects the seek.
     """
 
     _requested = _missing = 0
@@ -123,9 +122,8 @@ def _load(path: Path) -> Any:
             _TruncationSafeReader(io.FileIO(path)) as file,
             contextlib.redirect_stdout(io.StringIO()),
         ):
-            log: Any = ULog(
-                file, [*{t for s in _SOURCES.values() for t, *_ in s}, "actuator_motors"]
-            )
+            topics = {topic for sources in _SOURCES.values() for topic, *_ in sources}
+            log: Any = ULog(file, [*topics, "actuator_motors"])
             log.is_cut = file.is_cut
             return log
     except Exception as error:
@@ -165,8 +163,8 @@ def _valid(*flags: str) -> Change:
 def _in_odometry_world(topic: Topic, value: np.ndarray) -> np.ndarray | None:
     """Return a velocity that is in the position's world frame or in body axes, else None.
 
-    From PX4 v1.14 on, frames are 1 (north-east-down), 2 (z down with another heading) and 3 (body).
-    Before, they are 0, 1 and 3.
+    Frames are 1 (north-east-down; also 0 before PX4 v1.14), 2 (from v1.14 on: z down with another
+    heading) and 3 (body).
     """
     frame = topic.get("velocity_frame")
     since_v1_14 = "pose_frame" in topic
@@ -230,7 +228,7 @@ factor, and a change before the factor."""
 
 
 def _motor_count(parameters: Mapping[str, Any], topics: Mapping[str, Topic]) -> list[Finding]:
-    """Return a finding where the vehicle is not a quadrotor: by type, rotors and turning motors.
+    """Return a finding where type, rotors or turning motors show that it is no quadrotor.
 
     `esc_count` is not used, because it counts ESCs that are connected, with or without a motor.
     """

@@ -92,7 +92,7 @@ def _time(
 
 
 def unwrapped(time: np.ndarray) -> tuple[np.ndarray, list[Finding]]:
-    """Return times (N,) in any unit as one clock where a full counter starts again, and a finding.
+    """Return times (N,) in any unit as one clock where a full counter restarts, and a finding.
 
     A step back counts as such where the time goes on as usual after it.
     """

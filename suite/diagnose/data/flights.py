@@ -47,8 +47,9 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.rotation import rot_to_quat
 
 SLOW_WIDTH_S = 1.0
-"""Width of the bumps (smooth weights over time) where rates come from a path, which shows them only
-as means over a second [s]."""
+"""Width of the bumps (smooth weights over time) where rates come from a path [s]."""
+SMOOTH_S = 0.1
+"""Standard deviation of the Gaussian that smooths the velocity before it is differentiated [s]."""
 
 
 @dataclass(frozen=True)
@@ -147,10 +148,9 @@ def _calibrated(
 ) -> SmoothedFlight:
     """Return a flight whose model is corrected for measured rotor speeds, if these drive a torque.
 
-    Noise in a model's input makes every slope smaller (errors in variables), as more inertia or
-    less thrust would. The expected true input, given the measured one, does not (regression
-    calibration; Carroll et al. 2006, Measurement Error in Nonlinear Models, Ch. 4). The torque
-    between the rows of the log is added (see `torque_between_rows`).
+    Noise in a model's input makes every slope smaller, as more inertia would. The expected true
+    input, given the measured one, does not (regression calibration; Carroll et al. 2006,
+    Measurement Error in Nonlinear Models, Ch. 4). Torque between rows is added, too.
     """
     if view.in_world or rotors.noise is None or not len(flight.form.middle_s):
         return flight
@@ -168,7 +168,7 @@ def _calibrated(
 def _floor(view: View, flights: Sequence[SmoothedFlight], logs: Sequence[FlightLog]) -> np.ndarray:
     """Return the noise (3,) of the mean accelerations, from differences of neighbouring rows.
 
-    Only rows of the signal itself count, by `logs`, the flights before the interpolation.
+    Only the signal's own rows count, by `logs`, the flights before the interpolation.
     """
     power = []
     for flight, log in zip(flights, logs, strict=True):
@@ -190,14 +190,10 @@ def _floor(view: View, flights: Sequence[SmoothedFlight], logs: Sequence[FlightL
     return np.full(3, floor.mean()) if view.in_world else floor
 
 
-SMOOTH_S = 0.1
-"""Standard deviation of the Gaussian that smooths the velocity before it is differentiated [s]."""
-
-
 def completed(log: FlightLog) -> FlightLog:
     """Return `log` with a missing attitude from its path, and missing rates from the attitude.
 
-    A flight without position and accelerometer gets a constant pose, as only its rotation is used.
+    Without position and accelerometer only rotation is used, so the pose is constant.
 
     Raises:
         ValueError: for a log without positions and without rates.
@@ -231,10 +227,9 @@ def leaning(log: FlightLog) -> np.ndarray:
 
 
 def turning_of(time_s: np.ndarray, quat_wxyz: np.ndarray) -> np.ndarray:
-    """Return the body rates (T, 3) of attitudes (T, 4), from each row's two neighbours [rad/s].
+    """Return the body rates (T, 3) [rad/s] by the neighbours of each row of attitudes (T, 4).
 
-    Rows without an attitude are left out before. NaN in these, in the first and the last row, and
-    next to a hole.
+    NaN without an attitude, in the first and the last row that has one, and next to a hole.
     """
     rate_b = np.full((len(quat_wxyz), 3), np.nan)
     own = np.flatnonzero(np.isfinite(quat_wxyz).all(axis=1))
@@ -257,19 +252,15 @@ class ActingRotors(NamedTuple):
     each: bool
     """Whether the speed of each rotor is known. From a collective thrust only the sum is known."""
     noise: np.ndarray | None = None
-    """(N, 4) simulated noise of the same size as that of the measured speeds [rad/s]; None if the
-    speeds were not measured."""
+    """(N, 4) simulated noise like that of measured speeds [rad/s]; None without measured ones."""
     spacing_s: float = 0.0
     """Time between the rows of the measured speeds [s]."""
 
 
-def acting_rotors(
-    log: FlightLog, vehicle: Vehicle, limits: Thresholds = THRESHOLDS
-) -> ActingRotors:
-    """Return the rotor speeds of `log`, measured or from commands.
+def acting_rotors(log: FlightLog, vehicle: Vehicle, limits: Thresholds) -> ActingRotors:
+    """Return the rotor speeds of `log`, measured or from commands, in every row but in holes.
 
-    They are interpolated to every row, but not across holes (long times without a value). Commanded
-    speeds pass through the vehicle's delay and rotor lag.
+    Commanded speeds pass through the vehicle's delay and rotor lag.
 
     Raises:
         ValueError: if no signal gives the rotor speeds.
@@ -303,10 +294,9 @@ def acting_rotors(
 
 
 def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:
-    """Return the rotor speeds (N, 4) that follow commanded ones `wanted` (N, 4).
+    """Return the rotor speeds (N, 4) behind commanded ones `wanted` (N, 4); NaN where these are.
 
-    A command is held until the next row. It acts after the vehicle's delay, and the speeds follow
-    with a first-order lag. They are NaN where the command is.
+    A command holds until the next row, and acts after the vehicle's delay and first-order lag.
     """
     constants = make_plant(vehicle, LONGEST_S).constants
     command_time_s = log.time_s - float(constants.delay)

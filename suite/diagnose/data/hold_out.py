@@ -15,6 +15,9 @@ from suite.diagnose.data.view import SmoothedFlight, smoothed
 from suite.diagnose.data.windows import LENGTH_S
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
+SmoothedFlights = dict[str, list[SmoothedFlight]]
+"""Flights by name of the view."""
+
 
 def choose_held_out(
     logs: Sequence[FlightLog],
@@ -25,11 +28,9 @@ def choose_held_out(
 ) -> tuple[np.ndarray, list[str]]:
     """Return for each window (W,) whether it is fitted, and the names of the held-out flights.
 
-    `information` (W, K) is the information of each window on each of K parameters.
-
-    Held out are the flights whose information the others contain, too. So a flight with the only
-    chirp (a command of rising frequency) or the only pass near the ground is fitted. The choice
-    does not depend on the errors. Of a single flight, the end is held out.
+    `information` (W, K) is that of each window on each of K parameters. Held out are flights whose
+    information the others contain, too, so not the only chirp or the only pass near the ground. The
+    choice does not depend on the errors. Of a single flight, the end is held out.
     """
     flight = np.asarray(flight)
     numbers = list(np.unique(flight))
@@ -52,17 +53,13 @@ def choose_held_out(
     return ~np.isin(flight, held), [logs[int(k)].name for k in sorted(held)]
 
 
-SmoothedFlights = dict[str, list[SmoothedFlight]]
-"""Flights by name of the view."""
-
-
 def parted(
     flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRESHOLDS
 ) -> tuple[SmoothedFlights, SmoothedFlights, list[str], list[str]]:
     """Return fitted flights, held-out flights, names of the latter, and notes in words.
 
-    `held` are the numbers of the flights to hold out. A single flight is split in time. A second
-    view is left out, with a note, if a part of it is too short.
+    `held` are the numbers of the flights to hold out; a single flight is split in time. A second
+    view with a part that is too short is left out, with a note.
 
     Raises:
         ValueError: if a part of the first view is too short.

@@ -32,8 +32,7 @@ PIECE_S = 12.0
 WIDTH_S = 0.2
 """Forces are compared as means over this time [s]."""
 KNOT_S = 1.0
-"""Time between knots, at which the estimated tilt may change: errors of the gyro make the tilt
-error a random walk [s]."""
+"""Time between knots, at which the estimated tilt may change (a random walk) [s]."""
 WALK, LEAST_WALK = 0.02, 0.001
 """Standard deviation of the tilt's change at a knot: value before it is estimated, and smallest
 value [rad]. A gyro that was sampled without a filter, or interpolated, drifts far more than its
@@ -83,8 +82,8 @@ class InertialLog(FlightLog):
     """(N, 3, K) change of the drag's acceleration, in body axes, if one of the K parameters of the
     pose changes by its prior standard deviation [m/s^2]."""
     vel_noise_b: np.ndarray | None = None
-    """(N, 3, `DRAWS`) random draws of the velocity's error in body axes [m/s]. The tilt's random
-    walk causes this error."""
+    """(N, 3, `DRAWS`) draws of the velocity's error, by the tilt's random walk, in body axes
+    [m/s]."""
 
 
 def specific_force_w(log: FlightLog) -> np.ndarray | None:
@@ -107,9 +106,9 @@ def posed(logs: Sequence[FlightLog]) -> list[FlightLog]:
 def _fitted(flights: Sequence[Sequence[_Piece]]) -> np.ndarray:
     """Fit the parameters of all pieces in place, and return the drag (3,) that they share.
 
-    The start of a piece stays fixed while the parameters of the previous piece change: coupled
-    starts make the rounds diverge in long flights. The noise of the force and the random walk of
-    the tilt are estimated as well, the walk by expectation maximisation (Dempster et al. 1977).
+    A piece's start stays fixed: coupled starts make the rounds diverge in long flights. Noise of
+    the force and random walk of the tilt are estimated as well, the walk by expectation
+    maximisation (Dempster et al. 1977).
     """
     drag, noise = DRAG, FORCE_NOISE
     pieces = [piece for flight in flights for piece in flight]
@@ -237,10 +236,7 @@ class _Piece:
         return rot_w, self.vel + vel + moved
 
     def off(self, drag: np.ndarray, rot_w: np.ndarray, vel_w: np.ndarray) -> np.ndarray:
-        """Return the residuals (M, 2) of the mean forces along body x and y for `drag` [m/s^2].
-
-        A residual is the measured mean force minus the force of the drag at the pose of `flown`.
-        """
+        """Return the residuals (M, 2) of mean forces along body x and y [m/s^2] for `drag`."""
         vel_b = (np.swapaxes(rot_w, 1, 2) @ vel_w[..., None])[:, :2, 0]
         drag_xy = drag[:2] + drag[2] * np.linalg.norm(vel_w, axis=1)[:, None]
         return self.means(self.acc_b[:, :2] - self.numbers[9:11] + drag_xy * vel_b)
@@ -248,8 +244,8 @@ class _Piece:
     def sides(self, drag: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the linear equations of a round: their matrix (R, P + 3) and right side (R,).
 
-        Their unknowns are the changes of the P parameters and of the three coefficients of the
-        drag. The first rows are the mean forces, the last P rows the priors of the parameters.
+        Unknown are the changes of the P parameters and of the drag's coefficients. The first rows
+        are the mean forces, the last P rows the priors of the parameters.
         """
         rot_w, vel_w = self.flown()
         to_body = np.swapaxes(rot_w, 1, 2)
@@ -287,15 +283,11 @@ class _Piece:
         count = len(self.time_s)
         each = np.broadcast_to(np.eye(3), (count, 3, 3))
         force_w = self._force_w(rot_w)[:, :, None]
-        tilts = np.concatenate([each, -self._integral(rot_w)], axis=2)  # by tilt and gyro bias
-        by_tilt, by_gyro = np.split(self._integral(np.cross(tilts, force_w, axis=1)), 2, axis=2)
-        by_walk = [
-            np.where((np.arange(count) >= knot)[:, None, None], by_tilt - by_tilt[knot], 0.0)[
-                ..., :2
-            ]
-            for knot in self.knots
-        ]
         by_bias = -self._integral(rot_w)
+        tilts = np.concatenate([each, by_bias], axis=2)  # by tilt and gyro bias
+        by_tilt, by_gyro = np.split(self._integral(np.cross(tilts, force_w, axis=1)), 2, axis=2)
+        row, by_xy = np.arange(count)[:, None, None], by_tilt[..., :2]
+        by_walk = [np.where(row >= knot, by_xy - by_xy[knot], 0.0) for knot in self.knots]
         return np.concatenate([by_tilt, each, by_gyro, by_bias, *by_walk], axis=2)
 
 

@@ -31,8 +31,7 @@ MISFIT_TIMES_S = tuple(np.geomspace(0.03, 1.0, 6).tolist())
 DRIFTS = (0.0, *np.logspace(-3.0, 5.0, 17).tolist())
 """Tested sizes of the model's error: its variance after a second over the variance of the noise."""
 ESTIMATED = ("position", "attitude", "velocity")
-"""Groups of channels that come from one state estimator and have the same T. The noise of other
-sensors is white."""
+"""Groups of channels of one state estimator, which have the same T; other noise is white."""
 INTEGRATED = {"position": 2, "attitude": 2, "velocity": 1}
 """Group of channels -> how many times a force or torque is integrated to give it; others: 0."""
 LEAST_ROWS = 30
@@ -107,8 +106,7 @@ def measured_noise(linear: Linearisation, limits: Thresholds = THRESHOLDS) -> No
 def residual_as_noise(linear: Linearisation, limits: Thresholds = THRESHOLDS) -> Noise:
     """Return the noise if the whole residual counts as noise, including the model's error.
 
-    It is used where even the best model does not fit: intervals then allow for the bias that the
-    wrong model causes.
+    Intervals then allow for the bias by a model that does not fit.
     """
     linear, sigma = _without_start(linear, limits)
     coloured = {}
@@ -125,9 +123,9 @@ def residual_as_noise(linear: Linearisation, limits: Thresholds = THRESHOLDS) ->
 
 
 def colour_filter(noise: Noise, name: str, windows: FlightWindows) -> np.ndarray:
-    """Return matrices (W, N, N) that make the rows of the group `name` independent.
+    """Return matrices (W, N, N) that make rows over their standard deviation independent.
 
-    They apply to rows over their standard deviation, and leave those without a value unchanged.
+    Rows of the group `name` without a value stay unchanged.
     """
     valid = np.asarray(np.all(windows.valid[..., SLICES[name]], axis=-1))
     correlation = _correlation(np.asarray(windows.row_s), *noise.coloured[name])
@@ -145,10 +143,7 @@ def _correlation(time_s: np.ndarray, share: float, lasts_s: float) -> np.ndarray
 
 
 def _without_start(linear: Linearisation, limits: Thresholds) -> tuple[Linearisation, np.ndarray]:
-    """Return the residuals without what an error of each window's start state explains.
-
-    They are weighted by the noise (19,) of the residuals with it, which is returned as well.
-    """
+    """Return the residuals without what errors of start states explain, and their noise (19,)."""
     residual, first = linear.residual, linear.slope.shape[-1] - linear.offset.shape[1]
     slope = linear.slope[..., first : first + STATE]
     sigma = noise_of(residual, linear.windows, limits=limits)
@@ -165,10 +160,9 @@ def _without_start(linear: Linearisation, limits: Thresholds) -> tuple[Linearisa
 def _stretches(
     linear: Linearisation, sigma: np.ndarray, names: Iterable[str], limits: Thresholds
 ) -> dict[str, _Stretches]:
-    """Return the stretches of the residuals, by group of channels.
+    """Return the stretches of the residuals, by group of channels in `names` with enough rows.
 
-    They are those of the groups in `names` that have enough rows. All stretches of a group get the
-    same number of rows: that which nine of ten usable windows have.
+    All stretches of a group get the number of rows that nine of ten usable windows have.
     """
     windows, groups = linear.windows, {}
     for name in names:
@@ -198,10 +192,7 @@ def _stretches(
 
 
 def _drift_covariance(time_s: np.ndarray, integrations: int) -> np.ndarray:
-    """Return the covariance (N, N) of white noise that is integrated once or twice; else zeros.
-
-    The variance after a second is 1.
-    """
+    """Return the covariance (N, N), 1 after 1 s, of white noise integrated 1 or 2 times; else 0."""
     early, late = np.minimum.outer(time_s, time_s), np.maximum.outer(time_s, time_s)
     if integrations == 2:
         return 0.5 * early**2 * (3.0 * late - early)
@@ -211,8 +202,8 @@ def _drift_covariance(time_s: np.ndarray, integrations: int) -> np.ndarray:
 def _without_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.ndarray, int, float]:
     """Return the energy (V * C,) without the polynomial, its freedom, and half a log-determinant.
 
-    The energy is the sum of squares of each column after rows are whitened by `process`; the
-    log-determinant is a term of the restricted likelihood.
+    The energy is that of each column whitened by `process`; the log-determinant is a term of the
+    restricted likelihood.
     """
     correlation = _correlation(stretches.time_s, process.share, process.lasts_s)
     lower = np.linalg.cholesky(correlation + process.drift * stretches.drift)
@@ -232,8 +223,8 @@ def _fit_by_time(
 ) -> list[tuple[_Process, float]]:
     """Return for each T in `times_s` the most likely process, and its gain over white noise.
 
-    The gain is a difference of log-likelihoods. A process with a drift (an error of the model) is
-    chosen only if its likelihood is clearly higher than without it.
+    The gain is a difference of log-likelihoods. A process with a drift (error of the model) has to
+    be clearly more likely than without it.
     """
 
     def score(process: _Process) -> float:
@@ -286,8 +277,7 @@ def _with_drift(
 def rotor_noise(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> float:
     """Return an upper limit of the noise of measured rotor speeds that are an input [rad/s].
 
-    An input has no residuals, so the polynomial is subtracted from the speeds themselves. True
-    changes of the speeds that are too fast for it count as noise; hence an upper limit.
+    An input has no residuals, so fast changes of the speeds themselves count as noise.
     """
     rotors = SLICES["rotor speed"]
     others = ((0, 0), (0, 0), (rotors.start, 0))  # the channels before the rotor speeds
@@ -304,9 +294,8 @@ def noise_of(
 ) -> np.ndarray:
     """Return the standard deviation (19,) of each channel's noise in `residual` (W, N, 19).
 
-    NaN where nothing was measured. A channel with too few rows in every window gets the RMS of its
-    residuals, which is an upper limit. One polynomial is subtracted from `rows_together` rows of a
-    channel, by default `limits.noise_rows`, or from all rows of a window with fewer rows.
+    NaN where nothing was measured. A channel with too few rows in every window gets its RMS, an
+    upper limit. A polynomial is subtracted from (by default `limits.noise_rows`) rows together.
     """
     block_rows, degree = rows_together or limits.noise_rows, limits.noise_degree
     power: list[list[float]] = [[] for _ in range(CHANNELS)]
@@ -353,10 +342,7 @@ def typical_variance(energy: np.ndarray, freedom: np.ndarray | int) -> np.ndarra
 
 
 def noise_like(speed: np.ndarray, limits: Thresholds = THRESHOLDS) -> np.ndarray:
-    """Return simulated noise (T, R) of the same size as the noise of rotor speeds `speed` (T, R).
-
-    It is zero with too few rows, and NaN where the speed is NaN.
-    """
+    """Return noise (T, R) like that of rotor speeds `speed` (T, R), NaN where `speed` is NaN."""
     draw = np.random.default_rng(0).standard_normal(speed.shape)
     noise = np.full(speed.shape, np.nan)
     block, degree = limits.rotor_noise_rows, limits.noise_degree

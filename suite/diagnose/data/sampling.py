@@ -31,11 +31,7 @@ HOLE_STEPS = 4.0
 
 
 def on_every_row(log: FlightLog, limits: Thresholds = THRESHOLDS) -> FlightLog:
-    """Return `log` with a value of every signal in every row, except in holes.
-
-    Each signal is interpolated or held, see `MEASURED` and `HELD`. A log whose signals have values
-    in all rows is returned unchanged.
-    """
+    """Return `log` with every signal in every row, except in holes (see `MEASURED`, `HELD`)."""
     filled: dict[str, Any] = {}
     for name in (*MEASURED, *HELD):
         values = getattr(log, name)
@@ -72,10 +68,9 @@ def with_fewer_rows(
 ) -> tuple[list[FlightLog], list[str]]:
     """Return `logs` with about `limits.most_rows` rows, and a note if rows were left out.
 
-    Of each signal the first value of every n rows is used, and more of a slow signal, so that its
-    values are at most `SPARSEST_S` apart. The signals are thinned one by one, because each may have
-    values in other rows. Rates and accelerations are averaged about the rows that remain, because
-    vibrations would otherwise alias (look like slow motion).
+    Each signal is thinned alone, as each may have values in other rows: the first value of every n
+    rows, and more of a slow signal, at most `SPARSEST_S` apart. Rates and accelerations are
+    averaged about the rows that remain, because vibrations would otherwise alias.
     """
     count = sum(len(log.time_s) for log in logs)
     # -(-a // b) is a / b, rounded up.
@@ -119,18 +114,15 @@ def with_fewer_rows(
 
 
 def own_spacing_s(time_s: np.ndarray, values: np.ndarray) -> float:
-    """Return the median time [s] between the rows of the slowest column of `values` (T, K).
-
-    It is infinite if a column has values in fewer than two rows.
-    """
+    """Return the median time [s] between rows of the slowest column of `values` (T, K), or inf."""
     rows = [time_s[np.isfinite(column)] for column in values.T]
     return max(float(np.median(np.diff(t))) if len(t) > 1 else np.inf for t in rows)
 
 
 def longest_gap_s(time_s: np.ndarray, since_s: float, until_s: float) -> float:
-    """Return the longest time [s] between rows, at `time_s` (T,), from `since_s` to `until_s`.
+    """Return the longest time [s] between rows at `time_s` (T,) from `since_s` to `until_s`.
 
-    The row before `since_s` counts as the first one, and the time after the last row counts.
+    The row before `since_s` counts, and so does the time after the last row.
     """
     first_row = max(int(np.searchsorted(time_s, since_s + 1e-9)) - 1, 0)
     rows_s = time_s[first_row : np.searchsorted(time_s, until_s + 1e-9)]
@@ -175,10 +167,9 @@ def _filled(time_s: np.ndarray, column: np.ndarray, hole_s: float, held: bool) -
 
 
 def in_hole(at_s: np.ndarray, time_s: np.ndarray, hole_s: float | None = None) -> np.ndarray:
-    """Return whether each of the times `at_s` (S,) is in a hole of a signal, or outside its rows.
+    """Return whether each of `at_s` (S,) is in a hole of rows at `time_s` (R,) or outside them.
 
-    `time_s` (R,) are the times of the signal's own rows. Rows further apart than `hole_s` [s] are a
-    hole; by default, it is `HOLE_STEPS` of their median steps.
+    Rows further apart than `hole_s` [s] (default: `HOLE_STEPS` median steps) are a hole.
     """
     if len(time_s) < 2:
         return np.ones(len(at_s), bool)
@@ -208,8 +199,7 @@ def interpolate(
 ) -> np.ndarray:
     """Return `series` (T, K) at the times `at_s` (S,), interpolated between finite values: (S, K).
 
-    `time_s` (T,) are the times of its rows. A column without any finite value becomes 0. With
-    `holes`, a column is NaN in its holes of `HOLE_STEPS` median steps, and outside its own rows.
+    A column without any becomes 0. With `holes`, it is NaN in holes (`in_hole`).
     """
     columns = []
     for column in series.T:
@@ -225,7 +215,7 @@ def interpolate(
 def hold(at_s: np.ndarray, time_s: np.ndarray, series: np.ndarray) -> np.ndarray:
     """Return the last finite row of `series` (T, K) at each of the times `at_s` (S,): (S, K).
 
-    Before the first finite row its value is used. Without any finite row the result is NaN.
+    Before the first finite row its value is used; without any it is NaN.
     """
     finite = np.flatnonzero(np.isfinite(series).all(axis=1))
     if not len(finite):
@@ -243,10 +233,7 @@ def voltage_drop(log: FlightLog, at_s: np.ndarray) -> np.ndarray:
 
 
 def follow_lag(commanded: np.ndarray, dt: float, time_constant: float) -> np.ndarray:
-    """Return the rotor speeds (S, 4) at the end of each step `dt` [s], behind `commanded` ones.
-
-    They follow with a first-order lag of `time_constant` [s], from the first commanded speeds on.
-    """
+    """Return rotor speeds (S, 4) after each step `dt` [s], behind `commanded` ones by a lag [s]."""
     decay = np.exp(-dt / time_constant) if time_constant > 1e-6 else 0.0
     filtered, _ = lfilter([1.0 - decay], [1.0, -decay], commanded, axis=0, zi=decay * commanded[:1])
     return np.asarray(filtered)

@@ -21,8 +21,7 @@ from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
 
 LONGEST_S = 0.002
-"""Approximate length of the longest step [s]. With it the integrator's error over a second is far
-below the noise."""
+"""Length of the longest step [s]: the integrator's error over 1 s is far below the noise."""
 LOST = 1.75
 """Between rows that are further apart than this multiple of the usual spacing, rows were lost."""
 
@@ -36,10 +35,7 @@ def step_s(vehicle: Vehicle) -> float:
 
 
 def has_firmware_loop(vehicle: Vehicle) -> bool:
-    """Return whether the vehicle has the rate loop of a firmware, with integrators and filters.
-
-    No log contains the state of integrators and filters at the start of a window.
-    """
+    """Return whether the rate loop has integrators and filters, whose state no log contains."""
     return vehicle.controller.kind != NOMINAL
 
 
@@ -57,8 +53,7 @@ class StepGrid(NamedTuple):
 def step_grid(row_s: np.ndarray, period_s: float, longest_s: float = LONGEST_S) -> StepGrid:
     """Return steps from the first to the last of `row_s` (R,), R >= 2, when commands may change.
 
-    The vehicle's rate loop restarts its `period_s` [s] at each row. `longest_s` is the approximate
-    length of the longest step [s].
+    The vehicle's rate loop restarts its `period_s` at each row. Steps last about `longest_s` [s].
     """
     row_s = np.asarray(row_s, dtype=float)
     spacing = np.diff(row_s)
@@ -88,19 +83,16 @@ def step_grid(row_s: np.ndarray, period_s: float, longest_s: float = LONGEST_S) 
 def with_lost_rows(time_s: np.ndarray, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return `time_s` (R,) and `command` (R, K) with the lost rows, interpolated linearly.
 
-    The vehicle received a command at each lost row, too. If the last logged command were held
-    instead, changes would come too late.
+    The vehicle received commands there, too: holding the last logged one would be too late.
     """
     spacing = np.diff(time_s)
     if not len(spacing):
         return time_s, command
     usual_spacing = float(np.median(spacing))
-    missing = np.where(
-        spacing > LOST * usual_spacing, np.rint(spacing / usual_spacing) - 1.0, 0.0
-    ).astype(int)
-    if not missing.any():
+    has_lost = spacing > LOST * usual_spacing
+    if not has_lost.any():
         return time_s, command
-    count = missing + 1
+    count = np.where(has_lost, np.rint(spacing / usual_spacing), 1.0).astype(int)
     share = np.concatenate([np.arange(n) / n for n in count] + [[0.0]])
     before = np.append(np.repeat(np.arange(len(spacing)), count), len(spacing))
     after = np.minimum(before + 1, len(spacing))
@@ -192,10 +184,7 @@ def torque_between_rows(vehicle: Vehicle, step_s: float) -> np.ndarray:
 
 
 def rows_show_torque(vehicle: Vehicle, step_s: float) -> bool:
-    """Return whether rotor speeds `step_s` [s] apart are dense enough to interpolate between them.
-
-    Those of a firmware's loop always are, as they are smooth.
-    """
+    """Return whether rows `step_s` [s] apart show the torque, as a firmware's loop always does."""
     return has_firmware_loop(vehicle) or step_s <= vehicle.rotors.time_constant
 
 
@@ -216,10 +205,9 @@ def rotor_mixer(vehicle: Vehicle) -> np.ndarray:
 def start_rotor_error(time_s: np.ndarray, rate_b: np.ndarray, vehicle: Vehicle) -> float:
     """Return the RMS error [rad/s] of the rotor speeds that the rate loop gives at measured rates.
 
-    The rates `rate_b` (N, 3) are interpolated between rows, which causes an error of the commanded
-    speeds. To estimate it, each row is compared with the interpolation between the rows before and
-    after it. The error between neighbouring rows is smaller: a quarter of that if rates are smooth,
-    about all of it if they are noise. Half is used.
+    The rates `rate_b` (N, 3) are interpolated between rows. Each row is compared with the
+    interpolation between its neighbours. Between neighbouring rows the error is a quarter of that
+    if rates are smooth, about all of it if they are noise; half is used.
     """
     if len(time_s) < 3:
         return LEAST_START_ERROR
@@ -237,10 +225,9 @@ def start_rotor_error(time_s: np.ndarray, rate_b: np.ndarray, vehicle: Vehicle) 
 def wrench_difference(
     measured: np.ndarray, commanded: np.ndarray, vehicle: Vehicle
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the accelerations by `measured` rotor speeds less those by `commanded` ones.
+    """Return the accelerations by `measured` less those by `commanded` rotor speeds (N, 4) [rad/s].
 
-    Both speeds are (N, 4) [rad/s]. The result is the difference of thrust over mass (N,) [m/s^2],
-    and that of the angular acceleration in body axes (N, 3) [rad/s^2].
+    They are thrust over mass (N,) [m/s^2], and angular in body axes (N, 3) [rad/s^2].
     """
     thrust = vehicle.rotors.thrust_coefficient * (measured**2 - commanded**2)
     wrench = thrust @ rotor_mixer(vehicle).T

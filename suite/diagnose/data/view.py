@@ -25,6 +25,9 @@ from suite.diagnose.data.sampling import voltage_drop
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.scene import Array
 
+LEAST_ROWS = 4
+"""Smallest number of steps from row to row in a bump."""
+
 
 class FlightRows(NamedTuple):
     """N rows of one flight. A missing signal has a filled-in value, and its row is not `good`."""
@@ -54,10 +57,7 @@ class FlightRows(NamedTuple):
 def rows_of(
     log: FlightLog, vehicle: Vehicle, rotor_speed: np.ndarray, limits: Thresholds = THRESHOLDS
 ) -> FlightRows:
-    """Return the rows of `log` with rotor speeds `rotor_speed` (N, 4) [rad/s].
-
-    Rows on the ground, and rows near them in time, are not `good`.
-    """
+    """Return the rows of `log` with rotor speeds (N, 4) [rad/s]; near the ground none is `good`."""
     rot_w = log.rot_w
     signals = (log.pos_w, log.vel_w, log.rate_b, rotor_speed)
     good = np.isfinite(np.concatenate(signals, axis=1)).all(axis=1)
@@ -116,10 +116,7 @@ def _near(time_s: np.ndarray, marked: np.ndarray, margin_s: float) -> np.ndarray
     if not marked.any():
         return marked
     marked_s = time_s[marked]
-    place = np.searchsorted(marked_s, time_s)
-    before = np.abs(time_s - marked_s[np.maximum(place - 1, 0)])
-    after = np.abs(time_s - marked_s[np.minimum(place, len(marked_s) - 1)])
-    return np.minimum(before, after) <= margin_s
+    return np.abs(time_s - marked_s[nearest(marked_s, time_s)]) <= margin_s
 
 
 @dataclass(frozen=True)
@@ -195,8 +192,8 @@ def weak_form(
     """Return bumps of `width_s`, half a width apart, without a bad row or a hole inside.
 
     Rows are at `time_s` (N,) [s]; `good` (N,) bool says which can be used, and those further apart
-    than `hole_s` [s] are a hole. With `slope`, the weight is -w'(t) in place of the bump w(t). Then
-    `mean` takes accelerations to means of their derivatives, and `change` takes positions to mean
+    than `hole_s` are a hole. With `slope`, the weight is -w'(t) in place of the bump w(t): `mean`
+    takes accelerations to means of their derivatives, and `change` takes positions to mean
     accelerations.
     """
     span = np.diff(time_s)
@@ -242,7 +239,3 @@ def weak_form(
     middle_s = np.array(centres)
     middle_row = nearest(time_s, middle_s)
     return WeakForm(middle_s, middle_row, matrix(-bump, bump), matrix(weight, weight))
-
-
-LEAST_ROWS = 4
-"""Smallest number of steps from row to row in a bump."""

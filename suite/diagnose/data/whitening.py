@@ -27,15 +27,13 @@ class Whitening(NamedTuple):
     weight: np.ndarray
     """(W, N, 19) 1 / noise; 0 where nothing was measured."""
     prior: np.ndarray
-    """(F - 12,) 1 / standard deviation of each error of the rotor speeds. The last F - 12 of the M
-    rows hold this prior."""
+    """(F - 12,) 1 / standard deviation of each rotor-speed error; the last F - 12 rows hold it."""
     start: np.ndarray
     """(W, M, F) orthonormal basis of the changes of the rows by the start numbers."""
     upper: np.ndarray
     """(W, F, F) upper triangular matrix from start numbers to coordinates in that basis."""
     slow: np.ndarray
-    """(W, 19, N, L) polynomials of unit length over the rows of each channel: errors that change
-    slowly over a window."""
+    """(W, 19, N, L) polynomials of unit length over the rows of each channel (slow errors)."""
     slow_freedom: np.ndarray
     """(W, 19) sum of squares along these polynomials that noise alone gives, by channel."""
     filters: Mapping[str, np.ndarray]
@@ -43,9 +41,7 @@ class Whitening(NamedTuple):
     independent, after a division by the standard deviation."""
 
 
-def make_whitening(
-    linear: Linearisation, noise: Noise, limits: Thresholds = THRESHOLDS
-) -> Whitening:
+def make_whitening(linear: Linearisation, noise: Noise, limits: Thresholds) -> Whitening:
     """Return the whitening of the windows in `linear` by `noise`.
 
     The last F slopes in `linear` must be those along the start numbers.
@@ -80,9 +76,9 @@ def make_whitening(
 def orthonormal(matrix: np.ndarray, singular: float) -> tuple[np.ndarray, np.ndarray]:
     """Return Q and upper triangular R of `matrix` (..., M, F), M much larger than F.
 
-    Cholesky's factor of the Gram matrix is used twice (CholeskyQR2; Yamamoto et al. 2015), since it
-    is faster for so tall a matrix than Householder's reflections. The latter are used where a
-    column nearly depends on the others, with an independent share of less than `singular`.
+    Cholesky's factor of the Gram matrix is used twice (CholeskyQR2; Yamamoto et al. 2015), faster
+    than Householder's reflections. These are used where a column has an independent share of less
+    than `singular`.
     """
     size = np.maximum(np.linalg.norm(matrix, axis=-2, keepdims=True), 1e-300)
     base, upper = matrix / size, np.swapaxes(size, -1, -2) * np.eye(matrix.shape[-1])
@@ -101,9 +97,8 @@ def orthonormal(matrix: np.ndarray, singular: float) -> tuple[np.ndarray, np.nda
 def rotor_spread(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> float:
     """Return the standard deviation of the rotor speeds' errors as nuisance parameters [rad/s].
 
-    If measured speeds are the input, their errors are linear between knots 0.1 s apart. White noise
-    of the rows is equivalent to knot errors that are smaller by the root of the number of rows per
-    knot. Otherwise the errors are those at the start of each window.
+    Errors of measured speeds as the input are linear between knots 0.1 s apart. They are smaller
+    than the white noise of the rows by the root of the rows per knot.
     """
     start = np.asarray(windows.start_rotor_error)
     if start.all():

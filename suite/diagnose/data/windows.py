@@ -192,10 +192,7 @@ def cut(
 
 
 def take(data: Any, chosen: Array) -> Any:
-    """Return the `chosen` windows of `data`, a named tuple of arrays (W, ...), such as windows.
-
-    They are chosen by indices or by (W,) bool. A field may be None, or such a tuple itself.
-    """
+    """Return the `chosen` windows (indices, or (W,) bool) of a tree of arrays (W, ...) and None."""
     return jax.tree.map(lambda field: np.asarray(field)[chosen], data)
 
 
@@ -244,8 +241,7 @@ class _Input(NamedTuple):
 def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, stride: int) -> _Input:
     """Return the inputs of the window at `row`; if there are no commands, those of a hover.
 
-    At most `ROWS` rows are compared. Every `stride`-th command is used, and held until the next one
-    that is.
+    At most `ROWS` rows are compared. Only every `stride`-th command is used.
     """
     time_s, begin_s, period_s = log.time_s, log.time_s[row], 1.0 / vehicle.controller.frequency
     rows = np.flatnonzero((time_s >= begin_s - 1e-9) & (time_s <= begin_s + LENGTH_S + 1e-9))
@@ -272,10 +268,7 @@ def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, stri
 
 
 def _of_one_shape(inputs: Sequence[_Input], like: FlightWindows | None) -> list[_Input]:
-    """Return `inputs` padded to equal numbers of steps and commands, or those of `like`.
-
-    There are few such numbers, for few compilations.
-    """
+    """Return `inputs` padded to the sizes of `like`, or to one of few sizes (to compile rarely)."""
 
     def padded_size(counts: Iterable[int], sizes: Sequence[int]) -> int:
         count = max(counts)
@@ -310,10 +303,10 @@ def _window(
     inputs: _Input,
     stride: int,
 ) -> FlightWindows:
-    """Return the window (without the axis W) that starts at `row` of `log`.
+    """Return the window (without the axis W) at `row` of `log`, whose `state` is in every row.
 
-    `state` is the log with a state in every row. If measured rotor speeds are the input, they are
-    `rotor_spacing_s` [s] apart, and every `stride`-th is used; else it is None.
+    If measured rotor speeds are the input, they are `rotor_spacing_s` [s] apart, and every
+    `stride`-th is used; else it is None.
     """
     time_s, begin_s = log.time_s, log.time_s[row]
     rows, before, window = inputs.rows, inputs.burn_in, inputs.window

@@ -23,16 +23,15 @@ class Estimate(NamedTuple):
     theta: np.ndarray
     """(P,) vector of the model's parameters."""
     free: np.ndarray = np.zeros((0, 0))
-    """(B, F) nuisance parameters of B stretches, such as the start state of a simulated stretch;
-    (0, 0) without any."""
+    """(B, F) nuisance parameters of B stretches, such as start states; (0, 0) without any."""
 
 
 @dataclass(frozen=True)
 class Block:
     """B stretches of M rows, linearised at one estimate, in units of independent noise.
 
-    What a change of the nuisance parameters of a stretch could explain is removed (projected out)
-    from its rows. Stretches with fewer rows are padded with zeros.
+    What nuisance parameters of a stretch could explain is projected out of its rows. Stretches with
+    fewer rows are padded with zeros.
     """
 
     residual: np.ndarray
@@ -81,8 +80,8 @@ class NormalEquations(NamedTuple):
     def columns_of(self, candidate: Candidate) -> list[int]:
         """Return the columns of the parameters of `candidate`.
 
-        Of a parameter with two columns, a composite (several effects as one hypothesis) uses the
-        second one, which is computed as if the other effects were there.
+        A composite (several effects) uses the second column of a parameter that has two: that is
+        computed as if the other effects were there.
         """
         place = {number: column for column, number in enumerate(self.along)}
         if not candidate.parts:
@@ -108,10 +107,7 @@ class NormalEquations(NamedTuple):
         return self.hessian[rows].sum(axis=0), self.gradient[rows].sum(axis=0)
 
     def chi2_at(self, change: np.ndarray) -> np.ndarray:
-        """Return the squared error (B,) of each stretch after a change (K,) of the parameters.
-
-        The change may differ between the stretches, (B, K).
-        """
+        """Return the squared error (B,) of each stretch after a change (K,) or (B, K)."""
         change = np.broadcast_to(change, self.gradient.shape)
         quadratic = np.einsum("bi,bij,bj->b", change, self.hessian, change)
         return self.chi2 - 2.0 * (self.gradient * change).sum(axis=1) + quadratic
@@ -140,11 +136,10 @@ def without_nuisance(
     flight: np.ndarray,
     start_s: np.ndarray,
 ) -> Block:
-    """Return the block of rows that have no nuisance parameters.
+    """Return the block of rows that have no nuisance parameters, see `Block`.
 
     `residual` (R, C) and `slope` (R, C, K), of R rows and C channels, are divided by the noise.
-    `stretch` (R,) is the number of each row's stretch: 0, 1, 2 and so on, none left out. See
-    `Block` for the others.
+    `stretch` (R,) is the number of each row's stretch: 0, 1, 2 and so on, none left out.
     """
     count, rows = len(flight), np.bincount(stretch)
     order = np.argsort(stretch, kind="stable")

@@ -30,8 +30,7 @@ class Composite(NamedTuple):
     about: str
     """Description for people."""
     carried: str | None = None
-    """Name of the effect that only acts through the others (carried by them); None where each acts
-    on its own."""
+    """Name of the effect that only acts through (is carried by) the others; None without one."""
 
 
 WIND, PASSED_ON = "constant_wind", "a wind and the drag that passes it on"
@@ -68,10 +67,7 @@ def carried(among: Sequence[Candidate]) -> list[Candidate]:
 
 
 def in_words(sets: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return lines for people on the composites in a diagnosis.
-
-    Each of `sets` has the name of a named effect, and then the names of its alternatives.
-    """
+    """Return lines on composites; each of `sets` is a named effect and then its alternatives."""
     names, alternatives = {one[0] for one in sets}, {name for one in sets for name in one[1:]}
     lines = []
     for composite in COMPOSITES:
@@ -90,9 +86,9 @@ def inactive_at(
 ) -> tuple[tuple[int, ...], np.ndarray] | None:
     """Return the parameters that change nothing at `theta` (P,), such as a wind without a drag.
 
-    They act only through other effects. Returned are their places, and all parameters (P,) with
-    usual sizes of these effects; None where there are none. If several composites contain them, the
-    first one counts. `acts` (P,) bool marks the parameters that change the model at `theta`.
+    Returned are their places, and all parameters (P,) with usual sizes of the effects through which
+    they act; None where there are none. The first composite that contains them counts. `acts` (P,)
+    bool marks the parameters that change the model at `theta`.
     """
     for composite in COMPOSITES:
         composite_candidate = next((c for c in among if c.name == JOIN.join(composite.parts)), None)
@@ -124,12 +120,10 @@ def begin_of(
     """Return the parameters (P,) with which the fit of a composite begins.
 
     A linear fit at `theta` (P,) identifies a drag, and the product of drag and wind. The wind is
-    that product over the drag, relative to the drag's usual size. If the drag of the linear fit is
-    too small, the fit begins with `LEAST_USUAL` of the usual drag.
-
-    `inactive` are the places of the parameters of `candidate` that act through the others. Their
-    slopes were computed with the others at their usual size. `change` (P,) is the change of all
-    parameters by the linear fit, and `information` (P,) that of the flights on each parameter.
+    that product over the drag, relative to the drag's usual size, of which at least `LEAST_USUAL`
+    is used. `inactive` are the places of the wind; its slopes were computed with the usual drag.
+    `change` (P,) is the change of all parameters by the linear fit, and `information` (P,) that of
+    the flights on each.
     """
     begin = np.clip(theta + change, space.array("low"), space.array("high"))
     carrier_indices = np.array([i for i in candidate.indices if i not in inactive])

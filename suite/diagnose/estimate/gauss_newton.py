@@ -17,14 +17,24 @@ from scipy.stats import t as student
 from suite.diagnose.estimate.block import NormalEquations
 from suite.diagnose.estimate.parameters import ParameterSpace
 
+Z95 = 1.96
+"""Half-width of a normal 95 % interval, in standard deviations."""
+TINY = 1e-12
+"""Smaller information counts as none."""
+RIDGE = 1e-9
+"""Added to the scaled information. So a parameter that is not identifiable gets a wide interval; a
+pseudo-inverse would give it a narrow one."""
+FEWEST = 3
+"""Smallest number of flights whose differences are tested."""
+
 
 def solve(
     hessian: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray, scale: np.ndarray
 ) -> np.ndarray:
     """Return the change (K,) of K parameters, from `low` to `high`, that lowers chi-square most.
 
-    `hessian` is J'J and `gradient` J'r. `scale` (K,) is the usual size of each parameter: in these
-    units the equations are well conditioned.
+    `hessian` is J'J and `gradient` J'r. In units of `scale` (K,), the usual size of each parameter,
+    the equations are well conditioned.
 
     Raises:
         ValueError: for values that are not finite.
@@ -56,8 +66,8 @@ def gauss_newton_step(
 ) -> tuple[np.ndarray, float]:
     """Return the best change (K,) of the parameters, and the expected fall of chi-square.
 
-    `equations` are along the K fitted parameters, computed at `theta` (P,). `inside` (B,) bool says
-    which stretches are fitted; all are if not given.
+    `equations` are along the K fitted parameters, computed at `theta` (P,). Only the stretches
+    `inside` (B,) bool are fitted, if given.
     """
     hessian, gradient = equations.sums(inside)
     indices = np.array(equations.along, dtype=int)
@@ -71,20 +81,9 @@ def chi2_fall(
 ) -> float:
     """Return the fall of chi-square, to first order, by a fit of the parameters at `columns`."""
     fitted = equations.take(sorted(set(columns)))
-    if not fitted.gradient.shape[1] or np.einsum("bkk->", fitted.hessian) < TINY:
+    if np.einsum("bkk->", fitted.hessian) < TINY:
         return 0.0
     return gauss_newton_step(fitted, theta, space)[1]
-
-
-Z95 = 1.96
-"""Half-width of a normal 95 % interval, in standard deviations."""
-TINY = 1e-12
-"""Smaller information counts as none."""
-RIDGE = 1e-9
-"""Added to the scaled information. So a parameter that is not identifiable gets a wide interval; a
-pseudo-inverse would give it a narrow one."""
-FEWEST = 3
-"""Smallest number of flights whose differences are tested."""
 
 
 class Intervals(NamedTuple):
@@ -125,9 +124,6 @@ def intervals95(
         prior: (K,) information on each parameter in addition to that of the flights.
     """
     count, size = equations.gradient.shape
-    if not size:
-        empty = np.zeros((0, 0))
-        return Intervals(np.zeros(0), empty, empty)
     prior = np.zeros(size) if prior is None else prior
     hessian = equations.hessian.sum(axis=0) + np.diag(prior)
     gradient = equations.gradient

@@ -88,10 +88,7 @@ class ParameterSpace:
 
 
 def effects_at(layout: ParameterLayout, base: Mapping[str, Any], theta: Array) -> dict[str, Any]:
-    """Return the effects `base` with the values of `theta` (P,), numpy or JAX (also traced).
-
-    `layout` says which number of `theta` belongs to which component of which parameter.
-    """
+    """Return the effects `base` with the values of `theta` (P,), numpy or JAX (also traced)."""
     xp = theta.__array_namespace__()
     values = {name: value._asdict() for name, value in base.items()}
     place = {entry: i for i, entry in enumerate(layout)}
@@ -124,8 +121,7 @@ def refuse_own_motion(vehicle: Vehicle) -> None:
 def make_space(vehicle: Vehicle) -> ParameterSpace:
     """Return the space of all numbers that flights of `vehicle` can identify.
 
-    It does not contain random effects, effects with a state of their own, known constants, and
-    components that no flight shows.
+    It has no random effects, effects with a state, known constants, and unseen components.
 
     Raises:
         ValueError: for a vehicle whose file has an effect with a motion of its own.
@@ -192,10 +188,7 @@ def indices_of(chosen: Sequence[Candidate]) -> list[int]:
 def implausible(
     space: ParameterSpace, theta: np.ndarray, candidate: Candidate, limits: Thresholds = THRESHOLDS
 ) -> list[str]:
-    """Return a phrase for each number of `candidate` with an implausible value in `theta` (P,).
-
-    It is far above the usual range in the catalogue (see `Thresholds.implausible_times`).
-    """
+    """Return a phrase for each number of `candidate` far above its usual range in `theta` (P,)."""
     phrases = []
     for index in candidate.indices:
         entry = space.entries[index]
@@ -211,10 +204,9 @@ def implausible(
 
 
 def at_bound(space: ParameterSpace, theta: np.ndarray, candidate: Candidate) -> bool:
-    """Return whether a number of `candidate` has a value in `theta` (P,) at a physical bound.
+    """Return whether a number of `candidate` in `theta` (P,) is at a physical bound.
 
-    Bounds at which the effect is absent, or at which the vehicle file is, do not count: a drag of
-    the vehicle file may turn out to be zero.
+    Bounds at which the effect is absent, or the file is, do not count: a drag may be zero.
     """
     for index in candidate.indices:
         entry, value = space.entries[index], theta[index]
@@ -230,7 +222,7 @@ def at_bound(space: ParameterSpace, theta: np.ndarray, candidate: Candidate) -> 
 def usual_first(
     space: ParameterSpace, theta: np.ndarray, candidate: Candidate
 ) -> tuple[bool, int, int]:
-    """Return the sort key of candidates that fit equally well, each at its own fit `theta` (P,).
+    """Return the sort key of `candidate` at its fit `theta` (P,), for equally good candidates.
 
     Plausible ones come first, then single effects, then the order of the catalogue.
     """

@@ -35,18 +35,6 @@ class CandidateScore(NamedTuple):
     """Gain that the best of all candidates reaches by chance with a probability of 1 %."""
 
 
-def folds_of(flight: np.ndarray, start_s: np.ndarray, folds: int = THRESHOLDS.folds) -> np.ndarray:
-    """Return the cross-validation fold (W,) of each window: 0, 1, 2 and so on along every flight.
-
-    A fold is not a flight, because a single flight may be the only one that identifies a parameter,
-    as a chirp (a command of rising frequency) identifies the gain of a rate loop.
-    """
-    order = np.lexsort((start_s, flight))
-    fold = np.empty(len(flight), int)
-    fold[order] = np.arange(len(flight)) % folds
-    return fold
-
-
 def permutation_test(
     among: Sequence[Candidate],
     hessian: np.ndarray,
@@ -63,14 +51,13 @@ def permutation_test(
     The null is the distribution of the largest gain of all groups if each window's residual gets a
     random sign. A sign for a whole window keeps the correlation within it. First the part that the
     best group explains is subtracted (Freedman and Lane 1983), since otherwise a real effect in a
-    few windows would be part of the null. If the best group explains much, the part of groups
-    nearly as good is subtracted, too. With too few windows the null is drawn from the measured
-    noise instead.
+    few windows would be part of the null; if it explains much, so is that of groups nearly as good.
+    With too few windows the null is drawn from the measured noise instead.
 
     The columns of `hessian` (W, K, K) and `gradient` (W, K) are scaled to similar size. `groups`
-    are those of the candidates `among`. They contain the columns `always`, and gains are relative
-    to a fit of these alone. `fold` (W,) is the cross-validation fold of each window, and `room` the
-    lowest and highest change (K,) of each column.
+    are those of the candidates `among`. They contain the columns `always`; gains are relative to a
+    fit of these. `fold` (W,) is the cross-validation fold of each window, and `room` the lowest and
+    highest change (K,) of each column.
     """
     if not groups:
         return []
@@ -81,13 +68,8 @@ def permutation_test(
     low, high = unbounded if room is None else room
 
     def fitted_change(hessian: np.ndarray, gradient: np.ndarray, places: list[int]) -> np.ndarray:
-        return solve(
-            hessian[np.ix_(places, places)],
-            gradient[places],
-            low[places],
-            high[places],
-            np.ones(len(places)),
-        )
+        ends, scale = (low[places], high[places]), np.ones(len(places))
+        return solve(hessian[np.ix_(places, places)], gradient[places], *ends, scale)
 
     # In the loops below, one part of the windows is fitted and the other part (a fold) is tested.
     def gain(columns: tuple[int, ...]) -> float:
@@ -95,15 +77,12 @@ def permutation_test(
         for (fit_hessian, test_hessian), (fit_part, test_part) in zip(hessians, folds, strict=True):
             change = fitted_change(fit_hessian, gradient[fit_part].sum(0), places)
             slope = gradient[test_part].sum(0)[places]
-            total += float(
-                2 * slope @ change - change @ test_hessian[np.ix_(places, places)] @ change
-            )
+            square = change @ test_hessian[np.ix_(places, places)] @ change
+            total += float(2 * slope @ change - square)
         return total
 
     def gain_by_chance(columns: tuple[int, ...]) -> np.ndarray:
         total, places = np.zeros(draws), list(columns)
-        if not places:
-            return total
         for (fit_hessian, test_hessian), (fit_part, test_part) in zip(hessians, drawn, strict=True):
             chosen = np.ix_(places, places)
             fit_hessian, test_hessian = fit_hessian[chosen], test_hessian[chosen]
@@ -179,9 +158,6 @@ def corrected_p_values(
 
 
 def _orthonormal_basis(columns: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (M, R) of the span of `columns` (M, K).
-
-    The columns must have unit length or be 0, as smaller singular values count as dependence.
-    """
+    """Return an orthonormal basis (M, R) of `columns` (M, K), each of unit length or 0."""
     directions, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     return directions[:, sizes > 1e-6]

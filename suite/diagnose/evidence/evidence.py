@@ -18,7 +18,7 @@ import numpy as np
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.gauss_newton import gauss_newton_step, intervals95
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
-from suite.diagnose.estimate.permutation import CandidateScore, folds_of, permutation_test
+from suite.diagnose.estimate.permutation import CandidateScore, permutation_test
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 LEAST_ERROR = 1e-9
@@ -54,7 +54,7 @@ class Evidence(ABC):
         return Evaluation(self, at, self.linearise(at))
 
     def misfit_as_noise(self, best: Evaluation) -> Evidence | None:
-        """Return this evidence with the whole residual of the `best` model as its noise.
+        """Return this evidence with the residual of the `best` model as its noise.
 
         None if that residual is measurement noise only.
         """
@@ -67,13 +67,10 @@ class Evidence(ABC):
         rounds: int | None = None,
         known: Block | None = None,
     ) -> Evaluation:
-        """Fit the parameters at `indices` and the nuisance parameters of every stretch.
+        """Fit the parameters at `indices` and the nuisance parameters; return the best evaluation.
 
-        At most `rounds` Gauss-Newton steps are taken from `start`, by default those of the limits.
+        At most `rounds` Gauss-Newton steps (default: those of the limits) are taken from `start`.
         `known` is the block at `start`, if it was computed before.
-
-        Returns:
-            This evidence, evaluated at the best estimate.
         """
         limits, space, places = self.limits, self.space, np.array(indices, dtype=int)
         low, high = space.array("low")[places], space.array("high")[places]
@@ -108,18 +105,12 @@ class Evidence(ABC):
         """Argument `differ_p` of `intervals95`: 1 if each flight is one random draw, else 0."""
         return 1.0
 
-    @property
-    def name_p_value(self) -> float:
-        """Probability that a step of the search names an effect although there is none."""
-        return self.limits.name_p_value
-
     def scores(
         self, current: Evaluation, named: Sequence[int], among: Sequence[Candidate], seed: int
     ) -> list[CandidateScore]:
         """Return the scores of candidates, each fitted with the `named` parameters, best first.
 
-        `current` is this evidence, evaluated along all parameters. A candidate without any effect
-        on the flights gets no score.
+        `current` is along all parameters. A candidate without any effect on the flights has none.
         """
         equations = current.block.equations
         along = list(equations.along)
@@ -136,8 +127,15 @@ class Evidence(ABC):
         )
 
     def folds(self, block: Block) -> np.ndarray:
-        """Return the fold (B,) of each stretch; cross-validation leaves out one fold at a time."""
-        return folds_of(block.flight, block.start_s, self.limits.folds)
+        """Return the fold (B,) of each stretch; cross-validation leaves out one fold at a time.
+
+        They are 0, 1, 2 and so on along every flight. A fold is no flight, as a single one may
+        identify a parameter, as a chirp (a command of rising frequency) does a rate loop's gain.
+        """
+        order = np.lexsort((block.start_s, block.flight))
+        fold = np.empty(len(order), int)
+        fold[order] = np.arange(len(order)) % self.limits.folds
+        return fold
 
     def explained_share(
         self, before: Block, after: Evaluation, candidate: Candidate, gains: np.ndarray
@@ -178,7 +176,7 @@ def validation_groups(flight: np.ndarray) -> np.ndarray:
 def flights_agree(gains: np.ndarray) -> bool:
     """Return whether all flights, or all but one, have positive `gains` (G,).
 
-    The sum without the largest gain must be positive, too. Fewer than three flights always agree.
+    So must have their sum without the largest gain. Fewer than three flights always agree.
     """
     if len(gains) < 3:
         return True

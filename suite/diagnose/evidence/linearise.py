@@ -34,8 +34,7 @@ class VehicleArrays(NamedTuple):
     nominal: Nominal
     constants: Constants
     base: dict[str, Any]
-    """Values of every effect that depends on the state alone: neither random nor with a state of
-    its own."""
+    """Values of every effect that depends on the state alone."""
     loop: Loop | None
     """A firmware's rate loop."""
 
@@ -55,17 +54,11 @@ def linearised(
     indices: Sequence[int] | None,
     size: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values (N, ...) of a model, and their slopes (N, ..., K).
+    """Return the values (N, ...) of a model for N pieces of `data`, and their slopes (N, ..., K).
 
-    Args:
-        compiled: a jitted function of `slopes_along`.
-        given: the vehicle.
-        theta: (P,) parameters.
-        offset: (N, F) nuisance parameters of each piece of the data.
-        data: N pieces, as a named tuple of arrays (N, ...).
-        indices: K places of the directions among parameters and then nuisance parameters, or None
-            for all.
-        size: number of pieces in one call.
+    `compiled` is a jitted function of `slopes_along`, which takes `size` pieces at a time. `theta`
+    (P,) are parameters, `offset` (N, F) nuisance parameters of each piece, and `indices` K places
+    among both (parameters first), or None for all.
     """
     directions = np.eye(len(theta) + offset.shape[1])
     directions = directions if indices is None else directions[list(indices)]
@@ -84,10 +77,7 @@ def linearised(
 def batches(
     offset: np.ndarray, data: Any, size: int = BATCH
 ) -> Iterator[tuple[np.ndarray, Any, int]]:
-    """Yield (offsets, data, number) by `size`; pieces after `number` repeat the last one.
-
-    `data` is a named tuple of arrays (N, ...), such as windows.
-    """
+    """Yield (offsets, data, number) by `size`; pieces after `number` repeat the last one."""
     count = len(offset)
     for first in range(0, count, size):
         rows = np.minimum(np.arange(first, first + size), count - 1)

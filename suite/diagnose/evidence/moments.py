@@ -42,10 +42,7 @@ class ForceModel:
     """Model of a vehicle's accelerations at measured attitude, velocity, rates and rotor speeds."""
 
     def __init__(self, vehicle: Vehicle, space: ParameterSpace, voltage: bool) -> None:
-        """Prepare `vehicle` with the parameters of `space`.
-
-        `voltage` says whether the rows have a battery voltage.
-        """
+        """Prepare `vehicle`; `voltage` says whether the rows have a battery voltage."""
         self.space = space
         self._vehicle = arrays_of(vehicle, space)
         self._compiled = _accelerations(space.layout, voltage)
@@ -55,8 +52,8 @@ class ForceModel:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the accelerations (N, 6) at `theta` (P,), and their slopes (N, 6, K).
 
-        They are the linear acceleration in world axes [m/s^2], and the angular one in body axes
-        [rad/s^2]. The slopes are along the parameters at `indices`, or along all with None.
+        They are linear in world axes [m/s^2], then angular in body axes [rad/s^2]. The slopes are
+        along the parameters at `indices`, or along all with None.
         """
         inputs = rows._replace(imu_acc_w=None, pose_slope_b=None)
         none = np.zeros((len(rows.time_s), 0))
@@ -112,8 +109,7 @@ class Weights(NamedTuple):
     memory: np.ndarray
     """(3,) autocorrelation time of the residual, as a number of moments, by axis."""
     trim: np.ndarray
-    """(3,) standard deviation of the trim (constant force or torque) from flight to flight, by
-    axis; infinite with too few flights."""
+    """(3,) standard deviation of the flights' trims by axis; infinite with too few flights."""
     base: np.ndarray | None = None
     """(3,) standard deviation of an error that all flights share, by axis; None if there is none.
     The mean of reference flights has such an error."""
@@ -187,9 +183,8 @@ def _pose_whitened(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return residual (M, 3) and slope (M, 3, P) of one flight, whitened by errors of its pose.
 
-    These errors add the covariance `pose_slope pose_slope'` to the noise, so directions in which
-    `pose_slope` (M, 3, L) is large count less. The values are multiplied by the inverse root of
-    `1 + pose_slope pose_slope'`, in units of the noise `unit` (3,).
+    These add the covariance `pose_slope pose_slope'` (M, 3, L) to the noise. So the values are
+    multiplied by the inverse root of `1 + pose_slope pose_slope'`, in units of the noise (3,).
     """
     count = residual.size
     basis, size, _ = np.linalg.svd(
@@ -236,11 +231,10 @@ def fast_share(
 ) -> tuple[float, float]:
     """Return the share of a fitted effect that fast changes confirm, and its 95 % half-width.
 
-    A controller makes the motors compensate a disturbance of the body. If it balances a slow torque
-    that the model lacks, the motors' torque causes no rotation. That looks like a larger inertia or
-    less thrust, but only in slow changes. If the model is right, changes from one moment to the
-    next give the same parameters as all moments do (a specification test; Hausman 1978, doi
-    10.2307/1913827). The share is computed to first order.
+    A controller makes the motors compensate a slow torque that the model lacks, so that their
+    torque causes no rotation. That looks like a larger inertia or less thrust, but only in slow
+    changes. If the model is right, changes from one moment to the next give the same parameters (to
+    first order) as all moments do (a specification test; Hausman 1978, doi 10.2307/1913827).
 
     `data` has the effect in the model. `columns` are those of the effect's K parameters in the
     slopes, and `change` (K,) is their fitted value minus that of the vehicle file.
@@ -258,8 +252,7 @@ def fast_changes_agree(
 ) -> bool:
     """Return whether fast changes confirm an effect; the arguments are those of `fast_share`.
 
-    They do not if they give less than a certain share of it, and significantly less than all of it.
-    Means of flights have no fast changes: they always agree.
+    Their share must not be small and significantly less than 1. Means of flights always agree.
     """
     if len(np.unique(data.flight)) == len(data.flight):
         return True

@@ -31,8 +31,7 @@ class Flown(NamedTuple):
     rotor_speed: Any
     """(B, S + 1, 4) rotor speeds [rad/s]."""
     force_b: Any
-    """(B, S + 1, 3) specific force (acceleration minus gravity) [m/s^2]; at the start, that at the
-    end of the first step."""
+    """(B, S + 1, 3) specific force [m/s^2]; at the start, that at the end of the first step."""
 
 
 def fly_windows(
@@ -104,7 +103,7 @@ def difference(
 ) -> Any:
     """Return simulated - measured (B, N, 19), zero where nothing was measured.
 
-    `values` and `integrator` are the arguments of `fly_windows`, and `flown` is its result.
+    See `fly_windows`, of which `flown` is the result.
     """
     track, speeds, forces = flown
     edge_s = jnp.asarray(windows.edge_s)[:, windows.burn_in_rate_b.shape[1] :]
@@ -150,8 +149,7 @@ def _speeds_after_burn_in(
 ) -> Any:
     """Return the rotor speeds (B, 4) at the windows' starts, by a simulation of the burn-in.
 
-    `spans` are the Q steps of the burn-in and `command` (Q, B, 4) their commands. The rate loop
-    must not have a state of its own (integrators or filters).
+    `command` (Q, B, 4) is that of its Q steps. The rate loop must not have integrators or filters.
     """
     # Of the motion in the burn-in only the rates are needed.
     rates_b = jnp.swapaxes(windows.burn_in_rate_b, 0, 1)
@@ -199,9 +197,9 @@ def _hats(time_s: Any) -> Any:
 
 
 def _places(time_s: Any, edge_s: Any) -> Any:
-    """Return the places of times `time_s` (B, N) among the ends `edge_s` (B, S + 1) of the steps.
+    """Return number, time since the start [s] and length [s] of the step of each `time_s` (B, N).
 
-    They are the numbers of the steps, the times since their starts, and their lengths [s], (B, N).
+    `edge_s` (B, S + 1) are the ends of the steps.
     """
     ends = edge_s.shape[1] - 1
     step = jax.vmap(partial(jnp.searchsorted, side="right"))(edge_s, time_s + 1e-9) - 1

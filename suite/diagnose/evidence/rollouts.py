@@ -45,6 +45,11 @@ from suite.diagnose.evidence.linearise import (
 from suite.diagnose.evidence.rollout import Flown, at_knots, difference, fly_windows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
+ACC_ROW = 9
+"""Row, of those with a velocity, to which the acceleration at a window's start is computed."""
+COMPILED = {"xla_cpu_use_fusion_emitters": False}
+"""Options of the compiler XLA: its newer code for loops is no faster, and compiles half as fast."""
+
 
 @dataclass(frozen=True)
 class RolloutEvidence(Evidence):
@@ -116,7 +121,7 @@ def start_estimate(
 ) -> Estimate:
     """Return the parameters `theta` (P,), or the vehicle file's, with the true start states.
 
-    Logged poses have a delay, an effect (the clock offset) in `theta`. Over the delay, position and
+    Logged poses have a delay, an effect (the clock offset) in `theta`. Over it, position and
     attitude change by velocity and rates, and the velocity by the acceleration.
     """
     theta = model.space.array("start") if theta is None else theta
@@ -156,14 +161,11 @@ def rollouts_along(
     return model, windows, start_estimate(model, windows)
 
 
-def trusted(
-    windows: FlightWindows, residual: np.ndarray, limits: Thresholds = THRESHOLDS
-) -> FlightWindows:
+def trusted(windows: FlightWindows, residual: np.ndarray, limits: Thresholds) -> FlightWindows:
     """Return `windows`, each shortened to the time in which the model stays near the flight.
 
     Further away the linearisation does not hold: the model may have tipped over or be below the
-    ground. With the named effects it stays near for longer, and so windows become longer.
-    `residual` (W, N, 19) is measured - simulated.
+    ground. `residual` (W, N, 19) is measured - simulated.
     """
     error = np.abs(residual)
     height = np.maximum(np.asarray(windows.row.pos_w)[..., 2], 0.0)
@@ -203,8 +205,8 @@ def rollout_evidence(
 def is_hopeless(model: RolloutModel, linear: Linearisation, limits: Thresholds) -> bool:
     """Return whether even a fit of all parameters leaves the rollouts far from the flights.
 
-    The fit uses `linear`, which has slopes along all parameters. It is inexact for large effects,
-    so if its error is too large, some windows are fitted with the full model.
+    It uses `linear`, along all parameters. If its error is too large, which may be because effects
+    are large, some windows are fitted with the full model.
     """
     evidence, block = rollout_evidence(model, linear, limits)
 
@@ -223,13 +225,6 @@ def is_hopeless(model: RolloutModel, linear: Linearisation, limits: Thresholds) 
     return is_far(float((best.block.residual**2).sum()))
 
 
-ACC_ROW = 9
-"""The acceleration at a window's start is computed from the velocities there and in this row,
-counted among the rows with a velocity."""
-COMPILED = {"xla_cpu_use_fusion_emitters": False}
-"""Options of the compiler XLA: its newer code for loops is no faster, and compiles half as fast."""
-
-
 class RolloutModel:
     """Simulation of windows with one vehicle: their residuals and slopes, compiled."""
 
@@ -241,10 +236,7 @@ class RolloutModel:
         voltage: bool,
         integrator: str = "continuous",
     ) -> None:
-        """Prepare the rollout of `vehicle` with the parameters of `space`.
-
-        The other arguments are those of `fly_windows`.
-        """
+        """Prepare the rollout of `vehicle`; for the other arguments see `fly_windows`."""
         self.space = space
         self.size = len(space.entries)
         self.free = STATE + 4 * (KNOTS if rotor_input else 1)
@@ -266,7 +258,7 @@ class RolloutModel:
     def respond(self, at: Estimate, windows: FlightWindows) -> tuple[Linearisation, Flown]:
         """Return residuals and slopes along disturbances, and the states (W, KNOTS, ...) at knots.
 
-        A disturbance is a force [m/s^2] and torque [rad/s^2] in body axes at one of the knots.
+        These are a force [m/s^2] and torque [rad/s^2] in body axes at one of the knots each.
         """
         with jax.enable_x64(True):
             parts = [

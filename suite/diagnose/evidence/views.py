@@ -40,8 +40,7 @@ class ViewEvidence(Evidence):
     model: ForceModel
     flights: Sequence[SmoothedFlight]
     carried: np.ndarray | None = None
-    """(M, 3) residual that follows from reference flights (is carried over from them); it is
-    subtracted."""
+    """(M, 3) residual that is carried over from reference flights, and subtracted."""
     means: bool = False
     """Whether only the mean of each flight is compared."""
     weights: Weights | None = None
@@ -126,8 +125,7 @@ class ViewEvidence(Evidence):
     ) -> float | None:
         """Return the share of the error that a candidate explains; see `Evidence`.
 
-        None if a value is at a physical bound, if flights disagree, if fast changes contradict the
-        candidate, or if the share is too small.
+        None at a physical bound, if flights disagree, if fast changes do, or for a small share.
         """
         theta, fitted = after.at.theta, after.block
         assert isinstance(before, ViewBlock) and isinstance(fitted, ViewBlock)

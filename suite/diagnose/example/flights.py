@@ -22,8 +22,7 @@ from eval.vehicles.vehicle import with_effects
 FOLDER = Path(__file__).parent
 VEHICLE = FOLDER / "vehicle.toml"
 HIDDEN = {"com_offset": ComOffset((0.006, -0.0015, 0.0))}
-"""The hidden effect: the vehicle's centre of mass is 6 mm too far ahead and 1.5 mm too far right,
-as with a misplaced battery [m]."""
+"""The hidden effect: the centre of mass is 6 mm too far ahead and 1.5 mm too far right [m]."""
 WAYS = (
     Trajectory("figure_eight", speed=5.0, size=4.0, turn="wobble"),
     Trajectory("speed_range", speed=7.0, size=6.0, height=2.0, turn="sweep"),
@@ -31,8 +30,7 @@ WAYS = (
 )
 """Trajectories of the three flights."""
 SENSORS = Sensors("example", 100.0, pos=0.002, attitude=0.003, gyro=0.02, acc=0.3, lost=0.005)
-"""Rate of the logs [Hz] and noise: of motion capture, and of the autopilot's gyro and
-accelerometer."""
+"""Rate of the logs [Hz], and noise of motion capture, gyro and accelerometer."""
 SEED = 20
 BITS = {"pos_w": 14, "quat_wxyz": 14, "rate_b": 12, "acc_b": 9, "thrust_cmd": 12, "rate_cmd_b": 12}
 """Values are rounded to 2^-n of their unit, far below the noise, so that files are small."""

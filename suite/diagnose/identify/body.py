@@ -55,6 +55,18 @@ FORCE_ERROR = 0.05
 FORCE_OFFSETS = np.array([True, True, False])
 """Body axes along which each flight has a free constant, for its trim (error of the attitude).
 Along z a constant would be mistaken for thrust."""
+TORQUE_WIDTH_S = 0.2
+"""Width of the windows in which changes of rate are compared [s]."""
+TO_RATE_S = TORQUE_WIDTH_S / (2.0 * np.pi)
+"""Factor from an angular acceleration to the change of rate that is compared in a window. The mean
+over the window is removed: the slow part of the motors' torque only balances trim and blade
+flapping, and does not turn the body [s]."""
+NOISE_BIASED = ("inertia_x", "inertia_y", "yaw")
+"""For each body axis, the number that noise of the rotor speeds biases."""
+FORCE_NUMBERS = ("thrust", "curve", "battery")
+"""Numbers of the force fit on which the torque depends."""
+LATEST_S, LATE_STEP_S = 0.13, 0.012
+"""Largest total delay that is tried for the start of a fit, and the step between trials [s]."""
 
 
 def force_unknowns(
@@ -62,9 +74,8 @@ def force_unknowns(
 ) -> list[Unknown]:
     """Return the numbers that the force fit estimates, with their start in the vehicle file.
 
-    With `leaning`, no flight has an attitude, so that it follows from how the vehicle must lean to
-    fly its path. Drag is then fitted along body z only. `scale` is the logarithm of the thrust's
-    scale in the vehicle file.
+    With `leaning`, no flight has an attitude, and drag is fitted along body z only. `scale` is the
+    logarithm of the thrust's scale in the vehicle file.
     """
     method_error = 0.004 if leaning else 0.001
     unknowns = [Unknown("thrust", scale, -2.0, 2.0, 0.25, 1e-3, method_error)]
@@ -86,8 +97,8 @@ def fit_force(
 ) -> Fitted:
     """Fit the numbers of thrust and drag.
 
-    All flights have velocities. Either all have an attitude, or none has one. `fixed` has the
-    values of numbers that are not fitted, `lag` and `late` (total delay) among them.
+    All flights have velocities; all or none have an attitude. `fixed` are other numbers, `lag` and
+    `late` (total delay) among them.
 
     Raises:
         NoWholeWindow: if no window has all signals.
@@ -164,8 +175,8 @@ def _without_motion(flights: Sequence[Windows]) -> list[str]:
     """Return the drags along x and y that flights without a pose do not show, by name.
 
     An estimated velocity that is mostly error has no relation to the force, so its drag would be 0
-    (errors in variables; Fuller 1987, Sec. 1.1). The variances of velocity and error are compared
-    after what the uncertainties of the pose explain is removed from both.
+    (errors in variables; Fuller 1987, Sec. 1.1). What the uncertainties of the pose explain is
+    removed from the compared variances of velocity and error.
     """
     error, total = np.zeros(2), np.zeros(2)
     for one in flights:
@@ -180,36 +191,20 @@ def _without_motion(flights: Sequence[Windows]) -> list[str]:
     return [f"drag_{axis}" for k, axis in enumerate("xy") if error[k] > MOST_ERROR * total[k]]
 
 
-TORQUE_WIDTH_S = 0.2
-"""Width of the windows in which changes of rate are compared [s]."""
-TO_RATE_S = TORQUE_WIDTH_S / (2.0 * np.pi)
-"""Factor from an angular acceleration to the change of rate that is compared in a window. The mean
-over the window is removed: the slow part of the motors' torque only balances trim and blade
-flapping, and does not turn the body [s]."""
-NOISE_BIASED = ("inertia_x", "inertia_y", "yaw")
-"""For each body axis, the number that noise of the rotor speeds biases."""
-FORCE_NUMBERS = ("thrust", "curve", "battery")
-"""Numbers of the force fit on which the torque depends."""
-LATEST_S, LATE_STEP_S = 0.13, 0.012
-"""Largest total delay that is tried for the start of a fit, and the step between trials [s]."""
-
-
 def lag_unknowns(lag_s: float, late_s: float) -> list[Unknown]:
     """Return the numbers `late` and `lag`, which start at `late_s` and `lag_s` [s].
 
-    `late` is the total delay from a command to its thrust: the sum of the rotors' `lag` and a pure
-    delay. Slow flights identify the sum, but not the lag's share.
+    `late` is the sum of the rotors' `lag` and a pure delay. Slow flights identify only the sum.
     """
     late = Unknown("late", late_s, -0.02, 0.3, 0.012, 1e-3, 0.0007)
     return [late, Unknown("lag", lag_s, 0.0, 0.3, 0.012, 1e-3, 0.0007)]
 
 
 def torque_unknowns(drive: str, lag_s: float, late_s: float) -> list[Unknown]:
-    """Return the numbers that the torque fit estimates.
+    """Return the numbers that the torque fit estimates, logarithms of ratios but for lag and delay.
 
-    All but lag and delay are logarithms of ratios to the start. `inertia_z` is relative to the mean
-    of the other two, and keeps this ratio if it is not identifiable. `yaw` is the yaw torque over
-    the inertia about z. It is missing if torques are commanded.
+    `inertia_z` is relative to the mean of the other two, and keeps this ratio if it is not
+    identifiable. `yaw` is the yaw torque over the inertia about z, unless torques are commanded.
     """
     unknowns = [Unknown(f"inertia_{a}", 0.0, -5.0, 5.0, 0.5, 1e-2, 0.015) for a in "xy"]
     widest_z = 0.5 if drive == "torques" else 0.25
@@ -331,10 +326,7 @@ def _reliability(windows: Sequence[Windows], vehicle: Accelerations) -> np.ndarr
 def _best_correlated_delay(
     residuals: Residuals, numbers: Mapping[str, float], measured: Sequence[np.ndarray]
 ) -> float:
-    """Return the delay `late` [s] at which modelled and measured roll and pitch correlate best.
-
-    `measured` are the changes of each flight's body rates, (M, 3).
-    """
+    """Return the delay `late` [s] at which modelled and measured roll and pitch correlate best."""
     trials = np.array([numbers["late"], *np.arange(0.0, LATEST_S, LATE_STEP_S)])
     scores = np.zeros(len(trials))
     for k, trial in enumerate(trials.tolist()):

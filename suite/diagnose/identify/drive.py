@@ -39,6 +39,12 @@ LEAST_LAG_S = 1e-4
 """A shorter lag (time constant) of the rotors counts as none [s]."""
 LEAST_VOLTS = 0.1
 """Lower measured voltages are raised to this, so that a power of them is finite [V]."""
+Accelerations = Callable[[FlightGrid, FlightRows], tuple[np.ndarray, np.ndarray]]
+"""Function that returns dv/dt in world axes and dw/dt in body axes on each row, (G, 3) each."""
+MERGED = ("motor_lag", "inertia_scale", "rate_gain")
+"""Effects that scale or replace a fitted number."""
+FITTED = ("linear_drag", "blade_flapping", "command_delay", "thrust_scale")
+"""Effects whose parameters are fitted themselves, starting from their values in the file."""
 
 
 def common_drive(flights: Sequence[FlightGrid]) -> str:
@@ -54,10 +60,6 @@ def common_drive(flights: Sequence[FlightGrid]) -> str:
         "the flights share no drive: every one needs rotor speeds, motor commands (pwm_1 to "
         "pwm_4), or a thrust command; identify flights of each kind separately"
     )
-
-
-Accelerations = Callable[[FlightGrid, FlightRows], tuple[np.ndarray, np.ndarray]]
-"""Function that returns dv/dt in world axes and dw/dt in body axes on each row, (G, 3) each."""
 
 
 @dataclass(frozen=True)
@@ -103,11 +105,10 @@ class DrivenVehicle:
         return (0.0, 0.0, 0.0) if effect is None else effect.coefficient
 
     def vehicle(self, numbers: Mapping[str, float]) -> Vehicle:
-        """Return the vehicle with these `numbers`.
+        """Return the vehicle with these `numbers`, and the effects that only depend on the state.
 
-        It keeps those effects of the start that only depend on the state (`by_state`). Only
-        measured rotor speeds identify the thrust coefficient. The number `yaw` is the logarithm of
-        yaw torque over inertia about z, relative to the start. `inertia_x` and `inertia_y` are
+        Only measured rotor speeds identify the thrust coefficient. `yaw` is the logarithm of yaw
+        torque over inertia about z, relative to the start. `inertia_x` and `inertia_y` are
         logarithms of ratios to the start, and `inertia_z` is relative to the mean of these two.
         """
         log_thrust = numbers.get("thrust", 0.0)
@@ -142,10 +143,7 @@ class DrivenVehicle:
         return MotorMap((float(first), float(second)), self.motors.voltage, float(battery))
 
     def accelerations(self, numbers: Mapping[str, float]) -> Accelerations:
-        """Return the equations of the vehicle with these `numbers`.
-
-        Where the rotors' speed is unknown, it is 0.
-        """
+        """Return the equations of the vehicle with these `numbers`; an unknown rotor speed is 0."""
         vehicle = self.vehicle(numbers)
         plant = make_plant(vehicle, LONGEST_S)
 
@@ -186,10 +184,9 @@ def driven_vehicle(
 ) -> DrivenVehicle:
     """Return `vehicle` under `drive`, with the usual command and voltage of `flights`.
 
-    With motor commands it has a table `[motors]`, the map from motor command to thrust. A new table
-    gives full speed at full command. Its voltage exponent is 0 for flights without a voltage. An
-    exponent of 0 makes the nominal voltage meaningless, so it becomes the flights' median, but not
-    in a table of the file with `keep_motors`.
+    With motor commands it has a table `[motors]` from motor command to thrust; a new one gives full
+    speed at full command. Without a voltage its exponent is 0; the nominal voltage then means
+    nothing, so it becomes the flights' median, but not in a table of the file with `keep_motors`.
     """
     if drive != "pwm":
         return DrivenVehicle(vehicle, drive)
@@ -211,18 +208,16 @@ def possible_inertia(inertia: ArrayLike) -> np.ndarray:
 def after_delay_and_lag(commands: np.ndarray, numbers: Mapping[str, float]) -> np.ndarray:
     """Return `commands` (G, C) as the rotors follow them: delayed, then with a first-order lag.
 
-    `numbers["lag"]` is the rotors' time constant, and `numbers["late"]` the sum of time constant
-    and delay [s].
+    `numbers["lag"]` is its time constant, and `numbers["late"]` the sum with the delay [s].
     """
     lag_s = numbers["lag"]
     return lagged(delayed(commands, numbers["late"] - lag_s), lag_s)
 
 
 def delayed(values: np.ndarray, delay_s: float) -> np.ndarray:
-    """Return `values` (G, C) as they were `delay_s` ago.
+    """Return `values` (G, C) as they were `delay_s` ago; before the first row, its value is used.
 
-    Before the first row, the first value is used. A value is a mean over one step of the grid, so
-    its time is the middle of the step.
+    A value is a mean over one step of the grid, so its time is the middle of the step.
     """
     rows = np.arange(len(values))
     place = rows - delay_s / STEP_S - 0.5
@@ -245,17 +240,11 @@ def filled(values: np.ndarray) -> np.ndarray:
     return np.nan_to_num(hold(rows, rows, values))
 
 
-MERGED = ("motor_lag", "inertia_scale", "rate_gain")
-"""Effects that scale or replace a fitted number."""
-FITTED = ("linear_drag", "blade_flapping", "command_delay", "thrust_scale")
-"""Effects whose parameters are fitted themselves, starting from their values in the file."""
-
-
 def with_merged_effects(vehicle: Vehicle, known_motors: bool) -> Vehicle:
     """Return `vehicle` with its effects that scale a fitted number merged into that number.
 
-    It flies as before. If such an effect stayed, it would scale the fitted number once more. With
-    `known_motors`, the motors' thrust is fitted, so `thrust_scale` is merged as well.
+    It flies as before. Otherwise they would scale the fitted number once more. With `known_motors`,
+    `thrust_scale` is one of them.
 
     Raises:
         ValueError: if a merged number is not allowed in a vehicle file, such as the thrust of
@@ -288,10 +277,7 @@ def with_merged_effects(vehicle: Vehicle, known_motors: bool) -> Vehicle:
 
 
 def unmodelled_effects(vehicle: Vehicle) -> list[str]:
-    """Return the names of the vehicle's effects that no fit models; they stay in its file.
-
-    The fits of force and torque model the effects that only depend on the state (`by_state`).
-    """
+    """Return the vehicle's effects that the fits of force and torque do not model, by name."""
     return [
         name
         for name in vehicle.effects

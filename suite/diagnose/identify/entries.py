@@ -32,8 +32,7 @@ class Row(NamedTuple):
     needs: Sequence[str]
     """The fitted number that must be identified, for each value of the entry."""
     formula: Callable[[Mapping[str, float]], ArrayLike] | None = None
-    """Function from fitted numbers by name to the value, or the values (V,); None: that of the
-    driven vehicle."""
+    """Function from fitted numbers by name to the value(s); None: those of the driven vehicle."""
 
 
 def entries_of(driven: DrivenVehicle, fitted: Fitted, log_thrust: float = 0.0) -> list[Number]:
@@ -44,7 +43,12 @@ def entries_of(driven: DrivenVehicle, fitted: Fitted, log_thrust: float = 0.0) -
     # Flights show the ratio of torque to inertia about z. The uncertainty of the inertia counts if
     # the inertia is identified; otherwise the inertia is held fixed.
     identified = [name for name in INERTIAS if fitted.identifies(name)]
-    gain = np.asarray(driven.start.controller.rate_gain)
+
+    def inertia(n: Mapping[str, float]) -> np.ndarray:
+        return possible_inertia(driven.vehicle(n).inertia)
+
+    def rate_gain(n: Mapping[str, float]) -> np.ndarray:
+        return np.asarray(driven.start.controller.rate_gain) * np.exp([n[name] for name in GAINS])
 
     def twist(n: Mapping[str, float]) -> float:
         numbers = {name: n[name] for name in (*identified, "yaw")}
@@ -60,25 +64,14 @@ def entries_of(driven: DrivenVehicle, fitted: Fitted, log_thrust: float = 0.0) -
     rows = {
         "thrust": thrust,
         "drag_z": [Row("effects.linear_drag.coefficient", "1/s", DRAGS)],
-        "inertia_x": [
-            Row(
-                "inertia", "kg m^2", INERTIAS, lambda n: possible_inertia(driven.vehicle(n).inertia)
-            )
-        ],
+        "inertia_x": [Row("inertia", "kg m^2", INERTIAS, inertia)],
         "yaw": [Row("rotors.torque_coefficient", "N m/(rad/s)^2", ("yaw",), twist)],
         "late": [
             Row("rotors.time_constant", "s", ("lag",), lambda n: n["lag"]),
             # `late` is the sum of lag and delay. The delay in the file keeps the sum.
             Row(DELAY, "s", ("late",), lambda n: n["late"] - n["lag"]),
         ],
-        "gain_x": [
-            Row(
-                "controller.rate_gain",
-                "1/s",
-                GAINS,
-                lambda n: gain * np.exp([n[g] for g in GAINS]),
-            )
-        ],
+        "gain_x": [Row("controller.rate_gain", "1/s", GAINS, rate_gain)],
     }
     names = [name for name in fitted.names if name not in fitted.known]
     return [_entry(driven, fitted, row) for name in rows if name in names for row in rows[name]]
@@ -122,9 +115,8 @@ def with_entries(
 ) -> tuple[Vehicle, list[Number], list[str]]:
     """Enter identified numbers into a vehicle.
 
-    Returns:
-        The vehicle, the entries with the values that its file has, and a line for people for each
-        value that had to differ from the fitted one. A delay of 0 is removed from the entries.
+    Returned are the vehicle, the entries as its file has them (without a delay of 0), and a line
+    for people for each value that had to differ from the fitted one.
     """
     numbers, notes = [], []
     for entry in entries:
@@ -170,9 +162,8 @@ def with_entry(vehicle: Vehicle, entry: Number) -> Vehicle:
 def with_reachable_speed(vehicle: Vehicle, speeds: Sequence[np.ndarray]) -> Vehicle:
     """Return a vehicle whose rotors are fast enough to hover.
 
-    If its `speed_max` is too low for that, it is replaced by the 99th percentile of the measured
-    rotor speeds; the highest speed of a log may be an outlier. `speeds` has one array (G, 4) for
-    each flight [rad/s].
+    If `speed_max` is too low, it becomes the 99th percentile of the measured `speeds` (G, 4)
+    [rad/s] of all flights; the highest may be an outlier.
     """
     try:
         check_vehicle(vehicle)

@@ -34,8 +34,8 @@ ROUNDS = 6
 DIFFER_P = 0.05
 """P-value below which flights differ more than their blocks explain. Intervals are then wider."""
 LEAST_SIGMA, LEAST_ERROR, LEAST_WEIGHT, LEAST_VARIANCE = 1e-9, 1e-9, 1e-12, 1e-30
-"""Lower limits that avoid a division by zero: of the noise, of an error divided by the noise, of a
-sum of weights, and of a product of two standard deviations."""
+"""Lower limits of noise, of an error over it, of a sum of weights, and of two deviations'
+product."""
 
 
 class NoWholeWindow(ValueError):
@@ -57,8 +57,7 @@ class Unknown(NamedTuple):
     step: float
     """Step of the finite differences."""
     method_error: float = 0.0
-    """Half-width of the method's own error, from simulated flights without noise. Its square is
-    added to that of the interval's half-width."""
+    """Half-width of the method's own error, from simulated flights; adds to that by noise."""
 
 
 class Rows(NamedTuple):
@@ -71,8 +70,7 @@ class Rows(NamedTuple):
     offset: np.ndarray
     """(C,) bool: channels in which the flight has a free constant, such as a trim."""
     nuisance: np.ndarray | None = None
-    """(N, C, K) change of the residuals by nuisance parameters, each by its standard deviation
-    before the flight; None for none."""
+    """(N, C, K) change of the residuals by one prior standard deviation of nuisance parameters."""
 
 
 Residuals = Callable[[Mapping[str, float]], Sequence[Rows]]
@@ -173,8 +171,8 @@ class ResidualEvidence(Evidence):
     def weighed(self, at: Estimate) -> ResidualEvidence:
         """Return this evidence with weights of the residuals at the estimate `at`.
 
-        A weight is one over the variance of the channel's noise. If the noise is estimated, it is
-        lower for an outlier (Huber 1964).
+        A weight is one over the noise variance; with estimated noise, less for an outlier (Huber
+        1964).
         """
         errors = [np.abs(_without_median(row)) for row in self.rows(at.theta)]
         if self.noise is not None:
@@ -218,7 +216,6 @@ class ResidualEvidence(Evidence):
             values.append(white[..., 0])
             slopes.append(white[..., 1:])
             blocks.append(np.stack([np.full(len(row.block), flight), row.block]))
-        # Number the blocks of all flights.
         places, stretch = np.unique(np.concatenate(blocks, axis=1), axis=1, return_inverse=True)
         residual, slope = np.concatenate(values), np.concatenate(slopes)
         flight_of, block = places
@@ -237,10 +234,10 @@ def fit(
 ) -> Fitted:
     """Return the numbers that minimise `residuals`, with intervals.
 
-    A number that is not identifiable may be wrong by its `max_half_width`; the intervals of the
-    others include the effect of that. The numbers `held` and `known` keep their start; another fit
-    has identified the latter. `noise` (C,) is the standard deviation of the residuals by channel;
-    by default it is estimated. `fixed` has the values of numbers that are not among `unknowns`.
+    A number that is not identifiable may be wrong by its `max_half_width`, which the intervals of
+    the others include. The numbers `held` and `known` (by another fit) keep their start. `noise`
+    (C,) is the standard deviation of the residuals by channel, or else is estimated. `fixed` are
+    the values of numbers that are not among `unknowns`.
 
     Raises:
         NoWholeWindow: if the residuals have no window.

@@ -34,11 +34,10 @@ FLAPPING = "blade_flapping"
 def flapping_of(
     logs: Sequence[FlightLog], vehicle: Vehicle, perturbed: Sequence[Vehicle] = ()
 ) -> Number | None:
-    """Return the flapping coefficient that `logs` show, or None if it is not significant.
+    """Return the flapping coefficient that complete `logs` show, None if it is not significant.
 
-    Only complete logs are used. The significance test is that of a diagnosis. Each of the vehicles
-    `perturbed` has one error of one standard deviation (`perturbed_vehicles`). The change of the
-    coefficient with each error widens the interval.
+    The test is that of a diagnosis. Each vehicle of `perturbed` has one error of one standard
+    deviation, and the change of the coefficient with it widens the interval.
     """
     complete = [log for log in logs if not log.partial]
     try:
@@ -72,10 +71,7 @@ def _torque_evidence(flights: ViewFlights, vehicle: Vehicle, voltage: bool) -> V
 
 
 def _coefficient_step(evidence: ViewEvidence, result: SearchResult) -> float:
-    """Return how far the coefficient of `result` moves if the flights are those of another vehicle.
-
-    It is one Gauss-Newton step; `evidence` compares the flights with that vehicle.
-    """
+    """Return by how much one Gauss-Newton step on `evidence` moves the coefficient of `result`."""
     theta, (index,) = evidence.model.space.array("start"), result.indices
     theta[index] = result.estimate.theta[index]
     last = result.last.evidence
@@ -88,10 +84,9 @@ def _coefficient_step(evidence: ViewEvidence, result: SearchResult) -> float:
 def perturbed_vehicles(
     vehicle: Vehicle, driven: DrivenVehicle, force: Fitted, torque: Fitted
 ) -> list[Vehicle]:
-    """Return copies of `vehicle` with one error of one standard deviation each.
+    """Return copies of `vehicle` with one independent error of one standard deviation each.
 
-    The errors are those of motors and inertia. There is one copy for each principal axis of the
-    covariance; these errors are independent.
+    They are along the principal axes of the covariances of motors and inertia.
     """
     vehicles = []
     motors = (force, FORCE_NUMBERS, ("motors", "rotors"))

@@ -37,8 +37,7 @@ STEP_S = 0.004
 MEMORY_S = 0.4
 """Commands older than this have no effect [s]."""
 ROTOR_NOISE = "rotor_noise"
-"""Name of a signal: random noise as large as that of the measured rotor speeds. It is added to
-them, to see how such noise changes the model."""
+"""Signal: noise like that of the measured rotor speeds, added to see its influence."""
 LEANING = "leaning"
 """Name of a signal: the attitude that the path's acceleration requires, if none was measured."""
 IMU_ACC = "imu_acc_w"
@@ -60,8 +59,7 @@ class FlightGrid(NamedTuple):
     signals: dict[str, np.ndarray]
     """Signals (G, ...) by name: rot_w, vel_w, pos_w, rate_b, commands and rotor speeds."""
     in_turn: tuple[str, ...] = ()
-    """Names of signals of which each row has only some columns, such as the speeds of motors that
-    are read one after another."""
+    """Signals of which each row has only some columns, such as motors that are read in turn."""
     rotor_spacing_s: float = 0.0
     """Time between the measured rotor speeds [s]; 0 without any."""
 
@@ -72,8 +70,8 @@ class FlightGrid(NamedTuple):
     def form(self, width_s: float, needs: Sequence[str], slope: bool = False) -> WeakForm:
         """Return the weights of the windows of `width_s` with all signals of `needs`.
 
-        With `slope`, the windows are for slopes of the signals, see `weak_form`. No window begins
-        in the first `MEMORY_S`, where commands from before the first row still act.
+        For `slope` see `weak_form`. No window begins in the first `MEMORY_S`, where commands from
+        before the first row still act.
         """
         good = self.time_s >= MEMORY_S
         for name in needs:
@@ -84,8 +82,7 @@ class FlightGrid(NamedTuple):
     def rows(self, attitude_of_path: bool) -> FlightRows:
         """Return the grid as rows of a view, with zeros for rotor speeds and for missing values.
 
-        With `attitude_of_path`, an attitude that was not measured is the one that the path requires
-        (`LEANING`). Its yaw is arbitrary.
+        With `attitude_of_path`, a missing attitude is `LEANING`, whose yaw is arbitrary.
         """
         signals, count = self.signals, len(self.time_s)
         zeros, no_speed, good = np.zeros((count, 3)), np.zeros((count, 4)), np.ones(count, bool)
@@ -100,7 +97,6 @@ class FlightGrid(NamedTuple):
 
 def grid_of(log: FlightLog) -> FlightGrid:
     """Return `log` on the grid: measurements interpolated, commands held from row to row."""
-    # Collect the signals that the log has.
     time_s = log.time_s - log.time_s[0]
     grid_s = np.arange(0.0, time_s[-1], STEP_S)
     values = {name: getattr(log, name) for name in (*MEASURED, *HELD)}
@@ -154,8 +150,7 @@ def _complete_rows(values: np.ndarray) -> int:
 def _held(time_s: np.ndarray, values: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
     """Return commands held from row to row, as means (G, ...) over each step of the grid.
 
-    A command changes at the time of a row, usually between two grid points. Its values at the grid
-    points would show the change too late.
+    They change between grid points, so that their values there would be too late.
     """
     flat = np.asarray(values.reshape(len(values), -1), dtype=float)
     ends_s, out = np.append(grid_s, grid_s[-1] + STEP_S), np.empty((len(grid_s), flat.shape[1]))

@@ -83,16 +83,12 @@ class Identified:
 
 
 def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] = ()) -> Identified:
-    """Estimate the numbers of `vehicle` that `logs` identify.
+    """Estimate the numbers of `vehicle` that `logs` identify, with intervals.
 
     Args:
         logs: flights of one vehicle; incomplete ones are used for the numbers that they allow.
-        vehicle: vehicle from which the fits start; a number that is not identifiable keeps its
-            value.
-        leave: parts not to fit: any of drag, motors, inertia, lag, loop.
-
-    Returns:
-        The vehicle with the identified numbers, and their intervals.
+        vehicle: the start of the fits; a number that is not identifiable keeps its value.
+        leave: parts not to fit, of `PARTS`.
 
     Raises:
         ValueError: if no signal drives the model in all flights, or no fit has a complete window.
@@ -214,8 +210,7 @@ class _Fits:
     def with_known_thrust(self, flights: list[FlightGrid]) -> list[FlightGrid]:
         """Return the flights in which the motors' thrust is known best, and remember the others.
 
-        The thrust of a motor command depends on the battery. For this drive, flights without a
-        voltage are therefore left out if other flights have one.
+        By motor commands, these are the flights with a voltage, if any have one.
         """
         with_voltage = [flight for flight in flights if flight.has("voltage")]
         if self.drive != "pwm" or not with_voltage:
@@ -241,7 +236,7 @@ class _Fits:
     def identified(
         self, original: Vehicle, logs: Sequence[FlightLog], lacking: Sequence[str]
     ) -> Identified:
-        """Return the result of all fits to `logs`; `original` is the vehicle before any change.
+        """Return the result of all fits to `logs`, from the unchanged vehicle `original`.
 
         `lacking` has a line for people for each number that was not fitted.
         """
@@ -261,26 +256,20 @@ class _Fits:
         # Blade flapping needs the results of both fits, and motors whose thrust is known.
         known_motors = self.drive in KNOWN_MOTORS and {"force", "torque"} <= {*results}
         if known_motors and "drag" not in self.leave:
-            fits = (results["force"], results["torque"])
-            perturbed = perturbed_vehicles(vehicle, self.driven, *fits)
+            force, torque = results["force"], results["torque"]
+            perturbed = perturbed_vehicles(vehicle, self.driven, force, torque)
             with_voltage = [log for log in logs if log.name not in self.without_voltage]
             flapping = flapping_of(with_voltage, vehicle, perturbed)
-            vehicle, more, further = with_entries(vehicle, [flapping] if flapping else [])
-            numbers, notes = [*numbers, *more], [*notes, *further]
+            vehicle, more, more_notes = with_entries(vehicle, [flapping] if flapping else [])
+            numbers, notes = [*numbers, *more], [*notes, *more_notes]
+        fits = [name for name in ("force", "torque") if name in results]
+        further = notes_on(self.flights, self.without_voltage, original, vehicle)
         return Identified(
             vehicle,
             tuple(numbers),
             (*not_identified(results, by_key), *lacking),
             self.drive,
-            {
-                name: results[name].residual_rms.tolist()
-                for name in ("force", "torque")
-                if name in results
-            },
+            {name: results[name].residual_rms.tolist() for name in fits},
             tuple(flight.name for flight in self.flights),
-            (
-                *misfit_notes(results),
-                *notes_on(self.flights, self.without_voltage, original, vehicle),
-                *notes,
-            ),
+            (*misfit_notes(results), *further, *notes),
         )

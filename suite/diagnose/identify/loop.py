@@ -35,10 +35,10 @@ WINDOWS = {"rate_b": ("rate_cmd_b", 0.08), "rotor_speed": ("rotor_speed_cmd", 0.
 def loop_unknowns(vehicle: Vehicle, flights: Sequence[FlightGrid]) -> list[Unknown]:
     """Return the numbers of the rate loop, apart from lag and delay.
 
-    The gains are logarithms of their ratios to those of the start. All others are nuisance
-    parameters: the factors from the rates about two axes to the angular acceleration of the third,
-    since the inertia in the vehicle file may be wrong; and the ratios of angular acceleration by
-    moving air (flapping) to velocity [1/(m s)], if all flights have a velocity and an attitude.
+    The gains are logarithms of ratios to the start. Nuisance parameters are the factors from the
+    rates about two axes to the angular acceleration of the third, and the ratios of angular
+    acceleration by moving air (flapping) to velocity [1/(m s)], if all flights have a velocity and
+    an attitude.
     """
     x, y, z = vehicle.inertia
     couplings = zip("xyz", ((z - y) / x, (x - z) / y, (y - x) / z), strict=True)
@@ -61,8 +61,8 @@ def fit_commanded(
     """Fit how a `measured` signal follows its command: body rates, or rotor speeds.
 
     Each channel of a flight has a free constant (bias of the gyro, trim). `model` returns the
-    signal (G, C) of a flight from its commands, for the `unknowns` and the numbers that are
-    `fixed`. Another fit has identified those that are `known`.
+    signal (G, C) of a flight from its commands, for the `unknowns` and the `fixed` numbers. Another
+    fit has identified those that are `known`.
 
     Raises:
         NoWholeWindow: if no window has both the signal and its command.

@@ -13,6 +13,33 @@ from suite.diagnose.identify.grid import IMU_ACC, FlightGrid
 
 DELAY = "effects.command_delay.delay"
 """Key of the command delay in a vehicle file."""
+OTHER_INERTIA = "the rotors' lag may be another, or the file is over 100 times wrong"
+"""Other reasons for which an inertia is not identifiable."""
+WHY = {
+    "thrust": "thrust: too little of the force along body z is explained",
+    "curve": "curvature of the thrust curve: the motor commands hardly change",
+    "battery": "voltage_exponent: the voltage hardly changes",
+    **{f"drag_{a}": f"drag along body {a}: too slow, or too little of it" for a in "xyz"},
+    "inertia_x": f"inertia about x: the body hardly rolls, {OTHER_INERTIA}",
+    "inertia_y": f"inertia about y: the body hardly pitches, {OTHER_INERTIA}",
+    "inertia_z": "inertia about z: the body hardly yaws, or not while it rolls and pitches",
+    "yaw": "torque_coefficient: the body hardly yaws",
+    "lag": "time_constant of the rotors: nothing fast enough is commanded",
+    "late": "command_delay: nothing fast enough is commanded",
+    "gain_x": "rate_gain about x: the body hardly rolls",
+    "gain_y": "rate_gain about y: the body hardly pitches",
+    "gain_z": "rate_gain about z: the body hardly yaws",
+}
+"""Description of each fitted number, by name, with the reason why flights may not identify it."""
+WELL_EXPLAINED, SMALL_MISFIT = 0.5, 1.0
+"""A model fits an axis if it explains this share of the measured mean square, or if the root mean
+square of the rest is below the second value: 1 m/s^2 or 1 rad/s^2."""
+MOTIONS = {"force": "acceleration along", "torque": "angular acceleration about"}
+"""Name of a fit -> what it explains."""
+NO_RATES = "no body rates and no attitude in these logs"
+"""Reason if a fit needs body rates and the logs have none."""
+NEVER_BOTH = "these logs have no stretch with both"
+"""Reason if the logs have the columns that a fit needs, but never all in one window."""
 
 
 class Number(NamedTuple):
@@ -26,8 +53,7 @@ class Number(NamedTuple):
     ci95: list[tuple[float, float] | None]
     """95 % interval of each component; None for one that is not identified."""
     follows: bool = False
-    """Whether a component is not identified but still written into the file. It is the difference
-    between an identified sum and another number, such as the delay."""
+    """Whether an unidentified component is in the file, as the rest of an identified sum."""
 
     @property
     def is_identified(self) -> bool:
@@ -67,35 +93,6 @@ def number_lines(numbers: Sequence[Number]) -> list[str]:
     ]
 
 
-OTHER_INERTIA = "the rotors' lag may be another, or the file is over 100 times wrong"
-"""Other reasons for which an inertia is not identifiable."""
-WHY = {
-    "thrust": "thrust: too little of the force along body z is explained",
-    "curve": "curvature of the thrust curve: the motor commands hardly change",
-    "battery": "voltage_exponent: the voltage hardly changes",
-    **{f"drag_{a}": f"drag along body {a}: too slow, or too little of it" for a in "xyz"},
-    "inertia_x": f"inertia about x: the body hardly rolls, {OTHER_INERTIA}",
-    "inertia_y": f"inertia about y: the body hardly pitches, {OTHER_INERTIA}",
-    "inertia_z": "inertia about z: the body hardly yaws, or not while it rolls and pitches",
-    "yaw": "torque_coefficient: the body hardly yaws",
-    "lag": "time_constant of the rotors: nothing fast enough is commanded",
-    "late": "command_delay: nothing fast enough is commanded",
-    "gain_x": "rate_gain about x: the body hardly rolls",
-    "gain_y": "rate_gain about y: the body hardly pitches",
-    "gain_z": "rate_gain about z: the body hardly yaws",
-}
-"""Description of each fitted number, by name, with the reason why flights may not identify it."""
-WELL_EXPLAINED, SMALL_MISFIT = 0.5, 1.0
-"""A model fits an axis if it explains this share of the measured mean square, or if the root mean
-square of the rest is below the second value: 1 m/s^2 or 1 rad/s^2."""
-MOTIONS = {"force": "acceleration along", "torque": "angular acceleration about"}
-"""Name of a fit -> what it explains."""
-NO_RATES = "no body rates and no attitude in these logs"
-"""Reason if a fit needs body rates and the logs have none."""
-NEVER_BOTH = "these logs have no stretch with both"
-"""Reason if the logs have the columns that a fit needs, but never all in one window."""
-
-
 def not_identified(fitted: Mapping[str, Fitted], entries: Mapping[str, Number]) -> list[str]:
     """Return a line for people for each number that was fitted and that no fit has identified."""
     fits = list(fitted.values())
@@ -122,8 +119,7 @@ def not_attempted(
 ) -> list[str]:
     """Return a line for people for each number that was not fitted, with the missing signal.
 
-    The fits of `fitted` are force, torque, rotors and loop. `broken` names fits for which the logs
-    have the columns, but no complete window.
+    Fits are force, torque, rotors and loop; those of `broken` had no complete window.
     """
 
     def any_has(name: str) -> bool:
@@ -205,7 +201,7 @@ def notes_on(
     start: Vehicle,
     identified: Vehicle,
 ) -> list[str]:
-    """Return lines for people on what was done with flights and vehicle beyond the fitted numbers.
+    """Return lines for people on what was done apart from the fits.
 
     `without_voltage` names the flights without a voltage, if others have one.
     """

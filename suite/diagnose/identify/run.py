@@ -33,11 +33,8 @@ def identify_files(
 ) -> dict[str, Any]:
     """Estimate the parameters of a vehicle from log files, and write its file.
 
-    The parts `leave` (of `PARTS`) are not fitted. The interface faults `accept` (wrong units,
-    signs, clocks) do not stop the command.
-
-    Returns:
-        The JSON object that `--json` prints.
+    The parts `leave` (of `PARTS`) are not fitted, and the interface faults `accept` do not stop the
+    command. Returned is the JSON object that `--json` prints.
 
     Raises:
         ValueError: if flights or vehicle cannot be used.
@@ -61,7 +58,6 @@ def identify_files(
             f"{start.name} has {', '.join(unmodelled)}: the fits do not model them, so the "
             "estimates include their share, and they stay in the file; start without them"
         )
-    # Fit, and write the file.
     identified = identify(logs, start, leave)
     counted = _counted(len(identified.flights))
     lines = [f"From {vehicle} {MADE_BY}, {counted} ({identified.drive}); 95 % intervals:"]

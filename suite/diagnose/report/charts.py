@@ -21,10 +21,7 @@ MEASURED, BEFORE, AFTER = "#1d2430", "#8b93a1", "#2463c9"
 
 
 def series_chart(series: Series) -> bytes:
-    """Draw held-out flights, measured and simulated, as a PNG.
-
-    Below are the errors, measured - simulated, if the horizontal axis is the time.
-    """
+    """Draw held-out flights, measured and simulated, as a PNG; over time also the errors."""
     figure = Figure(figsize=(9.0, 3.7), layout="constrained")
     is_over_time = series.x_label != "flight"
     panels = figure.subplots(1 + is_over_time, sharex=True, squeeze=False)[:, 0]
@@ -74,7 +71,7 @@ def write_rollouts(path: Path, flown: RolloutSource, rollouts: Rollouts) -> Path
 
 
 def _rollout(window: FlightWindows, residual: np.ndarray) -> tuple[States, np.ndarray] | None:
-    """Return the simulated states and the errors of one rollout; None if it diverged.
+    """Return simulated states and errors of a rollout; None if it diverged.
 
     They are at its T rows with a measured pose. The errors (T, 4) are those of position [m],
     velocity [m/s], attitude [deg] and rates [rad/s]. `residual` is measured minus simulated.

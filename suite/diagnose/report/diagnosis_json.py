@@ -73,9 +73,9 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def not_examined(diagnosis: Diagnosis) -> list[str]:
-    """Return the parts of the dynamics that no source tests: `force`, `torque`, `rate loop`.
+    """Return the untested parts of the dynamics: `force`, `torque`, `rate loop`.
 
-    The rate loop is tested if effects that need commands as the model's input are candidates.
+    The last is tested if effects that need commands as the model's input are candidates.
     """
     views = {one.source.name for one in diagnosis.findings}
     names = [candidate.name for one in diagnosis.findings for candidate in one.source.candidates]
@@ -127,11 +127,7 @@ def gap_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def effects_json(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Return an entry for each named effect.
-
-    An effect that was named for several motors has one entry. Effects that separate tests named
-    come last.
-    """
+    """Return an entry for each named effect (one for several motors), separate tests last."""
     searched = [
         _effect(finding, name, [named for named in finding.names if named.candidate.name == name])
         for finding in diagnosis.findings
@@ -178,10 +174,10 @@ def parameters_json(
     half_width: Mapping[int, float],
     undecided: Sequence[int] = (),
 ) -> dict[str, Any]:
-    """Return the parameters of the effect `name` as in diagnosis.json.
+    """Return the parameters of the effect `name` in `theta` (P,) as in diagnosis.json.
 
-    `theta` (P,) are all parameters; `half_width` has those of the 95 % intervals by index. For an
-    effect of one motor, `undecided` are parameters for other motors that fit as well.
+    `half_width` has those of the 95 % intervals by index. For an effect of one motor, `undecided`
+    are parameters for other motors that fit as well.
     """
 
     def value_and_interval(index: int) -> tuple[float, list[float]]:

@@ -59,8 +59,7 @@ def page(
 ) -> Report:
     """Return the report of a diagnosis with the diagnosis.json `result` and vehicle file `toml`.
 
-    `files` are the paths of those of `FILES` that exist. `rollouts` are those for the chart, if
-    they were simulated before.
+    `files` are the paths of those of `FILES` that exist. `rollouts` are those for the chart.
     """
     gap, flown, main = result["gap"], rollouts_of(diagnosis.main), diagnosis.main
     held = gap["held_out"]

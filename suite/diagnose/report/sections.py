@@ -20,6 +20,18 @@ from tracks.common.grid import Cell, Grid, table, table_of
 
 SHOWN = 12
 """Largest number of logs in the table of logs."""
+LEAST_P = 0.0005
+"""P-values up to this are not printed, as some thousand draws do not resolve them."""
+ALONE = (
+    "All {count} candidates, each fitted alone before anything was named. The gain is the fall of "
+    "the whitened squared error on stretches that were left out of its fit."
+)
+CHANGED = (
+    "The candidates whose gain is close to the best, each fitted alone before anything was named. "
+    "The gain is the fall of the whitened squared error of the flights' means, less two for each "
+    "fitted number."
+)
+"""Explanations of the table of candidates; the second is for a change since reference flights."""
 
 
 def logs_section(logs: Sequence[FlightLog]) -> Section:
@@ -31,10 +43,7 @@ def logs_section(logs: Sequence[FlightLog]) -> Section:
 
 
 def _facts(log: FlightLog) -> tuple[str, ...]:
-    """Return the table row of a log.
-
-    The row has the share of the log's rows that are incomplete: they lack a state or a command.
-    """
+    """Return the table row of a log, with the share of its rows that lack a state or a command."""
     optional = {
         "commands": log.thrust_cmd is not None,
         "velocity": not log.velocity_derived,
@@ -105,21 +114,6 @@ def _mismatch(mismatch: Mapping[str, Any]) -> Grid:
     return table(["", ""], rows, f"Compared with the {mismatch['commanded_by']}", note)
 
 
-LEAST_P = 0.0005
-"""P-values up to this are not printed. The null distribution (without any effect) has some thousand
-draws, so smaller values are not resolved."""
-ALONE = (
-    "All {count} candidates, each fitted alone before anything was named. The gain is the fall of "
-    "the whitened squared error on stretches that were left out of its fit."
-)
-CHANGED = (
-    "The candidates whose gain is close to the best, each fitted alone before anything was named. "
-    "The gain is the fall of the whitened squared error of the flights' means, less two for each "
-    "fitted number."
-)
-"""Explanations of the table of candidates; the second is for a change since reference flights."""
-
-
 def candidates_section(diagnosis: Diagnosis) -> Section:
     """Return the gain of each candidate when it is fitted alone, for each source of evidence."""
     parts: list[Part] = []
@@ -141,7 +135,8 @@ def candidates_section(diagnosis: Diagnosis) -> Section:
         words += (
             f" P is the probability that the best of all candidates gains as much by chance, left "
             f"out up to {LEAST_P:g}. Effects are named one after another while p is at most "
-            f"{finding.search.judged.evidence.name_p_value:g}; then all are refitted jointly."
+            f"{finding.search.judged.evidence.limits.name_p_value:g}; then all are refitted "
+            "jointly."
         )
         if scores[0].chance > 0.0:
             words += f" By chance the best gain is above {scores[0].chance:.1f} once in 100."
@@ -217,10 +212,7 @@ def residual_section(result: Mapping[str, Any]) -> Section:
 
 
 def evidence_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section:
-    """Return a table of the gaps on held-out flights.
-
-    They are those of the vehicle as given, with the named effects, and with a wrong effect.
-    """
+    """Return a table of the gaps on held-out flights: as given, named, and with a wrong effect."""
     main = diagnosis.main
     gaps = {"as given": main.before}
     if main.control is not None:

@@ -52,13 +52,14 @@ HEADINGS = {
     False: {False: "Wrong or missing in the vehicle file:", True: "Wrong in the logs:"},
     True: {False: "Changed in the vehicle:", True: "Changed in the logs:"},
 }
-"""Headings of named effects, by whether a change was searched for, and whether they are of the
-log."""
+"""Headings of named effects, by whether a change was searched for, and whether of the log."""
 UNTESTED = "Whether the file itself is right was not tested: for that, leave out --reference."
 CHECK = (
     "Verify the signals: a log's errors resemble physics. Read the notes of suite check: a small "
     "error of a scale or a filter is a note, and stops no diagnosis."
 )
+LEAST_SHOWN = 0.001
+"""A smaller gap is printed as "less than" this value, in the unit of the gap."""
 
 
 def headline(result: Mapping[str, Any]) -> str:
@@ -211,11 +212,6 @@ def _search_for(unexplained: Mapping[str, Any]) -> list[str]:
     return steps
 
 
-LEAST_SHOWN = 0.001
-"""A smaller gap is printed as "less than" this value, in the unit of the gap (times the noise,
-m/s^2 or rad/s^2)."""
-
-
 class Component(NamedTuple):
     """One value of a named effect, for people: a parameter, or one axis of it."""
 
@@ -256,10 +252,9 @@ class Component(NamedTuple):
 
 
 def in_digits(number: float, interval: Sequence[float]) -> str:
-    """Return `number` rounded to the second significant digit of its interval's half-width.
+    """Return `number` to the second significant digit of half the `interval` (value, low, high).
 
-    `interval` is (value, low, high). Small numbers, and those with no digit behind the point, are
-    written with an exponent.
+    Small numbers, and those with no digit behind the point, are written with an exponent.
     """
     half, size = 0.5 * (interval[2] - interval[1]), max(abs(n) for n in interval)
     if half <= 0.0 or not np.isfinite(half):

@@ -40,12 +40,18 @@ from suite.diagnose.evidence.views import ViewBlock, ViewEvidence, view_candidat
 from suite.diagnose.search.evaluation import NamedEffect, SearchResult
 from suite.diagnose.thresholds import Thresholds
 
+BALANCE = {"force": (("thrust_scale",),), "torque": (("com_offset",), ("torque_trim",))}
+"""Effects that are fitted to the reference flights, by view and one group after another. So the
+search for changes starts from a vehicle whose mean forces and torques are those of the real one."""
+BOUND_SHARE = 0.1
+"""Parameters may exceed their physical bounds by this share of a change, because of noise."""
+
 
 def _motion_inputs(task: ViewEvidence, theta: np.ndarray) -> np.ndarray:
-    """Return the inputs (M, 9) of a regression that explains a model's error by the motion.
+    """Return the inputs (M, 9) of a regression of a model's error on the motion, without means.
 
     They are the velocity, the speed times the velocity, and the model's accelerations at `theta`
-    (P,), which stand for an error of its gain or delay; all without each flight's mean.
+    (P,), which stand for an error of its gain or delay.
     """
     motion = []
     for flight in task.flights:
@@ -55,11 +61,6 @@ def _motion_inputs(task: ViewEvidence, theta: np.ndarray) -> np.ndarray:
     data = task.residuals(theta)
     inputs = np.concatenate([np.concatenate(motion), data.value], axis=1)
     return centred(inputs, data.flight)
-
-
-BALANCE = {"force": (("thrust_scale",),), "torque": (("com_offset",), ("torque_trim",))}
-"""Effects that are fitted to the reference flights, by view and one group after another. So the
-search for changes starts from a vehicle whose mean forces and torques are those of the real one."""
 
 
 def fit_balance(reference: ViewEvidence) -> np.ndarray:
@@ -78,9 +79,9 @@ def fit_balance(reference: ViewEvidence) -> np.ndarray:
 def less_reference_residual(
     reference: ViewEvidence, theta: np.ndarray, flights: Sequence[SmoothedFlight]
 ) -> ViewEvidence:
-    """Return the evidence of `flights`, from which the reference flights' residual is subtracted.
+    """Return the evidence of `flights` less the residual of `reference` at `theta` (P,).
 
-    That residual, at `theta` (P,), is described by its mean and a ridge regression on the motion.
+    That is its mean and a ridge regression on the motion.
     """
     data, inputs = reference.residuals(theta), _motion_inputs(reference, theta)
     deviation = centred(data.residual, data.flight)
@@ -98,8 +99,7 @@ class RotorSpread:
     """Spread from flight to flight of one unchanged vehicle, relative to a rotor's thrust."""
 
     share: float
-    """Standard deviation from flight to flight, relative to a rotor's thrust, pooled over all
-    axes."""
+    """Standard deviation between flights, relative to a rotor's thrust, pooled over all axes."""
     freedom: int
     """Degrees of freedom of this pooled estimate."""
     along: Mapping[str, np.ndarray]
@@ -122,8 +122,7 @@ class RotorSpread:
     ) -> np.ndarray:
         """Return draws (D, 3) of the estimated variance over the true one, by axis of `view`.
 
-        All axes have the same true variance here. Where the estimate is too small by chance, any
-        change seems too large, which the draws take into account.
+        Where the estimate is too small by chance, any change seems too large.
         """
         freedom = np.concatenate(list(self.freedom_along.values()))
         square = rng.chisquare(np.maximum(freedom, 1e-9), (limits.change_draws, len(freedom)))
@@ -142,7 +141,7 @@ def _moderated(
 def rotor_gain(task: ViewEvidence) -> np.ndarray:
     """Return the accelerations (3,) by a relative change of a rotor's thrust, in the view's unit.
 
-    Along each axis this is the root of the sum of the four rotors' squared accelerations.
+    It is the root of the sum of the four rotors' squares.
     """
     space = task.model.space
     weak_motor = [i for i, entry in enumerate(space.entries) if entry.effect == "weak_motor"]
@@ -191,11 +190,6 @@ class ChangeEvidence(ViewEvidence):
         """(3,) standard deviation of flights' means, without errors of the gains."""
         return self.exact_weights.trim
 
-    @property
-    def name_p_value(self) -> float:
-        """Probability that a step of the search names a change although nothing has changed."""
-        return self.limits.change_p_value
-
     def estimate_noise(self, at: Estimate) -> Evaluation:
         """Evaluate this evidence with its noise unchanged, since it is known; see `Evidence`."""
         return self.relinearise(at)
@@ -203,10 +197,7 @@ class ChangeEvidence(ViewEvidence):
     def scores(
         self, current: Evaluation, named: Sequence[int], among: Sequence[Candidate], seed: int
     ) -> list[CandidateScore]:
-        """Return the scores of all candidates close to the best, best first, see `Evidence`.
-
-        The means of few flights contain little information: nearly every candidate is close.
-        """
+        """Return the scores of all candidates close to the best, as most are with few means."""
         block, theta = current.block, current.at.theta
         assert isinstance(block, ViewBlock) and self.weights
         weights = self.weights if named else self.exact_weights
@@ -218,10 +209,8 @@ class ChangeEvidence(ViewEvidence):
         slope = whitened(block.data, weights)[1]
         ratios = self.spread.variance_ratios(self.view.name, self.limits, rng)
         views = len(self.spread.along)  # Bonferroni's correction for the views
-        p_values = [
-            min(views * p, 1.0)
-            for p in corrected_p_values(gains, slope, groups, named, ratios, rng)
-        ]
+        by_view = corrected_p_values(gains, slope, groups, named, ratios, rng)
+        p_values = [min(views * p, 1.0) for p in by_view]
         scores = [
             CandidateScore(candidate, gain - 2.0 * len(candidate.indices), p_value, 0.0)
             for candidate, gain, p_value in zip(among, gains, p_values, strict=True)
@@ -265,16 +254,12 @@ def change_evidence(
     with_gain_error = weights._replace(trim=np.hypot(trim, task.limits.gain_error * mean_change))
     # The means contain little information: every candidate that explains them is an alternative,
     # even one that explains much less than the best (a share of 1 switches that limit off).
-    limits = replace(task.limits, rival_share=1.0)
+    limits = replace(task.limits, rival_share=1.0, name_p_value=task.limits.change_p_value)
     evidence = ChangeEvidence(
         task.view, task.model, flights, task.carried, True, with_gain_error,
         exact_weights=weights, spread=spread, limits=limits,
     )  # fmt: skip
     return evidence.relinearise(Estimate(start))
-
-
-BOUND_SHARE = 0.1
-"""Parameters may exceed their physical bounds by this share of a change, because of noise."""
 
 
 def within_flights(data: ViewData) -> ViewData:
@@ -285,10 +270,7 @@ def within_flights(data: ViewData) -> ViewData:
 
 
 def equations_by_flight(inside: ViewData, scatter: np.ndarray) -> NormalEquations:
-    """Return the normal equations of each flight alone, along all parameters.
-
-    `inside` is from `within_flights`; `scatter` (3,) is the noise along each axis.
-    """
+    """Return the normal equations of each flight alone, with the noise `scatter` (3,) by axis."""
     numbers, place = np.unique(inside.flight, return_inverse=True)
     residual, slope = inside.residual / scatter, inside.slope / scatter[:, None]
     along, start_s = range(slope.shape[2]), np.zeros(len(numbers))
@@ -306,8 +288,7 @@ def search_motion_change(
 ) -> SearchResult | None:
     """Return the candidate that has changed since `reference`; None where none is significant.
 
-    Its parameters are total values, not changes. Both sets need at least two flights. Bonferroni's
-    correction counts the searched `views`.
+    Its parameters are totals. Each set needs two flights; `views` are those that are searched.
     """
     start, limits, space = fit_balance(reference), task.limits, task.space
     sets = [within_flights(one.residuals(start, None)) for one in (reference, task)]

@@ -26,8 +26,7 @@ class NamedEffect:
     rivals: tuple[str, ...] = ()
     """Names of the alternatives: effects that explain the flights about as well."""
     worse_by: dict[str, float] = field(default_factory=dict)
-    """How much worse another candidate in place of this effect fits, by its label: the rise of
-    chi-square plus number of parameters."""
+    """Rise of chi-square plus number of parameters with another candidate instead, by its label."""
     gains: tuple[float, ...] = ()
     """Fall of each flight's squared error, with the parameters fitted to the other flights."""
     share: float = 0.0
@@ -40,10 +39,10 @@ def fitted_by(named: Sequence[NamedEffect]) -> list[int]:
 
 
 def with_inactive(current: Evaluation, among: Sequence[Candidate]) -> Evaluation:
-    """Return the evaluation `current` with further columns for inactive parameters.
+    """Return the evaluation `current` with further columns for inactive parameters, and secants.
 
-    Without a drag, a wind's column of slopes is zero. Then a second column is added, computed with
-    a drag of usual size (see `inactive_at`). Some columns become secants (see `with_secants`).
+    Without a drag, a wind's column of slopes is zero. A second column is then computed with a drag
+    of usual size (see `inactive_at`).
     """
     evidence, at, _ = current
     block = with_secants(current, among)
@@ -64,9 +63,9 @@ def with_inactive(current: Evaluation, among: Sequence[Candidate]) -> Evaluation
 def with_secants(current: Evaluation, among: Sequence[Candidate]) -> Block:
     """Return the block with secants in place of tangents where these lead to a worse minimum.
 
-    A delay longer than the time between two rows is such a case. So the model is evaluated at the
-    parameter's values `tried`. If the best of them lowers chi-square more than a linear fit along
-    the tangent, the column becomes the secant to this value. A fit's first step then leads there.
+    A delay longer than the time between two rows is such a case. If the best of the values `tried`
+    lowers chi-square more than a linear fit along the tangent, the column becomes the secant to
+    this value, to which a fit's first step then leads.
     """
     evidence, at, block = current
     entries, start = evidence.space.entries, evidence.space.array("start")
@@ -76,7 +75,7 @@ def with_secants(current: Evaluation, among: Sequence[Candidate]) -> Block:
         column = block.along.index(index)
         tangent = block.slope[..., column]
         fall = float((tangent * block.residual).sum()) ** 2 / max(float((tangent**2).sum()), TINY)
-        least, secant = float((block.residual**2).sum()) - fall, None
+        least = float((block.residual**2).sum()) - fall
         for value in entries[index].tried:
             if value == start[index]:
                 continue
@@ -85,15 +84,10 @@ def with_secants(current: Evaluation, among: Sequence[Candidate]) -> Block:
             far = evidence.linearise(Estimate(theta, at.free), ())
             chi2, change = float((far.residual**2).sum()), value - start[index]
             if chi2 < least:  # never where the model diverges
-                least = chi2
-                secant = (
-                    (block.residual - far.residual) / change,
-                    (block.free - far.free) / change,
-                )
-        if secant is not None:
-            slope, free_slope = block.slope.copy(), block.free_slope.copy()
-            slope[..., column], free_slope[..., column] = secant
-            block = replace(block, slope=slope, free_slope=free_slope)
+                least, slope, free_slope = chi2, block.slope.copy(), block.free_slope.copy()
+                slope[..., column] = (block.residual - far.residual) / change
+                free_slope[..., column] = (block.free - far.free) / change
+                block = replace(block, slope=slope, free_slope=free_slope)
     return block
 
 
@@ -117,7 +111,7 @@ def linear_change(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the change (P,) of all parameters by one linear fit, and the information (P,) on each.
 
-    Only the parameters of `candidate` and those at `others` are fitted; the others do not change.
+    Fitted are the parameters of `candidate` and those at `others`.
     """
     equations, theta = start.block.equations, start.at.theta
     fitted = equations.take(sorted({*others, *equations.columns_of(candidate)}))
@@ -129,10 +123,7 @@ def linear_change(
 
 
 def cross_validated_chi2(current: Evaluation, indices: Sequence[int]) -> np.ndarray:
-    """Return the squared error (G,) of each group of stretches, fitted to the other groups.
-
-    The fit is linear about the estimate of `current`. Fitted are the parameters at `indices`.
-    """
+    """Return the squared error (G,) of each group of stretches by a linear fit to the others."""
     equations = current.block.equations.along_numbers(sorted(indices))
     theta, space, errors = current.at.theta, current.evidence.space, []
     group = validation_groups(current.block.flight)

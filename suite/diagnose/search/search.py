@@ -112,10 +112,9 @@ def _best_candidate(
 ) -> tuple[NamedEffect, Estimate] | None:
     """Return the candidate of `among` that explains most in addition to `named`, and its fit.
 
-    None where no candidate passes all tests. `current` is the evaluation with the present names.
-    `known` are the scores of the candidates, if they were computed before. `tested` is a candidate
-    that was taken out of `current`, to be tested against the others. If given, all that could
-    replace it are fitted, significant or not.
+    None where none passes all tests. `current` is the evaluation with the present names, and
+    `known` the scores, if computed before. `tested` was taken out of `current`, to be tested
+    against all that could replace it, significant or not.
     """
     evidence, limits, space = current.evidence, current.evidence.limits, current.evidence.space
     others = fitted_by(named)
@@ -129,7 +128,7 @@ def _best_candidate(
         shortlist = [
             c
             for c, score in scores.items()
-            if score.p_value <= evidence.name_p_value and score.gain >= least
+            if score.p_value <= limits.name_p_value and score.gain >= least
         ]
     # ... that could be the best to first order, and of the single effects only the first few.
     equations, theta = current.block.equations, current.at.theta
@@ -168,13 +167,13 @@ def _best_candidate(
     explained = chi2_before - chi2_fall(equations, theta, space, others) - lowest
     allowed = max(min(limits.rival_chi2, limits.rival_share * explained), 0.0)
     close = [trial for trial in trials if trial.cost - lowest <= allowed]
-    significant = [trial for trial in close if trial.name.p_value <= evidence.name_p_value]
+    significant = [trial for trial in close if trial.name.p_value <= limits.name_p_value]
     if not significant and tested:
         # A large effect is not linear, and its score without it may be wrong: test it at its fit.
         at_fit = [trial for trial in close if trial.name.candidate == tested]
         p_values = [_p_value_at_fit(task, current, others, unnamed, trial) for trial in at_fit]
         significant = [
-            trial for trial, p in zip(at_fit, p_values, strict=True) if p <= evidence.name_p_value
+            trial for trial, p in zip(at_fit, p_values, strict=True) if p <= limits.name_p_value
         ]
     if not significant:
         return None
@@ -219,8 +218,8 @@ def _replace_or_drop(
 ) -> tuple[list[NamedEffect], Estimate]:
     """Test the name at `place` of `named` as if it were added last, against the candidates `among`.
 
-    The best candidate takes its place; that may be the same effect. If none passes, the name is
-    dropped. Returned are the new names and their fit.
+    The best candidate takes its place, which may be the same effect; if none passes, it is dropped.
+    Returned are the new names and their fit.
     """
     tested, theta = named[place].candidate, at.theta.copy()
     theta[list(tested.indices)] = evidence.space.array("start")[list(tested.indices)]
@@ -237,7 +236,7 @@ def _replace_or_drop(
 def _drop_unneeded(
     task: SearchTask, evidence: Evidence, at: Estimate, named: list[NamedEffect], last_tested: bool
 ) -> tuple[list[NamedEffect], Estimate]:
-    """Return the names that are significant in addition to all others, and the fit with them.
+    """Return the names that are significant next to all others, and their fit.
 
     With `last_tested` the last name has just been tested, and is not tested again.
     """
@@ -276,9 +275,8 @@ def could_be_best(
 ) -> bool:
     """Return whether `candidate` could be the best after a fit of the full model.
 
-    `falls` holds the fall of chi-square by each candidate, computed to first order. That is inexact
-    for large effects, so a candidate may be somewhat below the largest. A composite also has to
-    explain clearly more than each of its parts.
+    `falls` are falls of chi-square to first order, which is inexact for large effects. A composite
+    also has to explain clearly more than each of its parts.
     """
     fall, largest = falls.get(candidate, -np.inf), max(falls.values())
     by_part = max((falls.get(part, 0.0) for part in candidate.parts), default=-np.inf)

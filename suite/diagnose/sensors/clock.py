@@ -47,7 +47,6 @@ class Clock(NamedTuple):
 
 def clock_of(log: FlightLog) -> Clock:
     """Return the shift between the times of gyro and reference in a flight."""
-    # Compute how badly the rates match, for each block and shift.
     no_shift = Clock(np.zeros(1), np.zeros(1))
     grid = np.arange(log.time_s[0], log.time_s[-1], STEP_S)
     size = round(BLOCK_S / STEP_S)
@@ -69,7 +68,6 @@ def clock_of(log: FlightLog) -> Clock:
         # A rate is a mean over 2 * SPAN_ROWS grid steps, so only one of so many is independent.
         cost = misfit / (2.0 * variance * 2 * SPAN_ROWS)
         path = _most_probable(cost, change)
-    # Keep the path if it is significant.
     gain = (cost[:, zero] - cost[all_blocks, path]).sum()
     shift_s = shifts_s[path]
     row_s = float(np.median(np.diff(log.time_s)))
@@ -82,11 +80,9 @@ def clock_of(log: FlightLog) -> Clock:
 def _misfits(
     log: FlightLog, grid: np.ndarray, shifts_s: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compare the rates of gyro and reference on the times `grid` (M * `size`,) at each shift.
+    """Return sums of squared differences of the rates (M, S), and numbers of compared times (M,).
 
-    Returns:
-        The sum of squared differences (M, S) in each block of `size` times at each shift, and the
-        number of times (M,) of each block that are compared.
+    They are for blocks of `size` of the times `grid`, and for each shift of `shifts_s` (S,) [s].
     """
     half_s = SPAN_ROWS * STEP_S
     rot_w = attitude_at(grid, log.time_s, log.quat_wxyz)
@@ -112,8 +108,7 @@ def _misfits(
 def _most_probable(cost: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Return the path of least cost: the index of the shift in each block, (M,).
 
-    `cost` (M, S) is that of each shift in each block. `change` (S, S) is the cost of another shift
-    in the next block.
+    `cost` (M, S) is that of a shift in a block, `change` (S, S) that of another in the next block.
     """
     # Forward: the least cost of a path to each shift, and the shift in the block before it.
     total, origins = cost[0], list[np.ndarray]()

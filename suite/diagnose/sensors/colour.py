@@ -43,8 +43,7 @@ TINY_S = 1e-6
 LOG_RATIO = (-7.0, -0.7)
 """Bounds of log T_f / T, the fast correlation time over the slow one."""
 LONGEST_NEW = 0.3
-"""A fast correlation time below this share of the time between rows counts as 0: rows do not
-show it."""
+"""A fast correlation time below this share of the rows' distance counts as 0."""
 
 
 class Series(NamedTuple):
@@ -80,10 +79,7 @@ class Coloured(NamedTuple):
     """Standard deviation, over flights, of the part of the error that is constant in a flight."""
 
     def correlation(self, lag_s: np.ndarray, duration_s: float) -> np.ndarray:
-        """Return the autocorrelation (L,) that a flight of `duration_s` shows on average.
-
-        The mean of the flight is subtracted from its errors, which removes a part of slow errors.
-        """
+        """Return the autocorrelation (L,) about the mean of a flight of `duration_s`."""
         colour = Colour(self.fast.value, self.fast_s.value, self.lasts_s.value)
         mean_share = colour.mean_variance(duration_s)
         return (colour.correlation(lag_s) - mean_share) / (1.0 - mean_share)
@@ -173,15 +169,11 @@ def _colour(theta: np.ndarray) -> Colour:
 def _noise(
     flights: Sequence[Series], variograms: _Variograms, lag_s: np.ndarray, walk: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit the noise in addition to a given random walk.
+    """Fit the noise in addition to a random walk of the variance `walk` for each metre.
 
     The fast process is used only if its share is significant. `lag_s` (L,) are the lags of the
-    variograms [s], whose last column is the variance about the mean; `walk` is the variance of the
-    random walk for each metre.
-
-    Returns:
-        The parameters log v, f, log (T_f / T) and log T (4,), and the half-widths of their
-        intervals.
+    variograms [s], whose last column is the variance about the mean. Returned are log v, f, log
+    (T_f / T) and log T (4,), and the half-widths of their intervals.
     """
     duration_s = float(np.mean([flight.duration_s for flight in flights]))
     measured = variograms.value
@@ -260,8 +252,8 @@ def _variograms(
 ) -> _Variograms | None:
     """Return the variograms of all stretches at the lags (L,); None for less than two stretches.
 
-    With `about_mean` there is one more column: the mean square of the errors of each stretch about
-    the mean of its flight. A stretch without a pair of rows, such as one row, is left out.
+    With `about_mean` there is one more column: the mean square about the mean of the flight. A
+    stretch without a pair of rows is left out.
     """
     values, counts, speeds, flight_of = [], [], [], []
     for number, flight in enumerate(flights):
@@ -299,20 +291,13 @@ def _variograms(
 
 
 def _half_widths(slope: np.ndarray, residual: np.ndarray, flight: np.ndarray) -> np.ndarray:
-    """Return the half-widths (K,) of the 95 % intervals of K parameters.
-
-    `slope` (B, L, K) and `residual` (B * L,) are those of the fit, and `flight` (B,) is the number
-    of each stretch's flight.
-    """
+    """Return the half-widths (K,) of 95 % intervals by slopes (B, L, K) and residuals (B * L,)."""
     equations = normal_equations(slope, residual.reshape(slope.shape[:2]), flight)
     return intervals95(equations, DIFFER_P, leave_out=True, noise_share=0.0).half_width
 
 
 def _bias(flights: Sequence[Series], variance: float, colour: Colour) -> Interval:
-    """Return the standard deviation of the constant error of a flight.
-
-    The mean of a flight's errors also contains the mean of the noise, whose variance is subtracted.
-    """
+    """Return the standard deviation, over flights, of the mean error, without that by noise."""
     flights = [flight for flight in flights if np.isfinite(flight.value).any()]
     means, count = np.array([np.nanmean(flight.value) for flight in flights]), len(flights)
     noise = variance * np.mean([colour.mean_variance(f.duration_s) for f in flights])

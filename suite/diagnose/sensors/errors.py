@@ -40,6 +40,22 @@ LEAST_S = 8.0
 """Least length of a flight; errors are correlated over seconds [s]."""
 ZERO = Interval(0.0, 0.0, 0.0)
 """A parameter that is not in the model."""
+STRETCH_S = 5.0
+"""Errors further apart than this count as independent [s]."""
+ROUNDS = 3
+"""Number of rounds of the fit; each is linearised at the delay of the round before."""
+TILT = slice(6, 9)
+"""Channels of the attitude among the errors. All three axes are fitted: if a body leans, a tilt
+about a horizontal world axis has a part about the body's z axis."""
+DELAY = Unknown("delay", 0.0, -1.0, 1.0, np.inf, 1e-3)
+SCALE = Unknown("scale", 0.0, -1.0, 1.0, np.inf, 1e-3)
+DRAG = Unknown("drag", 0.3, -2.0, 5.0, np.inf, 1e-2)
+LOG_LASTS = Unknown("log_lasts", 0.0, np.log(0.05), np.log(10.0), np.inf, 1e-2)
+"""The fitted parameters: change of the delay [s], relative scale error of the velocity, drag [1/s],
+and logarithm of the tilt's correlation time in seconds. The drag does not start at 0, where the
+correlation time has no effect."""
+LOG_LIMITS = (-20.0, 20.0)
+"""Limits of the logarithm of the correlation time's interval."""
 
 
 class Errors(NamedTuple):
@@ -48,8 +64,8 @@ class Errors(NamedTuple):
     step_s: float
     """Time between rows [s]."""
     value: np.ndarray
-    """(T, 9) estimate minus reference: position in world axes [m], velocity [m/s] and attitude
-    [rad] in body axes."""
+    """(T, 9) estimate minus reference: world position [m], body velocity [m/s] and attitude
+    [rad]."""
     slope: np.ndarray
     """(T, 9) time derivative of the reference, in the same axes."""
     vel_b: np.ndarray
@@ -62,9 +78,7 @@ class Errors(NamedTuple):
 
 
 def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
-    """Return the errors of the estimate in `log` relative to the reference.
-
-    The estimate is late by `late_s` [s]; it is compared with the reference so much earlier.
+    """Return the errors of the estimate in `log` relative to the reference `late_s` [s] earlier.
 
     Raises:
         FlightLogError: if the log has no estimate, no reference for it, or is too short.
@@ -117,10 +131,7 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
 
 
 def rotation_between(rot_w: np.ndarray, other_w: np.ndarray) -> np.ndarray:
-    """Return rotation vectors (T, 3) from `rot_w` to `other_w` in body axes [rad]; NaN is kept.
-
-    Both (T, 3, 3) are rotations from body to world.
-    """
+    """Return rotation vectors (T, 3) from `rot_w` to `other_w` (T, 3, 3), in body axes [rad]."""
     relative = np.matmul(np.swapaxes(rot_w, -1, -2), other_w)
     good = np.isfinite(relative).all(axis=(1, 2))
     rotation_b = np.full((len(relative), 3), np.nan)
@@ -139,32 +150,11 @@ def _estimate(log: FlightLog, group: str) -> np.ndarray | None:
 
 
 def _differentiated(values: np.ndarray, step_s: float) -> np.ndarray:
-    """Return the time derivative of `values` (T, C); NaN near missing values.
-
-    It is the slope of a parabola that is fitted to `SLOPE_ROWS` rows.
-    """
+    """Return the time derivative of `values` (T, C), by parabolas; NaN near missing values."""
     if len(values) < SLOPE_ROWS:
         return np.full_like(values, np.nan)
     slope = savgol_filter(values, SLOPE_ROWS, 2, deriv=1, delta=step_s, axis=0, mode="nearest")
     return np.asarray(slope)
-
-
-STRETCH_S = 5.0
-"""Errors further apart than this count as independent [s]."""
-ROUNDS = 3
-"""Number of rounds of the fit; each is linearised at the delay of the round before."""
-TILT = slice(6, 9)
-"""Channels of the attitude among the errors. All three axes are fitted: if a body leans, a tilt
-about a horizontal world axis has a part about the body's z axis."""
-DELAY = Unknown("delay", 0.0, -1.0, 1.0, np.inf, 1e-3)
-SCALE = Unknown("scale", 0.0, -1.0, 1.0, np.inf, 1e-3)
-DRAG = Unknown("drag", 0.3, -2.0, 5.0, np.inf, 1e-2)
-LOG_LASTS = Unknown("log_lasts", 0.0, np.log(0.05), np.log(10.0), np.inf, 1e-2)
-"""The fitted parameters: change of the delay [s], relative scale error of the velocity, drag [1/s],
-and logarithm of the tilt's correlation time in seconds. The drag does not start at 0, where the
-correlation time has no effect."""
-LOG_LIMITS = (-20.0, 20.0)
-"""Limits of the logarithm of the correlation time's interval."""
 
 
 class Systematic(NamedTuple):
@@ -239,10 +229,7 @@ def _neglected_drag(flights: Sequence[Errors]) -> tuple[Interval, Interval]:
 
 
 def _lean(flight: Errors, lasts_s: float) -> np.ndarray:
-    """Return the attitude error (T, 3) in body axes for a drag of 1/s, see `drag_tilt`.
-
-    `lasts_s` is the correlation time [s].
-    """
+    """Return the attitude error (T, 3) in body axes for a drag of 1/s, see `drag_tilt`."""
     lean_w = follow_lag(np.nan_to_num(flight.lean_w), flight.step_s, lasts_s)
     return to_local(flight.rot_w, lean_w[-len(flight.value) :])
 
@@ -255,10 +242,7 @@ def _without_scale(flight: Errors, scale: float) -> np.ndarray:
 
 
 def _size(values: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the RMS (C,) of errors (T, C) of each flight about the flight's mean.
-
-    It serves as noise of a fit, which explains a small part of the errors.
-    """
+    """Return the RMS (C,) of errors (T, C) about each flight's mean, as the noise of a fit."""
     known = [np.ma.masked_invalid(one) for one in values]
     squares = np.ma.concatenate([(one - one.mean(axis=0)) ** 2 for one in known])
     return np.maximum(np.sqrt(squares.mean(axis=0)).filled(1.0), 1e-150)

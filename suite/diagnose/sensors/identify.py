@@ -38,8 +38,7 @@ from suite.diagnose.sensors.errors import (
 SCHEMA = 1
 """Version of the JSON that `suite identify --sensors` prints."""
 WITHIN = 0.2
-"""A model fits if its autocorrelation differs by at most this from the measured one, at every lag
-(time difference)."""
+"""Largest difference between the autocorrelations of a model that fits and of the flights."""
 
 
 class Fitted(NamedTuple):
@@ -89,10 +88,9 @@ def fit_sensors(logs: Sequence[FlightLog]) -> Fitted:
 
 
 def held_out(logs: Sequence[FlightLog]) -> dict[str, HeldOut]:
-    """Compare a model that was fitted to half of the flights with the other half.
+    """Compare a model that was fitted to half of the flights with the other half, both ways.
 
-    Both halves are held out in turn. The result has the larger difference, by axis. It is empty for
-    a single flight.
+    The result has the larger difference, by axis. It is empty for a single flight.
     """
     worst: dict[str, HeldOut] = {}
     for half in (0, 1) if len(logs) > 1 else ():
@@ -171,14 +169,11 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
     """Fit a sensors model to the estimates in flight logs, and write its file.
 
     A log without an estimate gives a warning, as does each fault that the checks of a log find.
-
-    Returns:
-        The JSON object that `--json` prints.
+    Returned is the JSON object that `--json` prints.
 
     Raises:
         ValueError: if no log has both an estimate and a reference, or no axis has enough data.
     """
-    # Read the logs, and leave out those that have no estimate or no reference.
     checked = read_checked(flights, CheckContext(), list(FAULTS), partial=True)
     used, seconds, refused = [], 0.0, []
     for log in checked.logs:
@@ -206,7 +201,6 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
             "no axis of the estimate has two stretches of 5 s without a hole; fly longer, or log "
             "the estimate and the reference in the same rows"
         )
-    # Write the file, with a header that states all intervals.
     parameters = parameters_of(fitted)
     header = [f"An on-board estimate against a reference in {len(used)} flights; 95 % intervals:"]
     if clocks_s:

@@ -20,19 +20,15 @@ from suite.diagnose.sources.source import TOGETHER, TOO_SMALL, Finding, Source
 from suite.diagnose.verdict.gap import EffectSize, Gap
 
 CONTRADICTION = 1.5
-"""Two values of a parameter contradict each other if they differ by more than this many times the
-sum of the half-widths of their 95 % intervals."""
+"""Two values contradict each other if they differ by more than this many sums of half-widths."""
 
 
 def examine(
     source: Source, earlier: Sequence[Finding], say: Callable[[str], None], seed: int
 ) -> tuple[Finding, list[str]]:
-    """Search for named effects with one source, and test them.
+    """Search for named effects with one source, and test them; return the finding and warnings.
 
     Effects that contradict the first of the `earlier` findings are left out.
-
-    Returns:
-        The finding, and warnings for people.
     """
     # Search. If an earlier source contradicts some of the effects, search again without them.
     # (Not if a change since reference flights is searched for, as `names_small` shows.)
@@ -53,8 +49,7 @@ def examine(
     if not found.named and source.fallback:
         by_fallback = source.fallback.search(say, seed)
         source, found = (source.fallback, by_fallback) if by_fallback.named else (source, found)
-    # Test on held-out flights: first all named effects together, then (in rollouts) each
-    # one alone.
+    # Test on held-out flights: first all named effects together, then (in rollouts) each alone.
     before = after = source.gap(found, found.start.theta)
     if found.named:
         after = source.gap(found, found.estimate.theta)
@@ -73,14 +68,12 @@ def examine(
     if too_small:
         without = _without_each(source, found)
     for name, size in too_small:
-        is_relevant = size.relevant(source.limits)
         reason = "too small to matter"
-        if is_relevant:
+        if size.relevant(source.limits):
             reason = "no larger than the model's own error, or the other effects cancel it"
         warnings.append(f"{name}: left out, {reason}: {size.words()}")
     if not source.small_explains:
         explained = found, (before, after)
-    # Analyse the remaining error.
     remaining = source.remaining(*explained, seed)
     if too_small and source.small_explains and not remaining.wind:
         remaining = remaining._replace(reason=TOO_SMALL)
@@ -107,10 +100,7 @@ def examine(
 
 
 def without_names(finding: Finding, seed: int) -> Finding:
-    """Return `finding` without its named effects, if these leave most of the gap.
-
-    All of the error then counts as unexplained.
-    """
+    """Return `finding` without its named effects: all of the error counts as unexplained."""
     bare, with_names = finding.search.refitted(()), finding.remaining
     remaining = finding.source.remaining(bare, (finding.before, finding.before), seed)
     # Without the names an error of the model may oscillate. A swing (an oscillating force) counts
@@ -131,12 +121,11 @@ def confirmed(
 
     If the error stays above the noise floor, model errors bias every parameter. An effect then has
     to lower the squared error by a share of the remaining error. An effect is kept if the held-out
-    flights are not sensitive to it, such as the ground effect in high flights. `after` is the gap
-    with all named effects.
+    flights are not sensitive to it, such as the ground effect in high flights.
 
     Returns:
-        The result with the confirmed effects, the gap with them, the gap without each of them (by
-        its label), and the labels of the withdrawn effects.
+        The result with the confirmed effects, the gap with them (at first `after`), the gap without
+        each of them (by its label), and the labels of the withdrawn effects.
     """
     withdrawn, limits = list[str](), source.limits
     while found.named:
@@ -173,12 +162,12 @@ def relevant_part(
 ) -> tuple[SearchResult, Gap, dict[str, EffectSize], list[tuple[str, EffectSize]]]:
     """Leave out the effects below the threshold of relevance.
 
-    If all named effects together are below it, only faults of the log may be named. `gaps` are the
-    gap without any named effect and the gap with all of them.
+    If all named effects together are below it, only faults of the log may be named. `gaps` are
+    those without any named effect and with all of them.
 
     Returns:
-        The result with the relevant effects, the gap with them, the sizes of these effects by name,
-        and the names and sizes of the effects that were left out.
+        The result with the relevant effects, the gap with them, their sizes by name, and the names
+        and sizes of the effects that were left out.
     """
     (before, after), left_out = gaps, list[tuple[str, EffectSize]]()
     all_are_small: bool | None = None
@@ -203,10 +192,9 @@ def relevant_part(
 
 
 def control(source: Source, found: SearchResult) -> tuple[str, Gap] | None:
-    """Return label and gap of a wrong effect, or None if there is none.
+    """Return label and gap of the best effect that is neither named nor an alternative, if any.
 
-    It is the best effect that is neither named nor an alternative. Its gap shows how much an effect
-    that is surely wrong would lower the error.
+    Its gap shows how much an effect that is surely wrong would lower the error.
     """
     excluded = {candidate.name for candidate in found.candidates}
     alternatives = [label for named in found.named for label in named.rivals]
@@ -238,8 +226,8 @@ def _without_each(source: Source, found: SearchResult) -> dict[str, Gap]:
 def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate, str]]:
     """Return the named effects of `found` that the evidence of `by` contradicts, and both values.
 
-    Each effect is fitted to that evidence, together with the effects that `by` names. It is
-    contradicted if a parameter differs significantly from its value in `found`.
+    Each effect is fitted to that evidence, with the effects that `by` names. It is contradicted if
+    a parameter differs significantly from its value in `found`.
     """
     refused = []
     widths = dict(zip(found.indices, found.half_widths(), strict=True))
@@ -263,13 +251,10 @@ def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate,
 
 
 def one_cause(findings: Sequence[Finding]) -> tuple[tuple[Finding, ...], list[str]]:
-    """Remove names so that each cause is named once.
+    """Return the findings with each cause named once, and a warning for each removed name.
 
     If two sources name the same effect, the name with the relatively narrower interval is kept. An
     effect is removed if one of its alternatives is named by another source.
-
-    Returns:
-        The findings with the remaining names, and a warning for each removed name.
     """
     kept, warnings = list(findings), list[str]()
     for index, finding in enumerate(kept):

@@ -30,7 +30,6 @@ from suite.diagnose.data.windows import (
 )
 from suite.diagnose.estimate.gauss_newton import TINY, Z95, solve
 from suite.diagnose.estimate.parameters import Candidate
-from suite.diagnose.estimate.permutation import folds_of
 from suite.diagnose.evidence.evidence import Evaluation
 from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.rollouts import (
@@ -85,7 +84,7 @@ SHAPES = 5
 
 
 def of_rollouts(evaluation: Evaluation) -> RolloutEvidence:
-    """Return the evidence of `evaluation`, which must be one of rollouts, with its exact type."""
+    """Return the evidence of an evaluation of rollouts, with its exact type."""
     assert isinstance(evaluation.evidence, RolloutEvidence)
     return evaluation.evidence
 
@@ -121,10 +120,7 @@ class RolloutSource(Source):
         return after.exceeds(before, overlap(self.held), self.limits)
 
     def would_show(self, found: SearchResult, candidate: Candidate) -> bool:
-        """Return whether held-out flights are sensitive to `candidate`, see `Source`.
-
-        They are if the effect's fitted size should change their slow errors significantly.
-        """
+        """Return whether `candidate` should change the slow held-out errors significantly."""
         theta, indices = found.estimate.theta, list(candidate.indices)
         linear = from_true_starts(self.model, theta, self.held, indices)
         whitening = make_whitening(linear, of_rollouts(found.last).noise, self.limits)
@@ -135,10 +131,9 @@ class RolloutSource(Source):
         return bool(expected_chi2 > self.limits.shown_chi2)
 
     def is_relevant(self, gap: Gap) -> bool:
-        """Return whether rollout errors may exceed the noise by a relevant amount.
+        """Return whether the upper end of the errors' 95 % interval exceeds the noise relevantly.
 
-        The upper end of the error's 95 % interval is compared with the thresholds. Rollouts overlap
-        in time. The number of independent rollouts is therefore the held-out time in seconds.
+        Rollouts overlap, so the number of independent ones is the held-out time in seconds.
         """
         force, torque, drift = self.limits.relevance
         independent = max(len(self.held.flight) * overlap(self.held), 1.0)
@@ -160,14 +155,11 @@ class RolloutSource(Source):
         """Return the sizes of the named effects on the fitted flights, see `Source`.
 
         If measured rotor speeds are the input, the model has a numerical error, since the speeds
-        between two rows are unknown. This error is subtracted before the upper end is computed. The
-        same holds for commands that the log lacks; the whole change then counts as the error.
-
-        To estimate it, the effect is fitted again with every second rotor speed only. Half of the
-        change counts as the error; for an error of second order it would be a third (step doubling;
-        Hairer, Norsett & Wanner 1993, Sec. II.4). Rows further apart than the rotors' lag (their
-        time constant) do not show all torque. The change then estimates the missing torque only to
-        a factor of two, so twice the change is subtracted (`coarser_share`).
+        between two rows are unknown. To estimate it, the effect is fitted again with every second
+        rotor speed only. Half of the change counts as the error; for an error of second order it
+        would be a third (step doubling; Hairer, Norsett & Wanner 1993, Sec. II.4). Rows further
+        apart than the rotors' lag show the torque only to a factor of two, so twice the change
+        counts (`coarser_share`). If the log lacks commands, the whole change counts.
         """
         model, estimate, indices = self.model, found.estimate, found.indices
         windows = of_rollouts(found.last).trusted
@@ -187,8 +179,7 @@ class RolloutSource(Source):
     def remaining(self, found: SearchResult, gaps: tuple[Gap, Gap], seed: int) -> Remaining:
         """Return the structure in the error that remains after `found`, see `Source`.
 
-        If there is structure, random wind and an oscillating force (swing) are tested, since no
-        parameter of the search reproduces them.
+        Random wind and an oscillating force (swing) are tested apart: no parameter reproduces them.
         """
         structure, wind = self._structure(found, seed)
         details = {
@@ -218,13 +209,11 @@ class RolloutSource(Source):
         self, found: SearchResult, seed: int
     ) -> tuple[ResidualStructure, TestedEffect | None]:
         """Return the structure in the remaining error, and the wind that may cause it."""
-        evidence, limits = of_rollouts(found.last), self.limits
-        windows = evidence.trusted
-        equations = disturbance_equations(evidence, windows, found.estimate)
-        fold = folds_of(windows.flight, windows.start_s, limits.folds)
-        residual = residual_structure(equations, fold, seed)
+        evidence = of_rollouts(found.last)
+        equations = disturbance_equations(evidence, evidence.trusted, found.estimate)
+        residual = residual_structure(equations, evidence.folds(found.last.block), seed)
         wind = self._wind(found, equations, residual)
-        is_significant = any(s.p_value <= limits.shape_p_value for s in residual.shapes)
+        is_significant = any(s.p_value <= self.limits.shape_p_value for s in residual.shapes)
         if self.coarser is not None and is_significant:
             coarse = disturbance_equations(evidence, self.coarser, found.estimate)
             residual = beyond_model_error(residual, equations, coarse, self.coarser_share)
@@ -247,10 +236,7 @@ class RolloutSource(Source):
         return wind
 
     def _swing(self, theta: np.ndarray) -> Swing | None:
-        """Return an oscillating force in the flights' force errors at `theta` (P,), if any.
-
-        It is searched for in all flights with the force view, which has one value at each time.
-        """
+        """Return an oscillating force in the force view of all flights at `theta` (P,), if any."""
         try:
             flights = ready(self.logs, self.vehicle, self.limits).smoothed[FORCE.name]
         except ValueError:  # no flight meets the conditions of the force view
@@ -260,10 +246,7 @@ class RolloutSource(Source):
         return residual_swing(ViewEvidence(FORCE, model, flights, limits=self.limits), theta)
 
     def explained_by_steps(self, found: SearchResult) -> bool:
-        """Return whether MuJoCo's Euler steps explain a named delay between pose and rates.
-
-        In a flight that MuJoCo simulated, pose and rates differ by about half a step in time.
-        """
+        """Return whether a named delay of the pose is about half a step, as in MuJoCo's flights."""
         step_s = 1.0 / self.vehicle.controller.frequency
         delays_s = pose_delays(found).values()
         return any(abs(delay_s) <= self.limits.integrator_share * step_s for delay_s in delays_s)
@@ -271,7 +254,7 @@ class RolloutSource(Source):
     def model_error(self, found: SearchResult) -> float:
         """Return the share of the noise floor that is the model's numerical error, see `Source`.
 
-        It is the largest share among the groups of channels (position, attitude, velocity, rates).
+        It is the largest share among the groups of channels of the state.
         """
         groups, sigma = len(STATE_GROUPS), of_rollouts(found.last).noise.sigma
         least = np.array(self.limits.least_noise)[:groups]
@@ -285,9 +268,8 @@ class RolloutSource(Source):
     def simulated(self, found: SearchResult) -> Rollouts:
         """Return 1 s windows of some held-out flights, and their errors by label of the model.
 
-        The errors are measured - simulated (W, N, 19), with the vehicle file's parameters, and if
-        something is named also with the fitted ones. Both start from the state that fits the better
-        model (`start_correction`).
+        The errors are measured - simulated (W, N, 19) by the vehicle file and, if something is
+        named, by the fitted model. Both start from the state that fits the better model.
         """
         settings = (self.rotor_input, LENGTH_S, self.limits, self.model.integrator)
         shown = np.unique(self.held.flight)[:SHOWN].tolist()
@@ -347,8 +329,7 @@ def structure_where(
 ) -> str | None:
     """Return in words the quantity that a structured residual depends on; None if it is noise.
 
-    `slow_errors` are from `RolloutEvidence.slow_errors`. With measured rotor speeds as the input,
-    or commands of which the log lacks some, the noise is less certain, and the thresholds higher.
+    For `slow_errors` see `RolloutEvidence`. Where the noise is uncertain, thresholds are higher.
     """
     slow, expected = slow_errors
     shape = residual.shapes[0] if residual.shapes else None

@@ -7,6 +7,7 @@ commands or rotor speeds drive it. Some stretches are fitted, the others held ou
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -14,11 +15,11 @@ import numpy as np
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.hold_out import choose_held_out
-from suite.diagnose.data.noise import Linearisation, measured_noise
+from suite.diagnose.data.noise import Linearisation, Noise, at_least, measured_noise
 from suite.diagnose.data.sampling import own_spacing_s
 from suite.diagnose.data.steps import has_firmware_loop, rows_show_torque
-from suite.diagnose.data.whitening import block_of, make_whitening
-from suite.diagnose.data.windows import LENGTH_S, cut, take
+from suite.diagnose.data.whitening import Whitening, block_of, make_whitening, slow_energy
+from suite.diagnose.data.windows import LENGTH_S, SLICES, cut, take
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.parameters import candidates, make_space
@@ -37,7 +38,6 @@ from suite.diagnose.verdict.actuators import (
     integrator_of,
     rotors_are_input,
 )
-from suite.diagnose.verdict.model_error import with_held_commands, with_model_error
 
 BASE_S, STRETCH_S = 5.0, 0.25
 """Estimated duration on two cores: fixed part, and for each stretch [s]."""
@@ -66,7 +66,6 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
         raise ValueError("rollouts cannot find a change since reference flights; views can")
     if given.references or not (given.chosen or can_fly(logs, vehicle)):
         return None
-    # Choose the input of the model: commands or measured rotor speeds.
     integrator = integrator_of(logs, given.integrator)
     rotor_input, warnings = rotors_are_input(logs, given.drive, vehicle), list[str]()
     is_open = given.drive == "auto" and not rotor_input
@@ -108,9 +107,9 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     has_error = integrator != "euler" or rotor_input
     coarser = take(windows_of(coarser=windows)[0], is_finite) if has_error else None
     linear = take(linear, is_finite)
+    at = Estimate(start.theta, linear.offset)
     if coarser is not None:
-        other = model.residual(Estimate(start.theta, linear.offset), coarser)
-        limits = with_model_error(linear, other, limits)
+        limits = with_model_error(linear, model.residual(at, coarser) - linear.residual, limits)
     # See `RolloutSource.sizes` for these shares.
     dense = all(
         log.rotor_speed is None
@@ -122,8 +121,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     are_slow = any(own_spacing_s(*command) > limits.command_spacing_s for command in commands)
     if are_slow and not rotor_input:
         fewer = take(windows_of(fewer_commands=windows)[0], is_finite)
-        other = model.residual(Estimate(start.theta, linear.offset), fewer)
-        held = with_held_commands(linear, other, limits)
+        held = with_held_commands(linear, model.residual(at, fewer) - linear.residual, limits)
         if held is not None:
             limits, coarser, coarser_share = held, fewer, 1.0
             warnings.append(LACKING)
@@ -185,10 +183,9 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
 
 
 def can_fly(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
-    """Return whether rollouts of these flights can be simulated.
+    """Return whether the logs have all signals of the state, and an input of rollouts.
 
-    The logs need all signals of the state, and measured rotor speeds or commands to a rate loop
-    without integrators and filters (whose state is unknown).
+    That is measured rotor speeds, or commands to a rate loop without integrators and filters.
     """
     return not any(
         log.partial
@@ -207,11 +204,7 @@ def _check_count(count: int, limits: Thresholds) -> None:
 
 
 def _finite(linear: Linearisation, limits: Thresholds) -> np.ndarray:
-    """Return which windows (W,) the model simulates without divergence.
-
-    Raises:
-        ValueError: if the model diverges in all windows.
-    """
+    """Return which windows (W,) the model simulates without divergence; a ValueError if none."""
     residual = linear.residual
     is_finite = np.asarray(np.isfinite(residual).all(axis=(1, 2)))
     is_finite &= np.isfinite(linear.slope).all(axis=(1, 2, 3))
@@ -221,3 +214,75 @@ def _finite(linear: Linearisation, limits: Thresholds) -> np.ndarray:
             "the model diverges on every flight: check the vehicle file and the frames"
         )
     return is_finite
+
+
+def with_model_error(
+    linear: Linearisation, difference: np.ndarray, limits: Thresholds
+) -> Thresholds:
+    """Return `limits` with the lower limits of the noise raised to the model's numerical error.
+
+    It is estimated by step doubling (Hairer, Norsett & Wanner 1993, Sec. II.4): longer steps and
+    fewer rotor speeds change the residuals by the `difference` (W, N, 19), several times the error.
+    `linear` has slopes along all parameters and start numbers.
+    """
+    noise = measured_noise(linear, limits)
+    whitening = make_whitening(linear, noise, limits)
+    return _raised(_unexplained_rms(difference, linear, noise, whitening), limits)
+
+
+def with_held_commands(
+    linear: Linearisation, difference: np.ndarray, limits: Thresholds
+) -> Thresholds | None:
+    """Return `limits` with the noise raised to the error of held commands; None without the error.
+
+    If the drone received commands between the rows of the log, their times are wrong. With every
+    second command the residuals change by the `difference` (W, N, 19). If one command was left out
+    after each row, the true error is half of that. Body rates and rotor speeds follow a command at
+    once, so their residuals limit the error's share of the difference. With a small share, the log
+    has every command. For `linear` see `with_model_error`.
+    """
+    noise = measured_noise(linear, limits)
+    whitening = make_whitening(linear, noise, limits)
+    rms = _unexplained_rms(difference, linear, noise, whitening)
+    residual = _unexplained_rms(linear.residual, linear, noise, whitening)
+    shares = residual / np.maximum(rms, 1e-12)
+    fast = [s for n, s in zip(SLICES, shares, strict=True) if n in ("rates", "rotor speed")]
+    share = min((share for share in fast if share > 0.0), default=0.0)
+    if share < limits.held_share:
+        return None
+    # The error accumulates along a window, so its slow part exceeds that of white noise.
+    share = min(share, 1.0)
+    raised = _raised(share * rms, limits)
+    noise = Noise(at_least(noise.sigma, raised), {})
+    whitening = make_whitening(linear, noise, raised)
+    known = np.isfinite(difference).all(axis=(1, 2), keepdims=True)
+    error = linear._replace(residual=np.where(known, share * difference, 0.0))
+    slow = slow_energy(whitening, block_of(whitening, error, ()).residual).sum(axis=0)
+    expected = np.maximum(whitening.slow_freedom.sum(axis=0), 1e-9)
+    factor = [np.sqrt(max(slow[c].sum() / expected[c].sum(), 1.0)) for c in SLICES.values()]
+    return _raised(share * rms * np.array(factor), limits)
+
+
+def _unexplained_rms(
+    errors: np.ndarray, linear: Linearisation, noise: Noise, whitening: Whitening
+) -> np.ndarray:
+    """Return the RMS (6,) by sensor (of `SLICES`) of the part that no start state explains.
+
+    `errors` are (W, N, 19); windows that diverge are left out. It is 0 where nothing was measured.
+    """
+    known = np.isfinite(errors).all(axis=(1, 2), keepdims=True)
+    errors = np.where(known, errors, 0.0)
+    unexplained = block_of(whitening, linear._replace(residual=errors), ()).residual
+    _, rows, channels = errors.shape
+    over_noise = unexplained[:, : rows * channels].reshape(errors.shape)
+    sigma = np.where(np.isfinite(noise.sigma), noise.sigma, 0.0)
+    valid = np.asarray(linear.windows.valid) & known
+    energy = (np.where(valid, over_noise * sigma, 0.0) ** 2).sum(axis=(0, 1))
+    # Mean of each channel, and then of each group of channels (three or four of one sensor).
+    power = energy / np.maximum(valid.sum(axis=(0, 1)), 1)
+    return np.array([np.sqrt(power[channel].mean()) for channel in SLICES.values()])
+
+
+def _raised(error: np.ndarray, limits: Thresholds) -> Thresholds:
+    """Return `limits` with lower limits of the noise of at least `error` (6,)."""
+    return replace(limits, least_noise=tuple(np.maximum(limits.least_noise, error).tolist()))

@@ -27,8 +27,7 @@ from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.actuators import TestedEffect
 from suite.diagnose.verdict.disturbances import Swing
-from suite.diagnose.verdict.gap import EffectSize, Gap, upper_size
-from suite.diagnose.verdict.model_error import beyond_error, less_error
+from suite.diagnose.verdict.gap import EffectSize, Gap, beyond_error, less_error, upper_size
 
 LEAST_GAP = 1e-9
 """Lower limit of a gap minus its noise floor in a division, in the gap's unit."""
@@ -42,6 +41,8 @@ FAR = (
     "and torque are compared; check the commands' units, and the gains of the rate loop"
 )
 """Warning if rollouts cannot be used."""
+GIVEN, FITTED = "simulated as given", "simulated with the named effects"
+"""Labels of the vehicle file's model and of the fitted model, in charts and recordings."""
 
 
 class Remaining(NamedTuple):
@@ -56,8 +57,7 @@ class Remaining(NamedTuple):
     reason: str = "that depends on no tested quantity"
     """Words after "an error": why an error above the noise floor does not count as structure."""
     explainable: float = 0.0
-    """Share of the gap that a black box (a regression without physics) explains; 0 if none was
-    fitted."""
+    """Share of the gap that a black box (regression without physics) explains; 0 without one."""
     wind: TestedEffect | None = None
     """Random wind that explains the error."""
     swing: Swing | None = None
@@ -68,10 +68,6 @@ class Remaining(NamedTuple):
     """Further entries of `gap` in diagnosis.json."""
     channels: Mapping[str, Mapping[str, Any]] = {}
     """Further entries of `gap.channels` in diagnosis.json, by group and channel."""
-
-
-GIVEN, FITTED = "simulated as given", "simulated with the named effects"
-"""Labels of the vehicle file's model and of the fitted model, in charts and recordings."""
 
 
 class Series(NamedTuple):
@@ -111,8 +107,7 @@ class Source(ABC):
     horizon_s: float
     """Length of the windows over which the gap is measured [s]."""
     begin: Evaluation
-    """The fitted flights with their noise, evaluated along all parameters at the vehicle file's
-    parameters, from which the search starts."""
+    """The fitted flights with their noise, at the vehicle file's parameters, along all of them."""
     candidates: Sequence[Candidate]
     """Effects that the search tries."""
     limits: Thresholds
@@ -120,8 +115,7 @@ class Source(ABC):
     """Whether effects below the threshold of relevance are named. True for a change since reference
     flights, which is compared with the spread between flights instead."""
     small_explains: bool = False
-    """Whether the remaining error is what remains with all fitted effects, including those that are
-    too small to be named."""
+    """Whether effects that are too small to be named count as explaining the remaining error."""
     fallback: Source | None = None
     """A second source, which is searched if this one names nothing."""
 
@@ -155,9 +149,8 @@ class Source(ABC):
     def is_worse(self, before: Gap, after: Gap) -> bool:
         """Return whether held-out flights contradict effects that change the gap to `after`.
 
-        `before` is the gap without the effects. Both the total error and the error within flights
-        have to grow: a held-out flight with another trim (constant offset) may raise the total
-        alone.
+        Total error and error within flights both have to grow: a held-out flight with another trim
+        (constant offset) may raise the total alone.
         """
         rise = float(after.energy.sum()) - float(before.energy.sum())
         return after.total >= before.total and rise >= 0.0
@@ -166,17 +159,12 @@ class Source(ABC):
         """Return whether held-out flights are sensitive to `candidate` at its fitted size."""
         return False
 
-    def is_relevant(self, gap: Gap) -> bool:
-        """Return whether `gap` may exceed the noise by a relevant amount."""
-        return True
-
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
         """Return the sizes of the named effects on these flights, by the effect's name.
 
-        The entry `TOGETHER` is for all of them at once: their changes may cancel. Each entry is the
-        size and the upper end of its 95 % interval, which is zero if the model's own error may be
-        the whole effect. The result is empty if the size has no physical unit;
-        then no effect counts as too small.
+        Each entry is the size and the upper end of its 95 % interval, zero if the model's own error
+        may be the whole effect. The entry `TOGETHER` is for all at once, as changes may cancel.
+        Without a physical unit there are none, and no effect counts as too small.
         """
         return {}
 
@@ -195,13 +183,11 @@ def sizes_by_effect(
     size_of: Callable[..., EffectSize],
     model_error: float | np.ndarray = 0.0,
 ) -> dict[str, tuple[EffectSize, EffectSize]]:
-    """Return the size of each named effect and the upper end of its 95 % interval, by name.
+    """Return the sizes of the named effects, see `Source.sizes`.
 
-    The entry `TOGETHER` is for all of them at once. The upper end is zero if the model's own error
-    may be the whole effect (see `beyond_error`). `slope` (..., K) are derivatives of the flights'
-    errors by the K named parameters. `size_of` takes a change of these errors to its size, or with
-    a number of standard errors to its upper limit. The model's own numerical error may change the
-    parameters by `model_error` (K,); this is subtracted before the upper end is computed.
+    `slope` (..., K) are derivatives of the flights' errors by the K named parameters; for `size_of`
+    see `upper_size`. The model's own numerical error may change the parameters by `model_error`
+    (K,); this is subtracted before the upper end is computed.
     """
     entries, width = found.last.evidence.space.entries, found.half_widths()
     change = (found.estimate.theta - found.start.theta)[found.indices]
@@ -285,10 +271,7 @@ class Finding:
         return self.search.estimate.theta
 
     def removed(self, names: Sequence[NamedEffect]) -> float:
-        """Return the share of the gap that `names` remove when they are added last.
-
-        All of `names` belong to one effect.
-        """
+        """Return the share of the gap that `names`, all of one effect, remove when added last."""
         without = max(self.without[named.candidate.label].rms for named in names)
         total = max(self.before.rms - self.before.floor, LEAST_GAP)
         return min(max((without - self.after.rms) / total, 0.0), 1.0)

@@ -36,6 +36,10 @@ QUANTITIES = {"force": "acceleration", "torque": "angular acceleration"}
 UNPREDICTED = "that logged signals hardly predict"
 NO_AGREEMENT = "on which the flights do not agree"
 """Reasons why an error of a view does not count as structure, see `Remaining.reason`."""
+RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
+"""Ridge weights that are tried, relative to the weight of the data."""
+PATTERNS = np.array([[1, 1, 1, 1], [-1, -1, 1, 1], [-1, 1, 1, -1], [1, -1, 1, -1]])
+"""Sums and differences of the four rotors' thrusts: collective thrust, roll, pitch and yaw."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +50,7 @@ class ViewSource(Source):
     held: ViewEvidence
     """The held-out flights."""
     floor: np.ndarray
-    """(3,) standard deviation of a mean acceleration that measurement noise causes, by body axis
-    [the view's unit]."""
+    """(3,) noise of a mean acceleration by body axis [the view's unit]."""
     reason = UNPREDICTED
     """Why an error above the noise floor does not count as structure, see `Remaining.reason`."""
     all_flights: ViewEvidence | None = None
@@ -137,11 +140,10 @@ class ViewSource(Source):
     def _unexplained_force(self, theta: np.ndarray, gap: Gap, seed: int) -> float:
         """Return the force [m/s^2] that remains within held-out flights, or 0 if insignificant.
 
-        The error has to exceed the noise and a least force significantly. The least force is the
-        threshold of relevance or, if larger, a multiple of the flights' constant offsets (trims),
-        which show the accuracy of attitude and thrust in the logs. The torque has no such test,
-        since noise of the rotor speeds dominates its remaining error. `gap` is the gap at the
-        parameters `theta` (P,).
+        `gap` is the gap at `theta` (P,). It has to exceed noise and a least force significantly:
+        the threshold of relevance or, if larger, a multiple of the flights' constant offsets
+        (trims), which show the accuracy of attitude and thrust in the logs. The torque has no such
+        test, since noise of the rotor speeds dominates its remaining error.
         """
         assert self.all_flights is not None
         data, limits = self.all_flights.residuals(theta), self.limits
@@ -183,10 +185,7 @@ class ViewSource(Source):
         return Shares(closed, np.maximum(explainable, closed), beyond, variance, spread)
 
     def series(self, found: SearchResult) -> Series:
-        """Return the stretch of a held-out flight that the named effects change most.
-
-        If nothing is named, it is the stretch with the largest error. See `Source`.
-        """
+        """Return the stretch that the named effects change most, or else that of most error."""
         before = self.held.residuals(found.start.theta)
         after = self.held.residuals(found.estimate.theta)
         shares = self._shares(found)
@@ -240,15 +239,11 @@ class Shares(NamedTuple):
         return {key: float(share) if np.isfinite(share) else None for key, share in shares.items()}
 
 
-RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
-"""Ridge weights that are tried, relative to the weight of the data."""
-
-
 def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> np.ndarray:
     """Return the weights (K, 3) with which `inputs` (M, K) explain `error` (M, 3) best.
 
-    They are those of a ridge regression, chosen in cross-validation over flights, of which each
-    flight's mean (its trim) is no part. A single flight is split into thirds.
+    They are those of a ridge regression without flights' means (trims), chosen in cross-validation
+    over flights or thirds of one.
     """
     groups = validation_groups(flight)
     inputs, error = centred(inputs, flight), centred(error, flight)
@@ -281,15 +276,8 @@ def closed_share(before: np.ndarray, after: np.ndarray, flight: np.ndarray) -> n
     return 1.0 - (centred(after, flight) ** 2).sum(axis=0) / np.maximum(power, TINY)
 
 
-PATTERNS = np.array([[1, 1, 1, 1], [-1, -1, 1, 1], [-1, 1, 1, -1], [1, -1, 1, -1]])
-"""Sums and differences of the four rotors' thrusts: collective thrust, roll, pitch and yaw."""
-
-
 def inputs_of(flight: SmoothedFlight) -> np.ndarray:
-    """Return the inputs (M, K) of the black box for one flight: signals and their products.
-
-    They are the means over the windows of the products on each row.
-    """
+    """Return the inputs (M, K) of the black box: means of a flight's signals and their products."""
     rows, vel_b = flight.rows, flight.rows.vel_b
     thrust = rows.rotor_speed**2
     thrust = thrust / np.maximum(thrust.mean(), 1e-9)

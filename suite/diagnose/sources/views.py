@@ -91,7 +91,6 @@ def by_views(given: DiagnosisInput) -> SourceSet:
         untested = [UNTESTED.format("some logs are partial")]
     elif references and len(next(iter(fitted.values()))) < 2:
         untested = [UNTESTED.format("this needs 3 new flights or more, as one is held out")]
-    # Make one source for each view.
     sources = []
     for name in fitted:
         one = evidence[name]
@@ -136,8 +135,7 @@ def by_views(given: DiagnosisInput) -> SourceSet:
 class MeansSource(ViewSource):
     """Source for a change of the mean acceleration of whole flights since reference flights.
 
-    Its noise floor is what an unchanged vehicle shows: how the means of the reference flights
-    differ.
+    Its noise floor is how the means of the reference flights differ.
     """
 
     reference: ViewEvidence
@@ -163,10 +161,7 @@ class MeansSource(ViewSource):
         return Shares(closed, np.maximum(closed, 0.0), np.zeros(3), before, spread)
 
     def series(self, found: SearchResult) -> Series:
-        """Return the mean of every reference flight and held-out flight, see `Source`.
-
-        The axis is the one along which the named effects change the means most.
-        """
+        """Return the means of all flights along the axis that the named effects change most."""
         start, end = found.start.theta, found.estimate.theta
         earlier = _deviations(self.reference, start)
         change, left = (self.held.residuals(theta).residual for theta in (start, end))
@@ -216,8 +211,7 @@ def since_reference(
 ) -> ViewSource:
     """Return the source that searches for a change since the `reference` flights.
 
-    `evidence` has the flights to fit, `held` the held-out ones. With `means_only` there is no
-    fallback. `shared` are fields of both sources.
+    `evidence` has the flights to fit, `held` the held-out ones; `shared` are fields of all sources.
     """
     begin = change_evidence(reference, evidence.flights, spread)
     theta = begin.at.theta
@@ -252,7 +246,7 @@ def references_of(
 ) -> tuple[dict[str, ViewEvidence], RotorSpread | None, tuple[str, ...]]:
     """Return the evidence of the reference flights by view, the spread between flights, and notes.
 
-    `flights` and `evidence` are those of the other flights. Each unusable flight has a note.
+    `flights` and `evidence` are those of the other flights.
 
     Raises:
         ValueError: if less than two are usable, or their signals differ from the other flights'.

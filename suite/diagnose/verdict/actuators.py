@@ -35,6 +35,10 @@ LONGEST_LAG_S, LONGEST_DELAY_S, DELAYS_TRIED = 0.15, 0.06, 9
 delays that are tried before the best is refined."""
 LONGEST_S = 60.0
 """Flight time after which no more flights are compared [s]; more adds little."""
+RATE_LOOP, LOGGED = "nominal rate loop", "logged motor commands"
+"""What commands rotor speeds: the rate loop at the measured body rates, or the log's commands."""
+LAG = "motor_lag"
+"""Name of the rotor lag in the catalogue of effects."""
 
 
 class TestedEffect(NamedTuple):
@@ -72,11 +76,9 @@ class ActuatorMismatch(NamedTuple):
     rms_own: float
     """RMS difference with the vehicle file's lag, and its best delay and scales [rad/s]."""
     thrust: tuple[float, float]
-    """Mean and standard deviation of measured minus commanded collective thrust, over the nominal
-    mass [m/s^2]."""
+    """Mean and standard deviation of measured minus commanded thrust over nominal mass [m/s^2]."""
     turn: tuple[tuple[float, float], ...]
-    """Mean and standard deviation of measured minus commanded angular acceleration, about body x,
-    y and z each [rad/s^2]."""
+    """The same of the angular acceleration about body x, y and z each [rad/s^2]."""
     followed: float
     """Share of the speeds' variance that the commands and the vehicle file's lag explain."""
 
@@ -97,15 +99,10 @@ def actuator_mismatches(
 ) -> list[ActuatorMismatch]:
     """Compare measured rotor speeds with those by the rate loop and those by motor commands.
 
-    Returned is one mismatch for each of the two comparisons that the logs allow. Logs without
-    measured rotor speeds are ignored, and so are the effects of `vehicle`.
+    Returned are the comparisons that the logs allow. Effects of `vehicle` are ignored.
     """
     mismatches = (_mismatch(source, logs, vehicle, limits) for source in (RATE_LOOP, LOGGED))
     return [mismatch for mismatch in mismatches if mismatch is not None]
-
-
-RATE_LOOP, LOGGED = "nominal rate loop", "logged motor commands"
-"""What commands rotor speeds: the rate loop at the measured body rates, or the log's commands."""
 
 
 def _stretches(
@@ -226,10 +223,7 @@ def _best_delay(cost: Callable[[float], float]) -> tuple[float, float]:
 def _at_rows(
     speed: np.ndarray, step_of_row: np.ndarray, dt: float, time_constant: float
 ) -> np.ndarray:
-    """Return rotor speeds (N, 4) at measured rows, behind commanded `speed` (S, 4) by a lag.
-
-    `dt` is the length of a step [s], and `step_of_row` (N,) the step that starts at each row.
-    """
+    """Return rotor speeds (N, 4) behind commanded ones (S, 4) by a lag, at the steps of N rows."""
     # The speed at the end of step k is that at the start of step k + 1.
     return np.concatenate([speed[:1], follow_lag(speed, dt, time_constant)])[step_of_row]
 
@@ -242,8 +236,7 @@ def _rms(values: np.ndarray) -> float:
 def rotors_are_input(logs: Sequence[FlightLog], drive: str, vehicle: Vehicle) -> bool:
     """Return whether measured rotor speeds are the model's input, and not the commands.
 
-    `drive` is the user's choice of the input: "commands", "motors" or "auto", which is the commands
-    where that is possible.
+    `drive` is the user's choice: "commands", "motors" or "auto" (commands where possible).
 
     Raises:
         ValueError: for an unknown `drive`, or one that the logs or the rate loop do not allow.
@@ -271,8 +264,7 @@ def rotors_are_input(logs: Sequence[FlightLog], drive: str, vehicle: Vehicle) ->
 def integrator_of(logs: Sequence[FlightLog], integrator: str) -> str:
     """Return the integrator of the simulation that made `logs`, "continuous" or "euler".
 
-    `integrator` is the user's choice. With "auto" the result is "euler" if all logs state it, and
-    "continuous" otherwise, as for real flights.
+    `integrator` is the user's choice; with "auto" it is what all logs state, else "continuous".
 
     Raises:
         ValueError: for an unknown `integrator`.
@@ -290,8 +282,7 @@ def flown_by_other_controller(
 ) -> bool:
     """Return whether the measured rotor speeds contradict the nominal rate loop.
 
-    The loop is computed at the measured rates, so only the controller and the rotors are compared.
-    Aerodynamics or a shifted centre of mass act on the rates, and so do not count as a difference.
+    The loop is computed at the measured rates, so aerodynamics do not count as a difference.
     """
     dt, plant = step_s(vehicle), make_plant(vehicle, step_s(vehicle))
     delay, lag = float(plant.constants.delay), float(plant.constants.time_constant)
@@ -312,17 +303,13 @@ def flown_by_other_controller(
     )
 
 
-LAG = "motor_lag"
-"""Name of the rotor lag in the catalogue of effects."""
-
-
 def find_rotor_lag(
     logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds = THRESHOLDS
 ) -> TestedEffect | None:
     """Return the rotors' lag where it differs significantly from that of `vehicle`, else None.
 
-    Flights without commands or rotor speeds are ignored. So are flights whose speeds the nominal
-    rate loop does not explain: a firmware's filters are not a lag.
+    Flights without commands or rotor speeds are ignored, and those whose speeds the nominal rate
+    loop does not explain: a firmware's filters are not a lag.
     """
     if has_firmware_loop(vehicle):
         return None

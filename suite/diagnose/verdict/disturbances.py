@@ -85,17 +85,12 @@ class Spectrum(NamedTuple):
 
 
 def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
-    """Return the oscillation in the residual force of `task` at the parameters `theta` (P,).
-
-    None where there is none, or where the view does not contain both horizontal axes.
-    """
+    """Return the oscillation in the residual force of `task` at `theta` (P,), if there is one."""
     if not {0, 1} <= set(task.view.axes):
         return None
     data, limits = task.residuals(theta), task.limits
-    every = (
-        _spectrum(flight, data.residual[data.flight == k]) for k, flight in enumerate(task.flights)
-    )
-    spectra = [spectrum for spectrum in every if spectrum is not None]
+    residuals = (data.residual[data.flight == k] for k in range(len(task.flights)))
+    spectra = [one for one in map(_spectrum, task.flights, residuals) if one is not None]
     if not spectra:
         return None
     shortest_s, longest_s = 0.6, 3.5  # periods of pendulums of 0.1 to 3 m
@@ -113,11 +108,8 @@ def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
     # Reject a peak that is not significant, small, or small next to the acceleration there.
     centre_hz = float(frequency_hz[best])
     force_ratio, share = _peak_shares(spectra, centre_hz, [one[width, best] for one in heights])
-    if (
-        p_value > limits.swing_p_value
-        or share < limits.swing_share
-        or force_ratio < limits.swing_driven
-    ):
+    is_small = share < limits.swing_share or force_ratio < limits.swing_driven
+    if p_value > limits.swing_p_value or is_small:
         return None
     # 95 % interval by the profile likelihood.
     likely = frequency_hz[gain[width] >= largest - limits.profile_fall]
@@ -127,9 +119,9 @@ def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
 
 
 def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None:
-    """Return the spectrum of one flight; None where it is too short for one, or has many holes.
+    """Return the spectrum of a flight with the residual force `residual_b` (M, 3) [m/s^2].
 
-    `residual_b` (M, 3) is its residual force in body axes [m/s^2].
+    None where it is too short for one, or has many holes.
     """
     middle_s = flight.form.middle_s
     if len(middle_s) < LEAST_MEANS:
@@ -219,10 +211,9 @@ def _peak_shares(
 def find_turbulence(
     model: RolloutModel, theta: np.ndarray, disturbance: DisturbanceEquations
 ) -> tuple[TestedEffect, float] | None:
-    """Return the random wind that explains the residual of `model` at `theta` (P,), or None.
+    """Return the random wind that explains the residual, and its log-likelihood over none; or None.
 
     None also without a drag that transmits it, with a better random force, or by outliers alone.
-    With the wind comes the logarithm of the likelihood ratio of this wind to no wind.
     """
     transmission, limits = _wind_transmission(model, theta, disturbance.knot), disturbance.limits
     if np.abs(transmission).max() < 1e-6:
@@ -283,7 +274,7 @@ def _wind_transmission(model: RolloutModel, theta: np.ndarray, knot: Flown) -> n
 
 
 def _wind_root(knot: Flown, length_m: float) -> np.ndarray:
-    """Return a matrix root (W, 3 KNOTS, 3 KNOTS) of the covariance of a wind of intensity 1 m/s.
+    """Return a root (W, 3 KNOTS, 3 KNOTS) of the covariance of a wind of intensity 1 m/s.
 
     The correlation decays exponentially with the distance flown over the length scale `length_m`.
     """
@@ -311,8 +302,8 @@ def _has_outliers(
     """Return whether the disturbance has heavier tails than a normal wind of this `size`.
 
     The fourth power of a normal variable of variance 1 has mean 3 and variance 96; the measured
-    mean may exceed 3 by `tail` standard errors. A force that acts only at some places or speeds has
-    a higher mean. With fewer than eight directions that contain information the result is False.
+    mean may exceed 3 by `tail` standard errors. A force at some places or speeds has a higher one.
+    With fewer than eight directions that contain information the result is False.
     """
     information, gradient = diagonalised(equations.hessian, equations.gradient, root)
     informed = size**2 * information > 1.0

@@ -32,13 +32,15 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 DRAWS = 1000
 """Number of draws of a bootstrap."""
+FORCE_S, TORQUE_S = 0.5, 0.1
+"""Times over which an effect's mean linear and angular accelerations are computed [s]. The time for
+the angular one is short, as the rate loop soon counteracts a rotation."""
 
 
 def rms_length(vectors: np.ndarray, z: float = 0.0) -> float:
     """Return the root mean square length of `vectors` (..., K), in their unit.
 
-    With `z` it is an upper limit, by that many standard errors of the mean square: the same vehicle
-    on other stretches of flight gives another one.
+    With `z` it is an upper limit, by that many standard errors of the mean square.
     """
     squares = (vectors**2).sum(axis=-1)
     return float(np.sqrt(squares.mean() + z * squares.std() / np.sqrt(squares.size)))
@@ -59,8 +61,8 @@ class Gap(NamedTuple):
     score: np.ndarray
     """(W,) mean squared error of each stretch, without trims, in the squared unit of `floor`."""
     energy: np.ndarray
-    """(W,) squared error of each stretch, by which models are compared. Errors that belong to one
-    flight or stretch alone are subtracted: its trim (constant force or torque) or start state."""
+    """(W,) squared error of each stretch, by which models are compared, without its trim (constant
+    force or torque) or start state."""
     channels: Mapping[str, Mapping[str, Channel]]
     """Error of each channel, by group (such as the time since the start) and channel."""
     floor: float = 1.0
@@ -68,8 +70,8 @@ class Gap(NamedTuple):
     offset: float = 0.0
     """RMS of the flights' trims, which are no part of `score`; 0 if none are subtracted."""
     together: int = 4
-    """Number of neighbouring stretches whose errors are correlated: a bootstrap draws them
-    together. Four rollouts that begin every 0.25 s overlap."""
+    """Number of neighbouring stretches that a bootstrap draws together, as their errors are
+    correlated. Four rollouts that begin every 0.25 s overlap."""
 
     @property
     def rms(self) -> float:
@@ -93,9 +95,9 @@ class Gap(NamedTuple):
     def exceeds(self, before: Gap, weight: float, limits: Thresholds) -> bool:
         """Return whether the energy is significantly larger than that of `before`.
 
-        A parameter that was fitted to other flights raises the squared error by about one, even if
-        the model is right. So the rise has to be clearly larger than that. `weight` multiplies sums
-        over stretches, so that rows in overlapping ones count once.
+        A fitted parameter raises the error of other flights by about one even if the model is
+        right, so the rise has to be clearly larger. `weight` makes rows in overlapping stretches
+        count once.
         """
         rise = self.energy - before.energy
         rise_low = np.quantile(self._means(rise, 0), 0.025)
@@ -104,8 +106,7 @@ class Gap(NamedTuple):
     def _means(self, values: np.ndarray, seed: int) -> np.ndarray:
         """Return the means (DRAWS,) of bootstrap draws of `values` (W,), one of each stretch.
 
-        The values form a circle, so that each of them is drawn equally often. With few values,
-        fewer are drawn together, so that draws differ.
+        The values form a circle, so that each is drawn equally often; of few, fewer together.
         """
         rng, count = np.random.default_rng(seed), len(values)
         block = max(1, min(self.together, count // 4))
@@ -136,10 +137,9 @@ def start_correction(
 ) -> np.ndarray:
     """Return corrections (W, F) of the true start states, fitted to all rows of each window.
 
-    The noise of a measured start state grows along a rollout. So each number of the state is
-    corrected by what fits the model with `theta` (P,) best, but at most by three sigma; without a
-    limit where nothing was measured. Windows in which the model diverges, and the rotor speeds,
-    are not corrected.
+    The noise of a measured start state grows along a rollout. So each number of the state gets the
+    correction that fits the model with `theta` (P,) best, of at most three sigma where it was
+    measured. Windows in which the model diverges, and rotor speeds, are not corrected.
     """
     linear = from_true_starts(model, theta, windows)
     flies = np.isfinite(linear.residual).all(axis=(1, 2))
@@ -157,8 +157,8 @@ def start_correction(
 def gap_of(linear: Linearisation, noise: Noise, limits: Thresholds = THRESHOLDS) -> Gap:
     """Return the gap of the residuals in `linear`, which has slopes along the start states only.
 
-    The score contains pose, velocity and rates only. The energy, by which models are compared,
-    contains every fitted channel, because a bias of the accelerometer changes no other channel.
+    The score is that of pose, velocity and rates. The energy, by which models are compared, has
+    every fitted channel: a bias of the accelerometer changes no other.
     """
     windows, whitening = linear.windows, make_whitening(linear, noise, limits)
     slow = slow_energy(whitening, block_of(whitening, linear, ()).residual)
@@ -192,17 +192,10 @@ def overlap(windows: FlightWindows) -> float:
 def noise_floor(slope: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Return the RMS errors (..., 12) that a perfect model would still have.
 
-    They have two causes: the noise of the measured start state, carried to this row by `slope`, and
-    the noise of the measurement in the row itself. `slope` (..., 12, F) is the derivative of a
-    row's state by the F numbers of the start state, and `noise` (F,) their noise. The first 12
-    entries of `noise` serve for both causes.
+    `slope` (..., 12, F) is the derivative of a row's state by the F start numbers, and carries
+    their `noise` (F,) to this row. The first 12 are also the noise of the row itself.
     """
     return np.sqrt(noise[:STATE] ** 2 + ((slope * noise) ** 2).sum(axis=-1))
-
-
-FORCE_S, TORQUE_S = 0.5, 0.1
-"""Times over which an effect's mean linear and angular accelerations are computed [s]. The time for
-the angular one is short, as the rate loop soon counteracts a rotation."""
 
 
 class EffectSize(NamedTuple):
@@ -228,11 +221,9 @@ class EffectSize(NamedTuple):
 
 
 def rollout_size(shift: np.ndarray, windows: FlightWindows, z: float = 0.0) -> EffectSize:
-    """Return the size of an effect that shifts the simulated values of `windows`.
+    """Return the size of an effect that shifts the values of `windows` by `shift` (W, N, 19).
 
-    A fault of the log gets the size of the motion that would change the logged values as much.
-    `shift` (W, N, 19) is the change of the simulated values by the effect, by row and channel. For
-    `z` see `rms_length`.
+    A fault of the log gets that of the motion with the same shift. For `z` see `rms_length`.
     """
     row_s, valid = np.asarray(windows.row_s), np.asarray(windows.valid)
 
@@ -261,14 +252,11 @@ def upper_size(
     half_width: np.ndarray,
     size_of: Callable[..., EffectSize],
 ) -> EffectSize:
-    """Return the upper end of the 95 % interval of an effect's size.
+    """Return the upper end of the 95 % interval of the size of an effect with K parameters.
 
-    Args:
-        slope: (..., K) derivative of the simulated values along the effect's K parameters.
-        change: (K,) fitted parameters minus those of the vehicle file.
-        half_width: (K,) half-widths of the parameters' 95 % intervals.
-        size_of: function that takes a shift (...) of the simulated values to its size, and with
-            `z` to the upper limit of its RMS, by that many standard errors.
+    `slope` (..., K) is the derivative of the simulated values, `change` (K,) the fitted parameters
+    minus those of the vehicle file, and `half_width` (K,) that of their 95 % intervals. `size_of`
+    takes a shift (...) of the simulated values, and `z` as in `rms_length`, to its size.
     """
     size = size_of(slope @ change, z=Z95)
     widths = [size_of(slope[..., k] * width) for k, width in enumerate(half_width)]
@@ -277,3 +265,20 @@ def upper_size(
     )
     total_drift = None if size.drift is None else size.drift + drift
     return EffectSize(size.force + force, size.torque + torque, total_drift)
+
+
+def beyond_error(change: np.ndarray, error: np.ndarray, width: np.ndarray) -> bool:
+    """Return whether an effect, or a shape of the residual, is more than the model's own error.
+
+    It is if a 95 % interval of `change` (K,), of half-width `width`, does not contain zero when it
+    is widened by `error` at both ends. Where no parameter is significant by itself, one has to
+    change by more than the error.
+    """
+    distance = np.abs(change)
+    least = width if (distance > width).any() else 0.0
+    return bool((distance - error > least).any())
+
+
+def less_error(change: np.ndarray, error: np.ndarray | float) -> np.ndarray:
+    """Return `change` (K,) moved towards zero by the model's own `error`, at most to zero."""
+    return np.sign(change) * np.maximum(np.abs(change) - error, 0.0)

@@ -26,8 +26,7 @@ from suite.diagnose.estimate.permutation import CandidateScore, permutation_test
 from suite.diagnose.evidence.rollout import Flown
 from suite.diagnose.evidence.rollouts import RolloutEvidence
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict.gap import EffectSize
-from suite.diagnose.verdict.model_error import beyond_error, less_error
+from suite.diagnose.verdict.gap import EffectSize, beyond_error, less_error
 
 AXES = ("force x", "force y", "force z", "torque x", "torque y", "torque z")
 
@@ -81,23 +80,14 @@ def disturbance_equations(
 def residual_structure(
     equations: DisturbanceEquations, fold: np.ndarray, seed: int = 0
 ) -> ResidualStructure:
-    """Test the residual for structure, by both tests.
-
-    `fold` (W,) is the cross-validation fold of each window; one fold is left out at a time.
-    """
+    """Test the residual by both tests; `fold` (W,) are the folds of the windows."""
     # From forces and torques at the knots to coefficients of the shapes.
     hessian, gradient = _along(equations, equations.unit)
     size = np.sqrt(np.maximum(np.einsum("wjj->j", hessian), 1e-12))
-    scores = permutation_test(
-        equations.shapes,
-        hessian / np.outer(size, size),
-        gradient / size,
-        [shape.indices for shape in equations.shapes],
-        (),
-        fold,
-        seed,
-        limits=equations.limits,
-    )
+    scaled = (hessian / np.outer(size, size), gradient / size)
+    shapes, limits = equations.shapes, equations.limits
+    groups = [shape.indices for shape in shapes]
+    scores = permutation_test(shapes, *scaled, groups, (), fold, seed, limits=limits)
     coloured = {axis: _energy_p_value(equations, i) for i, axis in enumerate(AXES)}
     return ResidualStructure(scores, coloured, _size(equations, scores))
 
@@ -108,10 +98,10 @@ def beyond_model_error(
     coarse: DisturbanceEquations,
     share: float,
 ) -> ResidualStructure:
-    """Return `structure` without the significant shapes that the model's own error may explain.
+    """Return `structure` without the shapes that the model's own error may explain.
 
-    `coarse` has fewer rotor speeds or commands as input, which makes the error larger. The `share`
-    of the change of a shape's coefficients counts as the error.
+    `coarse` has fewer rotor speeds or commands as input, and thus more of the error. The `share` of
+    the change of a shape's coefficients counts as the error.
     """
 
     def error_of(columns: Sequence[int], value: np.ndarray) -> np.ndarray:
@@ -143,8 +133,7 @@ def _size(
 ) -> EffectSize:
     """Return the RMS force and torque that the best of `shapes` adds, without the fit's noise.
 
-    The model's own error is subtracted from the coefficients; `error_of` returns it for columns and
-    their coefficients.
+    The model's own error, which `error_of` gives for columns and coefficients, is subtracted.
     """
     if not shapes or shapes[0].p_value > equations.limits.shape_p_value:
         return EffectSize(0.0, 0.0, None)
@@ -169,10 +158,7 @@ def _along(equations: DisturbanceEquations, unit: np.ndarray) -> tuple[np.ndarra
 def diagonalised(
     hessian: np.ndarray, gradient: np.ndarray, root: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return information and gradient (W, J) along the independent directions of root @ normal.
-
-    `hessian` (W, K, K) and `gradient` (W, K) are those of a disturbance; `root` is (..., K, J).
-    """
+    """Return information and gradient (W, J) along independent directions of `root` (..., K, J)."""
     information, vectors = np.linalg.eigh(root.mT @ hessian @ root)
     return information, (vectors.mT @ (root.mT @ gradient[..., None]))[..., 0]
 
@@ -265,10 +251,8 @@ def _shapes(knot: Flown, start_s: np.ndarray) -> tuple[np.ndarray, list[Candidat
         along_b[..., i, None] * unit_axes[i] for along_b in motion for i in range(3)
     ])  # fmt: skip
     for label, scalar in (("thrust", thrust), ("climb", vel_w[..., 2]), ("height", pos_w[..., 2])):
-        add(
-            f"force along body z, by the {label}",
-            [h[..., None] * unit_axes[2] for h in _hats(scalar)],
-        )
+        along_z = [hat[..., None] * unit_axes[2] for hat in _hats(scalar)]
+        add(f"force along body z, by the {label}", along_z)
     # Forces along world axes, everywhere or near a place.
     world = np.concatenate([axes_b, np.zeros_like(axes_b)], axis=-2)
     add("force along fixed directions", [world[..., i] for i in range(3)])
@@ -283,10 +267,7 @@ def _shapes(knot: Flown, start_s: np.ndarray) -> tuple[np.ndarray, list[Candidat
 
 
 def _hats(scalar: np.ndarray) -> list[np.ndarray]:
-    """Return hat functions (piecewise linear bumps) of `scalar` (W, KNOTS), each (W, KNOTS).
-
-    They stand on six quantiles of the scalar.
-    """
+    """Return hat functions of `scalar` (W, KNOTS), each (W, KNOTS), on six of its quantiles."""
     corners = np.unique(np.quantile(scalar, np.linspace(0.0, 1.0, 6)))
     return [np.interp(scalar, corners, heights) for heights in np.eye(len(corners))]
 

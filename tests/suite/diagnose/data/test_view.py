@@ -79,7 +79,7 @@ def test_a_bump_has_the_mean_acceleration_and_reaches_across_no_hole_or_bad_row(
 def test_motor_commands_give_the_speeds_of_the_vehicles_map_with_its_delay_and_lag():
     pwm, volt = np.full((200, 4), 0.6), np.full(200, 3.5)
     vehicle = replace(VEHICLE, motors=MotorMap((0.0, 8.0), 3.7, 1.0))
-    rotors = acting_rotors(level(TWO_S, pwm=pwm, voltage=volt), vehicle)
+    rotors = acting_rotors(level(TWO_S, pwm=pwm, voltage=volt), vehicle, THRESHOLDS)
     thrust = 8.0 * (0.6 * 3.5 / 3.7) ** 2
     assert rotors is not None and rotors.each
     assert np.allclose(rotors.speed**2 * vehicle.rotors.thrust_coefficient, thrust)
@@ -88,7 +88,7 @@ def test_motor_commands_give_the_speeds_of_the_vehicles_map_with_its_delay_and_l
     vehicle = replace(VEHICLE, motors=MotorMap((0.0, 8.0), 3.7, 0.0))
     slow = with_effects(vehicle, motor_lag=(0.1,), command_delay=(0.05,))
     step = np.where(TWO_S[:, None] < 1.0, 0.3, 0.6) * np.ones(4)
-    lagged = acting_rotors(level(TWO_S, pwm=step), slow)
+    lagged = acting_rotors(level(TWO_S, pwm=step), slow, THRESHOLDS)
     speed = lagged.speed[:, 0]
     assert np.ptp(speed[TWO_S < 1.045]) == 0.0
     after = speed[np.searchsorted(TWO_S, 1.15 - 1e-9)]
@@ -97,7 +97,7 @@ def test_motor_commands_give_the_speeds_of_the_vehicles_map_with_its_delay_and_l
 
 def test_a_collective_thrust_gives_the_force_view_only():
     log = level(TWO_S, thrust_cmd=np.full(200, 9.81), rate_cmd_b=np.zeros((200, 3)))
-    rotors = acting_rotors(log, VEHICLE)
+    rotors = acting_rotors(log, VEHICLE, THRESHOLDS)
     assert rotors is not None and not rotors.each and np.allclose(rotors.speed, HOVER)
     assert [view.name for view in ready([log], VEHICLE).views] == ["force"]
 

@@ -21,6 +21,7 @@ from suite.diagnose.data.windows import KNOTS, SLICES, STATE, cut
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence import rollouts
 from suite.diagnose.evidence.linearise import arrays_of
+from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.broken_logs import rows
 from tests.support.continuous_flights import fly_finely
 from tests.support.diagnosis_flights import NOISE, fly_all
@@ -107,7 +108,7 @@ def test_slopes_are_those_of_small_changes_and_a_disturbance_pushes_the_windows(
 def test_what_the_start_explains_is_projected_out(linearised):
     model, windows, linear = linearised
     sigma = np.where(windows.valid.any(axis=(0, 1)), 0.01, np.nan)
-    whitening = make_whitening(linear, Noise(sigma, {}))
+    whitening = make_whitening(linear, Noise(sigma, {}), THRESHOLDS)
     moved = np.random.default_rng(0).standard_normal((len(windows.flight), STATE))
     by_start = np.einsum("wnck,wk->wnc", linear.slope[..., model.starts[:STATE]], moved)
     start_only = linear._replace(residual=by_start, offset=0.0 * linear.offset)
@@ -139,7 +140,7 @@ def test_windows_are_trusted_until_the_model_leaves_the_flight(linearised):
     _, windows, linear = linearised
     residual = np.zeros_like(linear.residual)
     residual[0, np.asarray(windows.row_s)[0] > 0.4, 0] = 1.0
-    view = rollouts.trusted(windows, residual)
+    view = rollouts.trusted(windows, residual, THRESHOLDS)
     last = [np.asarray(windows.row_s)[w][view.valid[w].any(axis=1)].max() for w in (0, 1)]
     assert last == pytest.approx([0.25, 1.0], abs=0.011)
 

@@ -21,7 +21,6 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict import gap as gaps
 from suite.diagnose.verdict import residual_structure as structure
 from suite.diagnose.verdict.disturbances import Swing, _likelihood, _range_of, find_turbulence
-from suite.diagnose.verdict.model_error import beyond_error
 
 
 def slow_errors(size=1.0):
@@ -262,11 +261,11 @@ def test_an_effect_that_the_models_own_error_may_be_has_no_size_for_certain():
 
 def test_one_parameter_beyond_the_models_error_is_enough():
     change, width = np.array([0.13, -0.12, 0.06]), np.array([0.03, 0.04, 0.05])
-    assert not beyond_error(change, np.array([0.20, 0.10, 0.12]), width)
-    assert beyond_error(change, np.array([0.20, 0.07, 0.12]), width)
+    assert not gaps.beyond_error(change, np.array([0.20, 0.10, 0.12]), width)
+    assert gaps.beyond_error(change, np.array([0.20, 0.07, 0.12]), width)
     # Only all parameters together are significant: the error must explain each of them.
-    assert beyond_error(change, np.array([0.20, 0.10, 0.12]), 5.0 * width)
-    assert not beyond_error(change, np.array([0.20, 0.13, 0.12]), 5.0 * width)
+    assert gaps.beyond_error(change, np.array([0.20, 0.10, 0.12]), 5.0 * width)
+    assert not gaps.beyond_error(change, np.array([0.20, 0.13, 0.12]), 5.0 * width)
 
 
 @pytest.mark.parametrize(
