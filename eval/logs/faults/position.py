@@ -102,16 +102,16 @@ def check_clock_rate(rows: Rows) -> list[Finding]:
         return []
     if 1.0 / CLOCK < scale < CLOCK:
         return _small_clock_rate(rows, scale)
+    gyro = f"the gyro is {scale:.3g} times the attitude's turns, and "
     if not (slopes := _slopes(rows)):
-        return []
+        return unseen("time", f"{gyro}no force shows whether that is the clock's rate", "time_unit")
     one = min(slopes, key=lambda slope: slope.error)
+    text = f"{gyro}the path's vertical acceleration is {one.value:.2f} (± {one.error:.2f}) times "
+    text += f"that of the {one.source}: "
     far = abs(one.value - 1.0)
     if far < SURE_SLOPE * one.error or abs(one.value - scale**-2) > NEAR_SLOPE * far:
-        return []
-    text = f"the gyro is {scale:.3g} times the attitude's turns, and the path's vertical "
-    text += f"acceleration is {one.value:.2f} times that of the {one.source}: its steps are "
-    text += f"{scale:.3g} times the true ones"
-    return [_clock_rate(text, scale)]
+        return unseen("time", f"{text}a clock's rate does not show", "time_unit")
+    return [_clock_rate(f"{text}its steps are {scale:.3g} times the true ones", scale)]
 
 
 def _small_clock_rate(rows: Rows, scale: float) -> list[Finding]:
@@ -119,16 +119,22 @@ def _small_clock_rate(rows: Rows, scale: float) -> list[Finding]:
 
     `scale` is that of the gyro. A filter or a wrong scale of one sensor changes one of them only.
     """
-    if "vel" not in rows or abs(np.log(scale)) < np.log(NEAR_CLOCK):
+    if abs(np.log(scale)) < np.log(NEAR_CLOCK):
         return []
+    gyro = f"the gyro is {scale:.3g} times the attitude's turns"
+    if "vel" not in rows:
+        text = f"{gyro}, and no velocity shows whether that is the clock's rate"
+        return unseen("time", text, "time_unit")
     path = velocity_from_position(rows["time"], rows["pos"])
     found = match(*(smooth(rows["time"], value, GYRO_S) for value in (path, rows["vel"])))
     speed, low, high = pooled_scale(found)
+    text = f"{gyro}, and the velocity {speed:.3g} times the path's derivative"
     is_alike = low / ALIKE < scale < high * ALIKE and found.misfit(found.as_given) < OK
     if not is_alike or low / NEAR_CLOCK < 1.0 < high * NEAR_CLOCK:
-        return []
-    text = f"gyro and velocity are {scale:.3g} and {speed:.3g} times what attitude and position "
-    return [_clock_rate(f"{text}show: its steps are about {speed:.3g} times the true ones", speed)]
+        return unseen(
+            "time", f"{text}: filters or scales, so a clock's rate does not show", "time_unit"
+        )
+    return [_clock_rate(f"{text}: its steps are about {speed:.3g} times the true ones", speed)]
 
 
 def _clock_rate(text: str, scale: float) -> Finding:
