@@ -23,7 +23,7 @@ PUBLISHED = {
     "four_gates": "",
     "ablation": "",
     "schemes": "--set episode.start_speed=3.0 episode.image_stride=3 --ppo-iterations 2315",
-    "faults": "--seed 7920000",
+    "faults": "--seed 7930000",
 }
 """Page -> its options. `suite reproduce all` makes the pages in this order. The published page
 `perception` also has policies that are trained first; the page names their commands."""
