@@ -87,7 +87,7 @@ def row_times(
     within: tuple[float, float] = (-np.inf, np.inf),
     origin_s: float | None = None,
 ) -> np.ndarray:
-    """Return the rows' times (T,) on the clock of a recording with pos, quat or rate [s].
+    """Return the rows' times (T,) on the recording's clock [s].
 
     Args:
         recording: holds at least one of pos, quat and rate.

@@ -93,7 +93,7 @@ def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
         raise ValueError(
             f"{path}: not a readable Parquet file ({first_line}); run suite eval again"
         ) from error
-    columns = {}
+    columns, types = {}, _types()
     for name, kind in _kinds().items():
         if name not in names and name in TrialResult._field_defaults:
             continue
@@ -103,7 +103,7 @@ def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
                 f"{path}: {count} columns {name!r}; is it a trials.parquet of this suite?"
             )
         column = table[name]
-        if column.type != _types()[name] or (column.null_count and "None" not in kind):
+        if column.type != types[name] or (column.null_count and "None" not in kind):
             raise ValueError(
                 f"{path}: column {name!r} holds {column.type}, or cells without a value, where a "
                 f"trial has {kind}; is it a trials.parquet of this suite?"

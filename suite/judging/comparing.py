@@ -61,7 +61,13 @@ def read_runs(folder: Path) -> list[Run]:
     flown = manners(judged.get("speed") or (), bool(judged.get("monitor")))
     endings = sorted((manner.label("") for manner in flown), key=len, reverse=True)
     # The summary has an entry for each label, in the order of the rows.
-    digests = [policy["sha256"] for policy in summary["policies"]]
+    policies = [one for one in summary["policies"] if isinstance(one, dict)]
+    digests = [one["sha256"] for one in policies if isinstance(one.get("sha256"), str)]
+    if len(digests) < max(len(names), len(summary["policies"])):
+        raise ValueError(
+            f"{folder / 'summary.json'}: has no SHA-256 for each of the {len(names)} policies in "
+            "trials.parquet; the file was edited or is incomplete: run suite eval again"
+        )
     return [
         Run(
             f"{folder}" if len(names) == 1 else f"{folder}: {name}",

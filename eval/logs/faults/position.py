@@ -40,7 +40,7 @@ NEARER = 0.5
 """Least size of the slope: above it, a slope of 1 or -1 fits the flight better than 0."""
 CHANCE = 1e-4
 """Largest probability of such a slope where both accelerations are unrelated."""
-NEAR_CLOCK, ALIKE = 1.03, 1.015
+NEAR_CLOCK, AGREE = 1.03, 1.015
 """Least factor of a wrong clock that both gyro and velocity show, and by how much they may differ.
 In real logs filters change one of them by up to a tenth, but not both alike."""
 CLOCK, SURE_SLOPE, NEAR_SLOPE = 1.1, 4.0, 0.3
@@ -129,7 +129,7 @@ def _small_clock_rate(rows: Rows, scale: float) -> list[Finding]:
     found = match(*(smooth(rows["time"], value, GYRO_S) for value in (path, rows["vel"])))
     speed, low, high = pooled_scale(found)
     text = f"{gyro}, and the velocity {speed:.3g} times the path's derivative"
-    is_alike = low / ALIKE < scale < high * ALIKE and found.misfit(found.as_given) < OK
+    is_alike = low / AGREE < scale < high * AGREE and found.misfit(found.as_given) < OK
     if not is_alike or low / NEAR_CLOCK < 1.0 < high * NEAR_CLOCK:
         return unseen(
             "time", f"{text}: filters or scales, so a clock's rate does not show", "time_unit"

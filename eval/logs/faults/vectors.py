@@ -90,16 +90,16 @@ def check_gyro(rows: Rows) -> list[Finding]:
     found = match(turns, gyro)
     world = match(rotate(rows["quat"], turns), gyro)
     in_body, in_world = found.misfit(found.as_given), world.misfit(world.as_given)
-    rotated = match(rotated_to(turns, gyro), gyro)
-    least = min(GOOD, rotated.misfit(rotated.as_given))  # `check_clock` names a rotated body
     is_off = in_body > max(BAD, TIMES_BETTER * in_world)
-    if is_off and in_world < least and not found.is_turned:
-        text = (
-            f"its turns are off the attitude's by {100 * in_body:.0f} % in body axes and by "
-            f"{100 * in_world:.0f} % in world axes"
-        )
-        fix = option(("rate", "from-world"))
-        return [Finding("corrected", "gyro", text, "gyro_frame", None, 0.98, fix)]
+    if is_off and in_world < GOOD and not found.is_turned:
+        rotated = match(rotated_to(turns, gyro), gyro)
+        if in_world < rotated.misfit(rotated.as_given):  # `check_clock` names a rotated body
+            text = (
+                f"its turns are off the attitude's by {100 * in_body:.0f} % in body axes and by "
+                f"{100 * in_world:.0f} % in world axes"
+            )
+            fix = option(("rate", "from-world"))
+            return [Finding("corrected", "gyro", text, "gyro_frame", None, 0.98, fix)]
     findings = []
     apart = rms(rotate(rows["quat"], turns) - turns) / size
     if apart < APART:

@@ -106,6 +106,8 @@ def test_a_summary_that_is_none_and_a_trial_that_is_there_twice_are_refused(tmp_
         ("[1]", "is a list"),
         ('{"judged": [1]}', "'judged' is missing or not a dict"),
         ("{", "not JSON"),
+        ('{"judged": {}, "sha256": {}, "policies": []}', "has no SHA-256 for each of the 1"),
+        ('{"judged": {}, "sha256": {}, "policies": [{}]}', "has no SHA-256 for each of the 1"),
     ):
         (tmp_path / "summary.json").write_text(summary)
         with pytest.raises(ValueError, match=rf"summary\.json: .*{said}"):

@@ -16,7 +16,7 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import rates_between, rotate
-from eval.logs.faults.clocks.rotation import rotation_between, rotation_findings
+from eval.logs.faults.clocks.rotation import fit_rotation, rotation_findings
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import SPAN_S, WIDTH_S, Rows, turns_of
 from eval.logs.faults.relation import interpolate, jackknife_error, smooth
@@ -299,7 +299,7 @@ def _near_delay(
     if np.sqrt(np.mean(np.sum(gyro(0.0, 0.0) ** 2, axis=1))) < CALM or not turns.any():
         return None
     trials = np.arange(-REACH_S, REACH_S + 0.5 * STEP_S, STEP_S)
-    rotation, turned = rotation_between(turns, [gyro(late_s, 0.0) for late_s in trials])
+    rotation, turned = fit_rotation(turns, [gyro(late_s, 0.0) for late_s in trials])
     turns = turns @ rotation.T
     block = np.arange(len(first)) * BLOCKS // len(first)
 

@@ -16,9 +16,7 @@ HALF, PRIOR = 0.5, 0.03
 the share of the rates for which the axes are equal, since few axes may turn."""
 
 
-def rotation_between(
-    turns: np.ndarray, gyros: Sequence[np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
+def fit_rotation(turns: np.ndarray, gyros: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return the rotation (3, 3) from the rates `turns` (N, 3) to the gyro's, and its vector [deg].
 
     `gyros` are the gyro's rates (N, 3) for each trial delay. It is 0 where a delay alone fits about
@@ -49,7 +47,7 @@ def rotation_between(
 def rotated_to(turns: np.ndarray, given: np.ndarray) -> np.ndarray:
     """Return the rates `turns` (N, 3) in the body axes of the rates `given` (N, 3)."""
     known = np.isfinite(turns).all(axis=1) & np.isfinite(given).all(axis=1)
-    return turns @ rotation_between(turns[known], [given[known]])[0].T if known.any() else turns
+    return turns @ fit_rotation(turns[known], [given[known]])[0].T if known.any() else turns
 
 
 def rotation_findings(rotation: np.ndarray) -> list[Finding]:

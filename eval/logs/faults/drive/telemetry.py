@@ -89,10 +89,12 @@ def _late(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
     # A mean over rows counts from their middle, half a row before that of the change of rate.
     step_s = float(np.median(np.diff(rows["time"])))
     late_s, error_s = found[0] - 0.5 * step_s, found[1]
+    if abs(late_s) < max(LATE_S, CLEARLY * error_s):
+        return []
     then = scores_of(*_shifted(mean, turning, round(late_s / step_s)), mixer)[AS_GIVEN][:2].min()
     now = {order: one[:2].min() for order, one in scores_of(mean, turning, mixer).items()}
     other = max(score for order, score in now.items() if order != AS_GIVEN)
-    if abs(late_s) < max(LATE_S, CLEARLY * error_s) or then < max(SURELY, other + BETTER):
+    if then < max(SURELY, other + BETTER):
         return []
     size = f"{1e3 * abs(late_s):.0f} ms (± {1e3 * error_s:.1f} ms)"
     text = f"they are {size} late against the gyro"
