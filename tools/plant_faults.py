@@ -105,8 +105,8 @@ FAULTS = (
           "np.floor((place + 1) * self._period - ages)", "test_ages"),
     Fault("eval/judging", "+ (z / (2 * trials)) ** 2)", "+ (z / trials) ** 2)", "test_statistics"),
     # suite: losses, gradient, point mass
-    Fault("suite/train", "jnp.maximum(1.0 - step.gap, 0.0) ** 2",
-          "jnp.maximum(1.0 + step.gap, 0.0) ** 2", "test_losses"),
+    Fault("suite/train", "jnp.maximum(1.0 - step.margin, 0.0) ** 2",
+          "jnp.maximum(1.0 + step.margin, 0.0) ** 2", "test_losses"),
     Fault("suite/train", "-(jax.lax.stop_gradient(pull) * (step.pos_w - fixed_pos))",
           "(jax.lax.stop_gradient(pull) * (step.pos_w - fixed_pos))", "test_losses"),
     Fault("suite/train", "return x * factor + jax.lax.stop_gradient(x * (1 - factor))",

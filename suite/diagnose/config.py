@@ -35,8 +35,9 @@ class Config(Command):
     relevance: Advanced[Annotated[tuple[float, float, float], Range(0.0, 1e6)]] = (
         THRESHOLDS.relevance
     )
-    """Thresholds of practical relevance: force [m/s^2], torque over inertia [rad/s^2], drift after
-    a second [m]. An effect below all three is left out. 0 0 0 reports everything significant."""
+    """Thresholds of practical relevance: force [m/s^2], angular acceleration [rad/s^2], position
+    error after 1 s [m]. An effect below all three is left out. 0 0 0 reports everything
+    significant."""
     plan: bool = False
     """Also plan flights that separate the effects which these flights do not; in OUT/plan."""
     no_recording: Advanced[bool] = False

@@ -2,7 +2,7 @@
 
 Values without a unit are dimensionless. Terms:
 
-- window: a simulated stretch of 1 s; a view compares mean forces or torques instead
+- window: a simulated stretch of up to 1 s; a view compares mean forces or torques instead
 - gain: fall of chi-square (squared error in noise variances) by an effect, on left-out stretches
 - candidate: an effect that the search tries; name: an effect that the search reports
 - null: the distribution of a gain if there is no effect
@@ -77,7 +77,7 @@ class Thresholds:
 
     relevance: tuple[float, float, float] = (0.05, 0.5, 0.025)
     """Sizes below which an effect is not reported: force per mass [m/s^2] (0.5 % of the weight),
-    angular acceleration [rad/s^2], and drift after 1 s [m], which such a force causes."""
+    angular acceleration [rad/s^2], and position error after 1 s [m], which such a force causes."""
 
     slow_degree: int = 5
     """Degree of the polynomials over a window. Their part of the residual (the slow errors)
@@ -209,7 +209,7 @@ class Thresholds:
     """Least ratio of residual force to measured acceleration at that period. Below it, the flight's
     motion may excite a model error instead."""
     view_block_s: float = 2.0
-    """Length of stretches whose errors count as independent in a view [s]."""
+    """Length of blocks whose errors count as independent in a view [s]."""
 
     gap_stride_s: float = 0.25
     """Time between the starts of the rollouts that measure the gap [s]."""

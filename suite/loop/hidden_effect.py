@@ -128,8 +128,8 @@ def _diagnosis_section(config: LoopConfig, diagnosis: Mapping[str, Any]) -> Sect
     return Section(
         "What the diagnosis found in the flights",
         [
-            f"Verdict: {diagnosis['verdict']}. The gap (rollout error over the error of noise "
-            f"alone) on held-out flights is {gap['before']:.2f} before, {gap['after']:.2f} after; "
+            f"Verdict: {diagnosis['verdict']}. The gap (error) on held-out flights is "
+            f"{gap['before']:.2f} before, {gap['after']:.2f} after; "
             f"{gap['noise_floor']:.2g} is the noise floor.",
             table(headers, rows),
             *describe_hidden(config),

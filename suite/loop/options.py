@@ -48,7 +48,7 @@ class Config(Command):
     iterations: Advanced[Iterations | None] = None
     """Gradient steps of the training, instead of the recipe's."""
     finetune_iterations: Advanced[Iterations | None] = None
-    """Gradient steps of each fine-tuning. Without it a quarter of the recipe's; with a hidden
+    """Gradient steps of each fine-tuning. Without it a quarter of the last phase's; with a hidden
     vehicle 60."""
     fit_iterations: Advanced[Iterations | None] = None
     """Gradient steps of the Delta Action Model's fit. Without it 1500, with quick 500; with a

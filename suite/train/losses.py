@@ -2,10 +2,10 @@
 
 Each term is a function that returns a loss (B,), one per world (a simulated scene and drone) of the
 batch. A new term needs that function, a line in `LOSSES` and its weight in `LossConfig`. The names
-L_..., beta and u_A are those of the paper. In this file the gap is not the glossary's: it is the
-distance of a point to the nearest solid, minus the safety radius. The (attractive) field pulls the
-gradient towards the gate. The goal of the progress term is the gate or a point before it. The path
-is the straight line that the drone flies in the step; terms evaluate S points of it.
+L_..., beta and u_A are those of the paper. The margin is the distance of a point to the nearest
+solid, minus the safety radius. The (attractive) field pulls the gradient towards the gate. The goal
+of the progress term is the gate or a point before it. The path is the straight line that the drone
+flies in the step; terms evaluate S points of it.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ Term = Callable[[LossConfig, Step], jax.Array]
 
 
 def barrier(step: Step) -> jax.Array:
-    """Return ln(1 + e^{beta_2 gap}), (B, S), which grows if a point of the path is too near."""
-    return jax.nn.softplus(BARRIER_SLOPE * step.gap)
+    """Return ln(1 + e^{beta_2 margin}), (B, S), which grows if a point of the path is too near."""
+    return jax.nn.softplus(BARRIER_SLOPE * step.margin)
 
 
 def clearance(_: LossConfig, step: Step) -> jax.Array:
@@ -56,7 +56,7 @@ def collide(_: LossConfig, step: Step) -> jax.Array:
     """
     fixed_vel = jax.lax.stop_gradient(step.vel_w)
     closing_speed = jnp.maximum(-(step.away_w * fixed_vel[:, None]).sum(-1), 0.0)
-    return (closing_speed * jnp.maximum(1.0 - step.gap, 0.0) ** 2).mean(1)
+    return (closing_speed * jnp.maximum(1.0 - step.margin, 0.0) ** 2).mean(1)
 
 
 def acceleration(_: LossConfig, step: Step) -> jax.Array:

@@ -49,11 +49,11 @@ class Step(NamedTuple):
     up: jax.Array
     """(B,) cosine of the tilt (world z component of body z) at the step's end. It has a gradient if
     the attitude of the dynamics has one."""
-    gap: jax.Array
+    margin: jax.Array
     """(B, S) distance to the nearest solid, minus the safety radius r_q, at S points of the step's
     path, with gradient [m]."""
     away_w: jax.Array
-    """(B, S, 3) unit vectors away from that solid, along which `gap` grows."""
+    """(B, S, 3) unit vectors away from that solid, along which `margin` grows."""
     goal_w: jax.Array
     """(B, 3) goal of the progress term [m]."""
     place_g: jax.Array
@@ -98,7 +98,7 @@ def approach_shift(config: LossConfig, place_g: jax.Array) -> jax.Array:
     return jnp.clip(distance_off - APPROACH_FREE_M, 0.0, config.approach_m)
 
 
-def gap_beyond(
+def margin_of(
     config: LossConfig, distance: jax.Array, away_w: jax.Array, path_w: jax.Array
 ) -> jax.Array:
     """Return the distance to the nearest solid, minus the safety radius, (B, S) [m].
@@ -145,14 +145,14 @@ def make_step(
     share = (jnp.arange(PATH_SAMPLES) + 1.0) / PATH_SAMPLES
     path_w = before.pos_w[:, None] + share[:, None] * (after.pos_w - before.pos_w)[:, None]
     distance, away_w = nearest_obstacle(worlds.scene, jax.lax.stop_gradient(path_w), NEAR)
-    gap = gap_beyond(config, distance, away_w, path_w)
+    margin = margin_of(config, distance, away_w, path_w)
     return Step(
         pos_w=after.pos_w,
         vel_w=after.vel_w,
         acc_w=after.acc_w,
         jerk_w=(after.acc_w - before.acc_w) / worlds.constants.time_step[:, None],
         up=after.rot_w[:, 2, 2],
-        gap=gap,
+        margin=margin,
         away_w=away_w,
         goal_w=goal_w,
         place_g=place_g,

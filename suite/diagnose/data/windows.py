@@ -147,11 +147,11 @@ def cut(
         stride_s: time between the starts of two windows [s]; by default windows do not overlap.
         limits: longest hole in a window, and largest numbers of windows.
         integrator: integrator of the model; with "euler" its steps are the rate loop's periods.
-        coarser: the windows that an earlier call returned. If given, the same ones are cut with
-            steps of twice the length, and from every second rotor speed.
+        coarser: windows of an earlier call, which are cut again with steps of twice the length
+            and every second rotor speed.
         only: numbers of the flights that are cut; all if not given.
         since_s: earliest start of a window after its log's start [s].
-        fewer_commands: as `coarser`, but with usual steps, and from every second command.
+        fewer_commands: as `coarser`, but with usual steps and every second command.
     """
     starts, warnings = list[tuple[int, int]](), list[str]()  # (flight, row) each
     states = [on_every_row(log, limits) for log in logs]

@@ -51,7 +51,7 @@ def permutation_test(
     The null is the distribution of the largest gain of all groups if each window's residual gets a
     random sign. A sign for a whole window keeps the correlation within it. First the part that the
     best group explains is subtracted (Freedman and Lane 1983), since otherwise a real effect in a
-    few windows would be part of the null; if it explains much, so is that of groups nearly as good.
+    few windows would be part of the null; if that part is large, also those of similar groups.
     With too few windows the null is drawn from the measured noise instead.
 
     The columns of `hessian` (W, K, K) and `gradient` (W, K) are scaled to similar size. `groups`

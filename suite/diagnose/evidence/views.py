@@ -13,7 +13,7 @@ from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.composites import carried
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace, at_bound, usual_first
 from suite.diagnose.evidence.evidence import Evaluation, Evidence, flights_agree
-from suite.diagnose.evidence.moments import (
+from suite.diagnose.evidence.view_means import (
     ForceModel,
     ViewData,
     Weights,

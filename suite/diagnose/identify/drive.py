@@ -21,7 +21,7 @@ from eval.vehicles.vehicle_check import check_vehicle
 from suite.diagnose.data.sampling import follow_lag, hold
 from suite.diagnose.data.steps import LONGEST_S
 from suite.diagnose.data.view import FlightRows
-from suite.diagnose.evidence.moments import accelerations_on
+from suite.diagnose.evidence.view_means import accelerations_on
 from suite.diagnose.identify.grid import STEP_S, FlightGrid
 
 DRIVES = {

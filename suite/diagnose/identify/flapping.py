@@ -18,7 +18,7 @@ from suite.diagnose.data.flights import ViewFlights, ready
 from suite.diagnose.data.view import TORQUE
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.parameters import candidates, make_space
-from suite.diagnose.evidence.moments import ForceModel
+from suite.diagnose.evidence.view_means import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.identify.body import FORCE_NUMBERS
 from suite.diagnose.identify.drive import DrivenVehicle

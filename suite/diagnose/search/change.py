@@ -27,7 +27,7 @@ from suite.diagnose.estimate.gauss_newton import chi2_fall
 from suite.diagnose.estimate.parameters import Candidate, at_bound, usual_first
 from suite.diagnose.estimate.permutation import CandidateScore, corrected_p_values
 from suite.diagnose.evidence.evidence import Evaluation, Evidence, flights_agree
-from suite.diagnose.evidence.moments import (
+from suite.diagnose.evidence.view_means import (
     ViewData,
     Weights,
     block_of,
@@ -242,8 +242,8 @@ def change_evidence(
     weights = weights_of(data, task.limits)
     # Residuals also vary within a flight, by errors of the model. So only the flights' means are
     # compared, with the noise that such a mean has.
-    moments = np.unique(data.flight, return_counts=True)[1].mean()
-    noise_of_mean = weights.scatter * np.sqrt(weights.memory / moments)
+    means = np.unique(data.flight, return_counts=True)[1].mean()
+    noise_of_mean = weights.scatter * np.sqrt(weights.memory / means)
     weights = weights._replace(scatter=noise_of_mean, memory=np.ones(3))
     trim = spread.along[task.view.name] * gain
     if task.view.in_world:

@@ -31,13 +31,13 @@ from suite.diagnose.data.windows import (
 from suite.diagnose.estimate.gauss_newton import TINY, Z95, solve
 from suite.diagnose.estimate.parameters import Candidate
 from suite.diagnose.evidence.evidence import Evaluation
-from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.rollouts import (
     RolloutEvidence,
     RolloutModel,
     rollout_evidence,
     start_estimate,
 )
+from suite.diagnose.evidence.view_means import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.search.evaluation import SearchResult
 from suite.diagnose.sources.source import (

@@ -15,7 +15,7 @@ import numpy as np
 from suite.diagnose.data.view import SmoothedFlight, View
 from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.evidence.evidence import validation_groups
-from suite.diagnose.evidence.moments import centred, means_of
+from suite.diagnose.evidence.view_means import centred, means_of
 from suite.diagnose.evidence.views import ViewBlock, ViewEvidence
 from suite.diagnose.search.evaluation import SearchResult
 from suite.diagnose.sources.source import (

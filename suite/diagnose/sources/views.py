@@ -21,7 +21,7 @@ from suite.diagnose.data.inertial import UNSEEN, is_inertial
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.estimate.parameters import Candidate, candidates, make_space
-from suite.diagnose.evidence.moments import ForceModel, means_of
+from suite.diagnose.evidence.view_means import ForceModel, means_of
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.search.change import (
     RotorSpread,

@@ -27,7 +27,7 @@ from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.sampling import follow_lag, hold, interpolate, on_every_row
 from suite.diagnose.data.steps import has_firmware_loop, step_s, wrench_difference
-from suite.diagnose.evidence.moments import means_of
+from suite.diagnose.evidence.view_means import means_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 LONGEST_LAG_S, LONGEST_DELAY_S, DELAYS_TRIED = 0.15, 0.06, 9

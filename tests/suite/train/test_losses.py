@@ -12,7 +12,7 @@ from jax.test_util import check_grads
 from suite.train import losses
 from suite.train.config import LossConfig
 from suite.train.losses import MAX_PULL
-from suite.train.step import Step, gap_beyond
+from suite.train.step import Step, margin_of
 from tracks.geometry.field import attractive_field, magnetic_field
 from tracks.geometry.gates import square_gates
 from tracks.geometry.scene import Gates
@@ -30,7 +30,7 @@ def a_step(batch, **known):
     """Return a step of `batch` worlds at rest before a gate, but for what is `known`."""
     zero = np.zeros((batch, 3))
     rest = {name: zero for name in ("pos_w", "vel_w", "acc_w", "jerk_w", "goal_w", "place_g")}
-    path = {"gap": np.ones((batch, 1)), "away_w": zero[:, None], "clearance": np.ones(batch)}
+    path = {"margin": np.ones((batch, 1)), "away_w": zero[:, None], "clearance": np.ones(batch)}
     path |= {"up": np.ones(batch)}
     gate = {"gate": unit_gate(batch), "passed": np.zeros(batch, bool)}
     return Step(**{**rest, **path, **gate, **known})
@@ -43,8 +43,8 @@ weighted = by_config(losses.weighted)
 
 @by_config
 def obstacle_terms(config, distance, away_w, path_w, vel_w):
-    gap = gap_beyond(config, distance, away_w, path_w)
-    step = a_step(len(vel_w), gap=gap, away_w=away_w, vel_w=vel_w)
+    margin = margin_of(config, distance, away_w, path_w)
+    step = a_step(len(vel_w), margin=margin, away_w=away_w, vel_w=vel_w)
     return losses.clearance(config, step), losses.collide(config, step)
 
 
@@ -116,10 +116,10 @@ def test_obstacle_terms_are_the_papers_and_means_over_the_path_of_a_step():
     config = LossConfig(safety_radius_m=0.15)
     vel, path = jnp.array([1.0, 2.0, -1.0]), around(30, seed=0)
     distance, away_w = map(np.array, from_sphere(path))
-    gap, closing = distance - 0.15, np.maximum(0.0, -(away_w @ vel))
+    margin, closing = distance - 0.15, np.maximum(0.0, -(away_w @ vel))
     barrier, collide = terms_at(path, vel, config)
-    np.testing.assert_allclose(barrier, 2.0 * np.log1p(np.exp(-8.0 * gap)), rtol=1e-9)
-    np.testing.assert_allclose(collide, closing * np.maximum(1 - gap, 0) ** 2, rtol=1e-9)
+    np.testing.assert_allclose(barrier, 2.0 * np.log1p(np.exp(-8.0 * margin)), rtol=1e-9)
+    np.testing.assert_allclose(collide, closing * np.maximum(1 - margin, 0) ** 2, rtol=1e-9)
     slope = jax.grad(lambda vel: terms_at(path, vel, config)[1].sum())(vel)
     assert not np.any(slope), "the closing speed carries no gradient"
     config, path, vel = LossConfig(), around(4, seed=2), jnp.asarray([1.0, 2.0, -1.0])

@@ -286,8 +286,10 @@ def test_a_step_through_a_gate_and_its_numbers(pass_first, speed):
     place = np.einsum("bij,bi->bj", turn, np.array(after.pos_w) - aim)
     np.testing.assert_allclose(step.place_g, place, atol=1e-4)
     np.testing.assert_allclose(step.jerk_w, after.acc_w / worlds.constants.time_step[:, None])
-    assert step.gap.shape == (2, PATH_SAMPLES)
-    np.testing.assert_allclose(step.clearance, step.gap.min(-1) + config.safety_radius_m, atol=1e-6)
+    assert step.margin.shape == (2, PATH_SAMPLES)
+    np.testing.assert_allclose(
+        step.clearance, step.margin.min(-1) + config.safety_radius_m, atol=1e-6
+    )
     past = stepped(config, worlds, before, after, jnp.full(2, 8))
     assert not past.passed.any(), "all gates are passed already"
 

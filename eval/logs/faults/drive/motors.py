@@ -348,7 +348,7 @@ def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Fin
 
 
 def fit_force(rows: Rows, thrust: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the specific force (T,) along body z without drag [m/s^2], and `thrust` (T,) over it.
+    """Return the force per mass along body z without drag, (T,) [m/s^2], and `thrust` (T,) over it.
 
     A thrust in newtons gives a mass [kg], a thrust in m/s^2 a dimensionless ratio; 0 means that
     nothing could be fitted. The force is averaged over `WIDTH_S`. It comes from the path where the

@@ -17,7 +17,7 @@ from suite.diagnose.data.hold_out import parted
 from suite.diagnose.data.inertial import posed
 from suite.diagnose.data.view import FORCE, SPECIFIC, TORQUE, rows_of, weak_form
 from suite.diagnose.estimate.parameters import make_space
-from suite.diagnose.evidence.moments import ForceModel
+from suite.diagnose.evidence.view_means import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.identify.identify import identify
 from suite.diagnose.thresholds import THRESHOLDS

@@ -11,7 +11,7 @@ from suite.diagnose.data.view import FORCE, TORQUE
 from suite.diagnose.estimate import parameters
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.permutation import corrected_p_values
-from suite.diagnose.evidence import moments
+from suite.diagnose.evidence import view_means
 from suite.diagnose.evidence.evidence import validation_groups
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.search import change
@@ -28,12 +28,12 @@ def places(effect):
 
 
 def data_of(residual, slope, count=2, value=None):
-    """Return `count` flights with moments of 50 ms; `slope` (M, 3) is that along one parameter."""
+    """Return `count` flights with means of 50 ms; `slope` (M, 3) is that along one parameter."""
     length = len(residual) // count
     flight, middle_s = np.repeat(np.arange(count), length), np.tile(0.05 * np.arange(length), count)
     slope, none = slope.reshape(len(flight), 3, -1), np.zeros((len(flight), 3, 0))
     value = residual if value is None else value
-    return moments.ViewData(flight, middle_s, value, residual, slope, none)
+    return view_means.ViewData(flight, middle_s, value, residual, slope, none)
 
 
 def made(rng, count, length=200, trim=(0.5, 0.0, 2.0), scatter=0.3):
@@ -43,7 +43,7 @@ def made(rng, count, length=200, trim=(0.5, 0.0, 2.0), scatter=0.3):
 
 
 def test_slopes_are_those_of_finite_differences():
-    model, theta = moments.ForceModel(VEHICLE, SPACE, False), SPACE.array("start")
+    model, theta = view_means.ForceModel(VEHICLE, SPACE, False), SPACE.array("start")
     smoothed = ready(flights(1, duration_s=4.0), VEHICLE).smoothed[FORCE.name]
     evidence = ViewEvidence(FORCE, model, smoothed)
     first = evidence.residuals(theta, None)
@@ -54,17 +54,17 @@ def test_slopes_are_those_of_finite_differences():
         assert np.allclose(change / 1e-5, first.slope[..., index], atol=1e-4, rtol=1e-3)
 
 
-def test_trims_of_flights_are_separated_from_scatter_and_weighed_moments_are_independent_units():
-    weights = moments.weights_of(made(np.random.default_rng(1), count=60))
+def test_trims_of_flights_are_separated_from_scatter_and_weighted_means_are_independent_units():
+    weights = view_means.weights_of(made(np.random.default_rng(1), count=60))
     assert weights.scatter == pytest.approx([0.3, 0.3, 0.3], rel=0.05)
     assert weights.trim == pytest.approx([0.5, 0.0, 2.0], abs=0.35)
-    assert np.isinf(moments.weights_of(made(np.random.default_rng(1), count=2)).trim).all()
+    assert np.isinf(view_means.weights_of(made(np.random.default_rng(1), count=2)).trim).all()
     # A single flight is validated by thirds, others by flights.
     assert validation_groups(np.array([2, 2, 5])).tolist() == [2, 2, 5]
     assert validation_groups(np.zeros(6)).tolist() == [0, 0, 1, 1, 2, 2]
     rng = np.random.default_rng(2)
-    weights = moments.Weights(np.full(3, 0.3), np.ones(3), np.array([0.5, 0.0, 2.0]))
-    drawn = np.array([moments.whitened(made(rng, 1, 50), weights)[0] for _ in range(200)])
+    weights = view_means.Weights(np.full(3, 0.3), np.ones(3), np.array([0.5, 0.0, 2.0]))
+    drawn = np.array([view_means.whitened(made(rng, 1, 50), weights)[0] for _ in range(200)])
     means, within = drawn.sum(axis=1) / np.sqrt(50), drawn.std(axis=1)
     assert np.std(means, axis=0) == pytest.approx([1.0, 1.0, 1.0], rel=0.2)
     assert np.mean(within, axis=0) == pytest.approx([1.0, 1.0, 1.0], rel=0.05)
@@ -80,10 +80,10 @@ def test_errors_of_a_reconstructed_pose_are_whitened_with_the_trim():
     # Whitening is linear: slopes that are the columns of the identity give its matrix.
     columns = np.eye(3 * count).reshape(count, 3, 3 * count)
     none, flight = np.zeros((count, 3)), np.zeros(count, int)
-    data = moments.ViewData(flight, 0.1 * np.arange(count), none, none, columns, pose_slope)
-    matrix = moments.whitened(data, moments.Weights(np.full(3, unit), np.ones(3), trim))[1].reshape(
-        3 * count, -1
-    )
+    data = view_means.ViewData(flight, 0.1 * np.arange(count), none, none, columns, pose_slope)
+    matrix = view_means.whitened(data, view_means.Weights(np.full(3, unit), np.ones(3), trim))[
+        1
+    ].reshape(3 * count, -1)
     np.testing.assert_allclose(matrix @ covariance @ matrix.T, np.eye(3 * count), atol=1e-9)
 
 
@@ -110,7 +110,7 @@ def test_sizes_beyond_three_times_the_usual_are_implausible():
 ROWS = 1200
 
 
-def fitted(slow, *, closed_loop, seed=0) -> tuple[moments.ViewData, np.ndarray]:
+def fitted(slow, *, closed_loop, seed=0) -> tuple[view_means.ViewData, np.ndarray]:
     """Return the fit of a thrust scale under motors that answer a slow force, or less thrust."""
     rng = np.random.default_rng(seed)
     slow = slow * gaussian_filter1d(rng.standard_normal((ROWS, 3)), 20.0, axis=0) * 8.0
@@ -125,14 +125,14 @@ def fitted(slow, *, closed_loop, seed=0) -> tuple[moments.ViewData, np.ndarray]:
 @pytest.mark.parametrize(("slow", "closed_loop"), [(1.0, True), (3.0, True), (1.0, False)], ids=str)
 def test_a_slow_force_that_motors_answer_is_no_weak_thrust_but_less_thrust_is(slow, closed_loop):
     found, away = fitted(slow, closed_loop=closed_loop)
-    share, half_width = fast_share = moments.fast_share(found, [0], away, THRESHOLDS)
+    share, half_width = fast_share = view_means.fast_share(found, [0], away, THRESHOLDS)
     if closed_loop:
         assert away[0] < -0.3, "it does look like less thrust"
         assert sum(fast_share) < 0.3
     else:
         assert away[0] == pytest.approx(-0.4, abs=0.02)
         assert share == pytest.approx(1.0, abs=3.0 * half_width) and half_width < 0.1
-    assert moments.fast_changes_agree(found, [0], away, THRESHOLDS) != closed_loop
+    assert view_means.fast_changes_agree(found, [0], away, THRESHOLDS) != closed_loop
 
 
 def test_changes_reach_across_no_hole_and_no_two_flights():
@@ -140,14 +140,14 @@ def test_changes_reach_across_no_hole_and_no_two_flights():
     data = data_of(np.cumsum(ones, axis=0), ones)
     kept = np.ones(ROWS, bool)
     kept[100:110] = False
-    found = moments.successive_changes(moments.ViewData(*(field[kept] for field in data)))
+    found = view_means.successive_changes(view_means.ViewData(*(field[kept] for field in data)))
     assert len(found.flight) == ROWS - 10 - 1 - 2
     np.testing.assert_array_equal(found.residual, 1.0)
     np.testing.assert_array_equal(found.slope, 0.0)
     # Means of flights have no changes, which contradicts nothing.
     fit, away = fitted(1.0, closed_loop=True)
-    means = moments.ViewData(*(field[[0, -1]] for field in fit))
-    assert moments.fast_changes_agree(means, [0], away, THRESHOLDS)
+    means = view_means.ViewData(*(field[[0, -1]] for field in fit))
+    assert view_means.fast_changes_agree(means, [0], away, THRESHOLDS)
 
 
 DRAG = (0.4, 0.3, 0.2)
@@ -155,7 +155,7 @@ DRAG = (0.4, 0.3, 0.2)
 
 def task_of(logs, view=FORCE):
     smoothed = ready(logs, VEHICLE).smoothed[view.name]
-    return ViewEvidence(view, moments.ForceModel(VEHICLE, SPACE, False), smoothed)
+    return ViewEvidence(view, view_means.ForceModel(VEHICLE, SPACE, False), smoothed)
 
 
 def named(found):
@@ -309,15 +309,15 @@ def test_candidates_that_are_one_or_fitted_anyhow_cost_as_much_as_one_and_others
 def test_what_all_flights_are_judged_from_is_off_for_all_alike():
     rng, few, many = np.random.default_rng(7), 2, 8
     one, few_share = np.ones(3), np.full(3, 1.0 / np.sqrt(few))
-    weights = moments.Weights(np.full(3, 1e-3), one, one, few_share)
+    weights = view_means.Weights(np.full(3, 1e-3), one, one, few_share)
     unknown = weights._replace(trim=np.array([1.0, np.inf, 1.0]))
     sums = {"with it": [], "without": []}
     for _ in range(1000):
         residual = rng.standard_normal((many, 3)) - rng.standard_normal((few, 3)).mean(axis=0)
         data = data_of(residual, np.ones((many, 3)), many)
         for key, given in (("with it", weights), ("without", weights._replace(base=None))):
-            white, slope = moments.whitened(data, given)
+            white, slope = view_means.whitened(data, given)
             sums[key].append((white * slope[..., 0]).sum(axis=0) / np.sqrt((slope**2).sum((0, 2))))
-        assert np.all(moments.whitened(data, unknown)[0][:, 1] == 0.0)
+        assert np.all(view_means.whitened(data, unknown)[0][:, 1] == 0.0)
     assert np.std(sums["with it"], axis=0) == pytest.approx(np.ones(3), rel=0.06)
     assert np.std(sums["without"], axis=0).min() > 2.0  # the square root of 1 + 8 / 2

@@ -14,7 +14,7 @@ from suite.diagnose import run
 from suite.diagnose.config import Config
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import Candidate, make_space
-from suite.diagnose.evidence.moments import centred
+from suite.diagnose.evidence.view_means import centred
 from suite.diagnose.identify.run import is_identified
 from suite.diagnose.report import charts, sections, summary
 from suite.diagnose.report import diagnosis_json as as_json

@@ -11,7 +11,7 @@ from suite.diagnose.data.view import FORCE, SmoothedFlight, weak_form
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import candidates
 from suite.diagnose.evidence.evidence import Evaluation
-from suite.diagnose.evidence.moments import centred
+from suite.diagnose.evidence.view_means import centred
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.summary import next_steps
 from suite.diagnose.search.evaluation import NamedEffect

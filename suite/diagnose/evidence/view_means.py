@@ -1,6 +1,6 @@
 """Residuals of force and torque: measured mean accelerations minus those of the model.
 
-A moment is one mean over a short smooth window (`data/view.py`). The noise is estimated from the
+Each mean is taken over a short smooth window (`data/view.py`). The noise is estimated from the
 residual itself. An unchanged vehicle has a slightly different trim (constant force or torque) in
 each flight. So the mean residual of a flight along each axis contains a random error that all its
 rows share (a random effect; Laird and Ware 1982). After a share of that mean is subtracted, the
@@ -84,12 +84,12 @@ def accelerations_on(plant: Plant, rows: FlightRows, voltage: bool) -> tuple[Arr
 
 
 class ViewData(NamedTuple):
-    """M moments (mean accelerations) of all flights, in one view."""
+    """M mean accelerations of all flights, in one view."""
 
     flight: np.ndarray
     """(M,) number of the flight."""
     middle_s: np.ndarray
-    """(M,) middle of each moment, from the first row of the flight [s]."""
+    """(M,) middle of each mean's window, from the first row of the flight [s]."""
     value: np.ndarray
     """(M, 3) mean accelerations of the model, in body axes."""
     residual: np.ndarray
@@ -107,7 +107,7 @@ class Weights(NamedTuple):
     scatter: np.ndarray
     """(3,) RMS of the residual about the flights' means, by axis."""
     memory: np.ndarray
-    """(3,) autocorrelation time of the residual, as a number of moments, by axis."""
+    """(3,) autocorrelation time of the residual, as a number of means, by axis."""
     trim: np.ndarray
     """(3,) standard deviation of the flights' trims by axis; infinite with too few flights."""
     base: np.ndarray | None = None
@@ -133,7 +133,7 @@ def weights_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> Weights:
     count = sum(len(f) for f in flights)
     power = np.sum([(f**2).sum(axis=0) for f in deviations], axis=0)
     scatter = np.maximum(np.sqrt(power / max(count - len(flights), 1)), 1e-6)
-    # The autocorrelation time in moments is a sum up to the first uncorrelated lag.
+    # The autocorrelation time in means is a sum up to the first uncorrelated lag.
     memory, correlated = np.ones(3), np.ones(3, bool)
     for lag in range(1, limits.longest_memory):
         product = np.sum([(f[lag:] * f[:-lag]).sum(axis=0) for f in deviations], axis=0)
@@ -217,7 +217,7 @@ def block_of(
 
 
 def successive_changes(data: ViewData) -> ViewData:
-    """Return the changes of all values in `data` from each moment to the next of its flight."""
+    """Return the changes of all values in `data` from each mean to the next of its flight."""
     step = np.diff(data.middle_s)
     usual_step = np.median(step[step > 0.0])
     neighbours = (np.diff(data.flight) == 0) & (step < 1.5 * usual_step)
@@ -233,8 +233,8 @@ def fast_share(
 
     A controller makes the motors compensate a slow torque that the model lacks, so that their
     torque causes no rotation. That looks like a larger inertia or less thrust, but only in slow
-    changes. If the model is right, changes from one moment to the next give the same parameters (to
-    first order) as all moments do (a specification test; Hausman 1978, doi 10.2307/1913827).
+    changes. If the model is right, changes from one mean to the next give the same parameters (to
+    first order) as the means do (a specification test; Hausman 1978, doi 10.2307/1913827).
 
     `data` has the effect in the model. `columns` are those of the effect's K parameters in the
     slopes, and `change` (K,) is their fitted value minus that of the vehicle file.
