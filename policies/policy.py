@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from policies import shipped
-from policies.spec import PolicyError, PolicySpec
+from policies.spec import PolicyError, PolicySpec, check_spec
 from tracks.common.names import closest, unknown_name
 from tracks.input.ranges import as_path, check_type, shown
 
@@ -77,11 +77,11 @@ MEMBERS: dict[str, tuple[Any, str]] = {
 """Member of a policy -> its type, and the type's name in messages."""
 
 
-def check_is_policy(policy: object) -> None:
+def check_is_policy(policy: Any) -> None:
     """Refuse an object that is no policy.
 
     Raises:
-        ValueError: naming its missing or wrong members.
+        ValueError: naming its missing or wrong members, or an invalid number of its spec.
     """
     about = (
         "a policy object has name, spec, start(n) and act(hidden, state, image, fresh): "
@@ -95,6 +95,7 @@ def check_is_policy(policy: object) -> None:
             raise ValueError(
                 f"policy {shown(policy)}: its {name} is {shown(value)}, not {text}; {about}"
             )
+    check_spec(policy.spec, f"policy {policy.name!r}: spec.")
 
 
 def checked_act(
@@ -103,13 +104,18 @@ def checked_act(
     """Return what `Policy.act` returns; its actions are unchecked.
 
     Raises:
-        ValueError: where that is not a tuple of two.
+        ValueError: where that is not a tuple of two, or the action is a tensor with a gradient.
     """
     output = policy.act(hidden, state, image, fresh)
     if not isinstance(output, tuple) or len(output) != 2:
         kind = f"{len(output)} values" if isinstance(output, tuple) else type(output).__name__
         raise ValueError(
             f"policy {policy.name!r}: act returned {kind}, expected the tuple (action, hidden)"
+        )
+    if getattr(output[0], "requires_grad", False):
+        raise ValueError(
+            f"policy {policy.name!r}: act returned a torch tensor with a gradient; call the "
+            "network under torch.no_grad(), and return action.numpy()"
         )
     return output
 
@@ -156,6 +162,7 @@ def load_policy(name_or_path: str | Path, trust: bool = False) -> Policy:
     if path.is_dir():
         from policies.native import load_native
 
+        _check_is_checkpoint(path)
         folder = path.resolve()
         # A training writes its policy to RUN/policy, which is named after RUN.
         return load_native(path, folder.parent.name if folder.name == "policy" else folder.name)
@@ -182,6 +189,13 @@ def load_policy(name_or_path: str | Path, trust: bool = False) -> Policy:
     )
 
 
+def _check_is_checkpoint(path: Path) -> None:
+    """Refuse a folder that is no checkpoint but contains policy files, and name these."""
+    names = sorted(each.name for each in path.iterdir() if each.suffix in SUFFIXES)
+    if names and not (path / "config.json").exists():
+        raise PolicyError(f"{path}: no checkpoint, but a folder with {', '.join(names)}; name one")
+
+
 def _is_c_folder(path: Path) -> bool:
     return (path / "policy.c").is_file() and not (path / "config.json").exists()
 
@@ -191,7 +205,10 @@ def _missing(text: str, path: Path) -> PolicyError:
     looks_like_path = len(path.parts) > 1 or path.suffix in SUFFIXES
     if not looks_like_path:
         error = unknown_name("policy", text, shipped.names())
-        return PolicyError(f"{error} A checkpoint's folder or a policy file is allowed as well.")
+        hint = "A checkpoint's folder or a policy file is allowed as well."
+        if "," in text:
+            hint = "For several policies give --policy once for each."
+        return PolicyError(f"{error} {hint}")
     siblings = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
     similar = closest(path.name, siblings)
     question = f" Did you mean {path.parent / similar}?" if similar else ""

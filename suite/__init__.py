@@ -93,7 +93,8 @@ def evaluate_policy(
     Raises:
         ValueError: for an argument that cannot be used, before the first flight.
     """
-    from eval.judging.outputs import action_report, notes_of, object_faults
+    from eval.judging.policy_checks.faults import notes_of, object_faults
+    from eval.judging.policy_checks.in_flight import action_report
     from eval.logs.faults.vehicle import vehicle_doubts
     from eval.vehicles.vehicle import Vehicle
     from eval.worlds.engine import warn_of

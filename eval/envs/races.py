@@ -174,8 +174,8 @@ def resolved_spec(config: RaceConfig, vehicle: Vehicle) -> PolicySpec:
     spec = config.spec or PolicySpec()
     if not isinstance(spec, PolicySpec):
         policy = os.fspath(spec)
-        if not locate(policy).exists():
-            raise unknown_name("policy (or folder)", policy, names())
+        if not locate(policy).is_dir():
+            raise unknown_name("policy or folder of a checkpoint", policy, names())
         spec = load_policy_checkpoint(locate(policy)).spec
     depth = replace(
         spec.depth,

@@ -17,7 +17,7 @@ import numpy as np
 
 from eval.judging.ages import Delays
 from eval.judging.guard import ActionLimits, call_policy, check_rate, first_action, limits_of
-from eval.judging.outputs import Outputs
+from eval.judging.policy_checks.in_flight import Outputs
 from eval.judging.recorder import Recorder
 from eval.judging.sensors import Filtered, Sensors, single_steps
 from eval.logs.flight import Flight

@@ -18,6 +18,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from eval.logs.columns import KNOWN, FlightLogError
+from policies.policy import SUFFIXES
 from tracks.common.files import replacing_file
 from tracks.input.reading import LOG_BYTES, InputError, check_file, refuse_other_kinds
 
@@ -62,6 +63,8 @@ def read_columns(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[st
         return _read_parquet(path)
     if path.suffix.lower() in (".parquet", ".pq"):
         raise FlightLogError(path, "not a Parquet file (or cut at its start); copy it again")
+    if path.suffix.lower() in SUFFIXES:
+        raise FlightLogError(path, "a policy, not a flight log; check it by suite check --policy")
     if b"\0" in head:
         raise FlightLogError(path, "neither a Parquet file nor CSV; suite import reads others")
     return _read_csv(path)

@@ -92,7 +92,9 @@ def _check_rotors(vehicle: Vehicle) -> None:
         limits[f"motors.thrust = {list(vehicle.motors.thrust)}"] = full
     for entry, limit in limits.items():
         if hover.max() >= limit:
-            unit = "; a mass in grams?" if hover.max() > 30.0 * limit else ""
+            unit = ""
+            if hover.max() > 30.0 * limit:
+                unit = "; a mass in grams, or a thrust_coefficient per rpm^2, not per (rad/s)^2?"
             raise ValueError(
                 f"{entry}: too weak to hover with mass = {vehicle.mass:g} kg{unit}; a rotor gives "
                 f"{limit:.3g} N and {hover.max():.3g} N are needed"

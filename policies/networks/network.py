@@ -83,11 +83,15 @@ def adapt_params(params: Params, old: PolicySpec, new: PolicySpec) -> Params:
                 f"the policy to start from has spec.{entry.name} {before}, and this run {after}; "
                 "train without a start, or with the value of the policy"
             )
+    lacking = [f"spec.{key}=True" for key in EXTRAS if getattr(old, key) and not getattr(new, key)]
+    if lacking:
+        raise ValueError(
+            f"the policy to start from has more inputs; give --set {' '.join(lacking)}, or its own "
+            "--recipe with --finetune"
+        )
     weights, next_row = [params["state.weight"][: new.base_size]], new.base_size
     for key, count in EXTRAS.items():
         before, after = getattr(old, key), getattr(new, key)
-        if before and not after:
-            raise ValueError(f"the policy to start from has spec.{key}; set spec.{key}=True")
         if before:
             weights.append(params["state.weight"][next_row : next_row + count])
             next_row += count

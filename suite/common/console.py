@@ -55,20 +55,23 @@ class Console:
             with _bar(label, total, begun) as update:
                 yield update
             return
-        started = last = time.monotonic()
+        last = time.monotonic()
+        first: tuple[float, float] | None = None
 
         def update(done: float, note: str = "") -> None:
             """Print a line, unless the last one was printed a short time ago."""
-            nonlocal last
+            nonlocal last, first
             now = time.monotonic()
+            # The first part also loads and compiles, so its rate does not count.
+            first = first or (now, done)
             if now - last < PLAIN_PERIOD_S:
                 return
             last = now
-            newly_done = done - begun
-            remaining = (
-                duration((now - started) * (total - done) / newly_done) if newly_done else "unknown"
-            )
-            self.note(f"{label}: {done:g} of {total:g}, {remaining} left{note and ', ' + note}")
+            seconds, newly_done = now - first[0], done - first[1]
+            left = ""
+            if newly_done:
+                left = f", {duration(seconds * (total - done) / newly_done)} left"
+            self.note(f"{label}: {done:g} of {total:g}{left}{note and ', ' + note}")
 
         yield update
 

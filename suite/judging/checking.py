@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from eval.judging.outputs import action_report, notes_of
-from eval.judging.watched import Watched
+from eval.judging.policy_checks.faults import notes_of, unused_inputs
+from eval.judging.policy_checks.in_flight import Watched, action_report
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.check import (
     CheckContext,
@@ -34,7 +34,11 @@ from tracks.common.files import check_no_input
 TIME_LIMIT_S = 5.0
 """Time limit of the short flights that show a policy's actions [s]."""
 LEAST_FLIGHTS = 3
-"""Smallest number of short flights of which one should pass a gate."""
+"""Smallest number of short flights in which too few gates are a fault."""
+USUAL = "race"
+"""The policy with whose gates those of another one are compared."""
+UNCLEAR = {"action_limited"}
+"""Faults next to which too few gates may have another cause."""
 
 
 def check_policy(
@@ -144,7 +148,8 @@ def policy_findings(policy: Policy, trials: int, console: Console) -> list[Findi
     known = {finding.fault for finding in findings}
     warnings, hints = _warnings_in_flight(policy, trials, console, known)
     findings += [_finding("action", warning) for warning in warnings]
-    return findings + [_finding("memory", hint, "note") for hint in hints]
+    findings += [_finding("memory", hint, "note") for hint in hints]
+    return findings + [_finding("input", note, "note") for note in unused_inputs(policy)]
 
 
 def _warnings_in_flight(
@@ -152,13 +157,15 @@ def _warnings_in_flight(
 ) -> tuple[list[Note], list[Note]]:
     """Return probable faults of the actions in a few short flights, and hints.
 
-    The faults `known` are left out. Flights without a gate are a fault if there is no other one.
+    The faults `known` are left out. Few gates, or few flights without contact, are a fault if
+    there is no other one.
     """
     if not trials:
         return [], []
     request = SimulatedFlights("random", "0", trials, 500_000, "racer5", TIME_LIMIT_S)
     watched = Watched(policy)
-    results = fly_trials(watched, request, read_trial_set(request))
+    tracks = read_trial_set(request)
+    results = fly_trials(watched, request, tracks)
     actions = action_report(results, policy.spec.action, known)
     if not actions["decisions"]:
         return [], []
@@ -170,12 +177,16 @@ def _warnings_in_flight(
     endings = ", ".join(f"{number} {ending}" for ending, number in ended.items())
     text = f"in {trials} flights of {TIME_LIMIT_S:g} s at level 0 it passed {gates} gates"
     console.say(f"{text}; at the end: {endings}")
-    if not gates and trials >= LEAST_FLIGHTS and not (warnings or known):
+    others = known | {warning.fault for warning in warnings} - UNCLEAR
+    unharmed = ended["in flight"] + ended["finished"]
+    if trials >= LEAST_FLIGHTS and not others and (gates < trials or 2 * unharmed <= trials):
+        usual = sum(row.gates_passed for row in fly_trials(load_policy(USUAL), request, tracks))
+        text = f"{text} ({endings}); {USUAL} passes {usual}"
         fix = (
             "compare units, axes, signs and order of its state, image and action with the "
             "contract above; after a very short training this is no fault"
         )
-        warnings.append(Note("no_gate", f"{text} ({endings})", fix))
+        warnings.append(Note("few_gates" if gates else "no_gate", text, fix))
     return warnings, watched.hints()
 
 

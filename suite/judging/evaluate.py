@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.judging.outputs import action_report, notes_of
 from eval.judging.plans import VEHICLE, OverPlan, over_plan
+from eval.judging.policy_checks.faults import notes_of
+from eval.judging.policy_checks.in_flight import action_report
 from eval.judging.results import Journal, write_results
 from eval.judging.tables import grids, markdown_table, summarise, with_interval
 from eval.quadrotor.vehicle_file import load_vehicle, vehicle_table

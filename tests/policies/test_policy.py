@@ -44,6 +44,10 @@ def test_a_shipped_policy_is_found_by_name_and_another_told_the_nearest(shelf, e
         load_policy(exported / "tny.onnx")
     with pytest.raises(PolicyError, match="no such file or folder"):
         load_policy(exported / "nowhere" / "x.onnx")
+    with pytest.raises(PolicyError, match="give --policy once for each"):
+        load_policy("race,race-small")
+    with pytest.raises(PolicyError, match=r"no checkpoint, but a folder with .*tiny\.onnx"):
+        load_policy(exported)
 
 
 def test_a_trainings_folder_is_told_where_its_policy_is(checkpoint, tmp_path):

@@ -10,7 +10,7 @@ import numpy as np
 
 from eval.judging import judge
 from eval.judging.guard import ActionLimits, Guarded, call_policy, first_action, limits_of
-from eval.judging.outputs import Outputs
+from eval.judging.policy_checks.in_flight import Outputs
 from eval.judging.sensors import Sensors
 from eval.quadrotor.autopilot import autopilot_step, make_autopilot, start_autopilot
 from eval.quadrotor.plant import Motion, uses_noise

@@ -20,7 +20,7 @@ LIFT = (1.15, 20.0)
 ROUND = (0.015, 1.0)
 """Usual inertia about x and y over mass times arm squared: small where the mass is near the centre,
 1 at most where no mass is beyond the rotors."""
-TORQUE_M = (0.001, 0.2)
+TORQUE_M = (0.002, 0.1)
 """Plausible ratio of a rotor's torque to its thrust [m]; usual are 0.005 to 0.05."""
 GAIN = 1.0
 """Smallest plausible gain of the nominal rate loop [1/s]."""

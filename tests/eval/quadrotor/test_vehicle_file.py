@@ -79,7 +79,7 @@ REFUSED = [
     ("rotors.spin", [1, 1, -1, 1], r"rotors\.spin = .*two rotors must spin in each"),
     ("rotors.position", [[0.2, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [0.2, 0.1, 0]], "between"),
     ("rotors.speed_max", 1000.0, "too weak to hover with mass = 0.75 kg; a rotor"),
-    ("mass", 750.0, r"too weak to hover with mass = 750 kg; a mass in grams\?"),
+    ("mass", 750.0, r"too weak to hover with mass = 750 kg; a mass in grams"),
     ("rotors.time_constant", -0.1, r"rotors\.time_constant = -0\.1.*from 0"),
     ("controller.frequency", 10.0, r"controller\.frequency.*from 50"),
     ("controller.rate_gain", [20.0, 20.0, 0.0], r"controller\.rate_gain"),

@@ -324,7 +324,7 @@ def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first
     assert isinstance(fast, BlockPolicy)
     fast = replace(fast, spec=replace(fast.spec, rate_hz=2000.0))
     monkeypatch.setattr(fly, "load_in_manner", lambda *_: fast)
-    assert "decides at 2000 Hz" in refused(capsys, asked, tmp_path / "b")
+    assert "spec.rate_hz is 2000" in refused(capsys, asked, tmp_path / "b")
     assert not (tmp_path / "b").exists()
 
 

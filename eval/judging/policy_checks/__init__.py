@@ -1,0 +1,1 @@
+"""Checks of a policy for common errors of unit, scale, sign, frame and memory."""
