@@ -46,7 +46,7 @@ CLEAR_RATE = 0.2
 DOMINANT = 1.5
 """If one component of an output answers to an offset by this factor more than the others, it is the
 axis of this offset."""
-THRUST = (3.0, 40.0)
+THRUST = (6.0, 40.0)
 """Plausible mean of the commanded thrust per mass [m/s^2]."""
 RATE_MOST = 35.0
 """Largest plausible body rate [rad/s], 2000 deg/s."""
@@ -151,8 +151,8 @@ def _ctbr_faults(policy: Policy, found: Responses) -> list[Note]:
     if not THRUST[0] <= thrust <= THRUST[1]:
         text = f"commands a thrust of {thrust:.3g} m/s^2 in level flight towards a gate"
         fix = (
-            "thrust is per mass [m/s^2], 9.81 in hover, no share and no force, and the first of "
-            "thrust, roll, pitch, yaw; or set action.scale"
+            "thrust is per mass [m/s^2] and contains gravity: 9.81 in hover, no share and no force. "
+            "It is the first of thrust, roll, pitch, yaw; or set action.scale"
         )
         return [Note("action_thrust", text, fix)]
     if largest > RATE_MOST:

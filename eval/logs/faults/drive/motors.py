@@ -16,7 +16,7 @@ from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import WIDTH_S, Rows
 from eval.logs.faults.reading import option
 from eval.logs.faults.relation import forward_mean, rms, smooth, within
-from eval.logs.velocity import velocity_from_position
+from eval.logs.velocity import HALF_WINDOW_S, velocity_from_position
 from eval.vehicles.vehicle import Vehicle, motor_thrust
 
 SPAN_S = 0.08
@@ -351,23 +351,29 @@ def fit_force(rows: Rows, thrust: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the force per mass along body z without drag, (T,) [m/s^2], and `thrust` (T,) over it.
 
     A thrust in newtons gives a mass [kg], a thrust in m/s^2 a dimensionless ratio; 0 means that
-    nothing could be fitted. The force is averaged over `WIDTH_S`. It comes from the path where the
-    log has a pose, from the accelerometer otherwise (then without a correction for drag), and is
-    gravity where the log has neither.
+    nothing could be fitted. The force comes from the path where the log has a pose, from the
+    accelerometer otherwise (then without a correction for drag), and is gravity where the log has
+    neither. Force and thrust are averaged over `WIDTH_S` as vectors in the same axes, since the
+    body may rotate within this time. At the ends of a path its acceleration is too uncertain.
     """
     time_s = rows["time"]
-    drag = np.zeros((len(time_s), 0))
-    force = np.full(len(time_s), GRAVITY)
+    drag, thrust = np.zeros((len(time_s), 0)), thrust[:, None]
+    force, inside = np.full(len(time_s), GRAVITY), np.ones(len(time_s), bool)
     if "quat" in rows and "pos" in rows:
         quat, vel = conjugate(rows["quat"]), velocity_from_position(time_s, rows["pos"])
         acc = smooth(time_s, velocity_from_position(time_s, vel), WIDTH_S)
         force = rotate(quat, acc + [0.0, 0.0, GRAVITY])[:, 2]
+        up_w = rotate(rows["quat"], np.broadcast_to([0.0, 0.0, 1.0], acc.shape))
+        thrust = rotate(quat, smooth(time_s, thrust * up_w, WIDTH_S))[:, 2:]
         vel_z = rotate(quat, vel)[:, 2:]
         drag = np.concatenate([vel_z, vel_z * np.linalg.norm(vel, axis=1, keepdims=True)], axis=1)
+        end_s = 2.0 * max(HALF_WINDOW_S, 2.0 * float(np.median(np.diff(time_s))))
+        inside = (time_s - time_s[0] >= end_s) & (time_s[-1] - time_s >= end_s)
     elif "acc" in rows:
         force = smooth(time_s, rows["acc"][:, 2:], WIDTH_S)[:, 0]
-    columns = np.concatenate([thrust[:, None], drag], axis=1)
-    good = np.isfinite(force) & np.isfinite(columns).all(axis=1)
+        thrust = smooth(time_s, thrust, WIDTH_S)
+    columns = np.concatenate([thrust, drag], axis=1)
+    good = inside & np.isfinite(force) & np.isfinite(columns).all(axis=1)
     if not good.any() or not np.any(thrust[good]):
         return force, 0.0
     coefficients = np.linalg.lstsq(columns[good], force[good], rcond=None)[0]

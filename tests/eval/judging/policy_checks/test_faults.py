@@ -115,13 +115,15 @@ class Turning(Pursuit):
     spec: PolicySpec = PolicySpec(action=ActionSpec("ctbr"))
     change: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
     order: tuple[int, ...] = (0, 1, 2, 3)
+    weight: float = GRAVITY
 
     def act(self, hidden, state, image, fresh):
         wanted = super().act(hidden, state, image, fresh)[0] + GRAVITY * state[:, 3:6]
         size = np.linalg.norm(wanted, axis=1)
         yaw = np.arctan2(state[:, 7], state[:, 6])
         rates = [-6 * wanted[:, 1] / size, 6 * wanted[:, 0] / size, 2 * yaw]
-        action = np.stack([wanted[:, 2], *rates], -1)[:, self.order] * self.change
+        thrust = wanted[:, 2] + (self.weight - GRAVITY) * state[:, 5]
+        action = np.stack([thrust, *rates], -1)[:, self.order] * self.change
         return action.astype(np.float32), hidden
 
 
@@ -135,6 +137,7 @@ class Turning(Pursuit):
         ("action_order", "with its pitch rate", {"order": (0, 2, 1, 3)}),
         ("action_thrust", "a thrust of", {"order": (1, 2, 3, 0)}),
         ("action_thrust", "a thrust of", {"change": (0.1, 1, 1, 1)}),
+        ("action_thrust", "a thrust of", {"weight": 0.0}),
         ("action_rates", "rad/s in level flight", {"change": (1, 57.3, 57.3, 57.3)}),
     ],
 )

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from eval.logs.faults.drive.commands import check_thrust_command
 from eval.logs.faults.drive.motor_map import check_motor_map
-from eval.logs.faults.drive.motors import check_inertia, check_lift, check_motors
+from eval.logs.faults.drive.motors import check_inertia, check_lift, check_motors, fit_force
 from eval.logs.faults.reading import parse_readings, read_rows
 from eval.logs.faults.relation import match
 from eval.logs.faults.sensors import check_voltage
@@ -39,6 +39,20 @@ def lift(factor, vehicle=PLAIN):
 def test_speeds_that_carry_the_weight_or_what_an_effect_can_do_are_no_fault():
     assert lift(0.98).status == lift(1.03).status == "ok"
     assert (lift(1.1).status, lift(1.1).fault) == ("note", "thrust_scale")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_lift_of_a_short_fast_noisy_flight_is_right(seed):
+    fine_s = np.arange(0.0, 6.0, 0.001)
+    roll, thrust = 0.8 * np.sin(8.0 * fine_s), 12.0 + 3.0 * np.sin(5.0 * fine_s)
+    none = np.zeros_like(roll)
+    acc_w = thrust * np.stack([none, -np.sin(roll), np.cos(roll)]) - [[0.0], [0.0], [9.81]]
+    pos_w = np.cumsum(np.cumsum(acc_w, axis=1), axis=1) * 0.001**2
+    quat = np.stack([np.cos(roll / 2), np.sin(roll / 2), none, none])
+    rows = {"time": fine_s, "pos": pos_w.T, "quat": quat.T, "thrust": thrust}
+    rows = {name: values[::10] for name, values in rows.items()}
+    rows["pos"] += 0.005 * np.random.default_rng(seed).standard_normal(rows["pos"].shape)
+    assert fit_force(rows, 2.0 * rows.pop("thrust"))[1] == pytest.approx(2.0, rel=0.01)
 
 
 def test_a_factor_with_a_name_is_put_right():
