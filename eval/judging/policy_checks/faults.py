@@ -151,8 +151,8 @@ def _ctbr_faults(policy: Policy, found: Responses) -> list[Note]:
     if not THRUST[0] <= thrust <= THRUST[1]:
         text = f"commands a thrust of {thrust:.3g} m/s^2 in level flight towards a gate"
         fix = (
-            "thrust is per mass [m/s^2] and contains gravity: 9.81 in hover, no share and no force. "
-            "It is the first of thrust, roll, pitch, yaw; or set action.scale"
+            "thrust is per mass [m/s^2], with gravity: 9.81 in hover, no share and no force. It is "
+            "the first of thrust, roll, pitch, yaw; or set action.scale"
         )
         return [Note("action_thrust", text, fix)]
     if largest > RATE_MOST:
