@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from eval.judging.guard import Guarded
+from eval.judging.policy_checks.responses import UP_B, VEL_B
 from eval.worlds.trial import TrialResult
 from policies.policy import Hidden, Policy, Wrapper
 from policies.spec import ActionSpec, Note
@@ -25,8 +26,6 @@ EXTREME, LEAST_DECISIONS = 0.999, 20
 OFTEN = 0.5
 """Share of extreme outputs above which the policy probably saturates."""
 
-VEL_B, UP_B = slice(0, 3), slice(3, 6)
-"""Parts of a state observation (`policies.observation`), in body axes: velocity, world z axis."""
 UNIT_FIX = "check the unit of its output"
 SCALE_FIX = (
     "export it with the contract (units, scales, frames) of its environment, or set action.scale; "
