@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from policies.block_policy import BlockPolicy, verify_rows
 from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks import network
-from policies.spec import PolicySpec
+from policies.spec import Note, PolicySpec
 
 
 def load_native(folder: Path, name: str) -> BlockPolicy:
@@ -22,7 +23,20 @@ def load_native(folder: Path, name: str) -> BlockPolicy:
         PolicyError: where the checkpoint is damaged or of another kind.
     """
     checkpoint = load_policy_checkpoint(folder)
-    return verify_rows(native_policy(checkpoint.params, checkpoint.spec, name), str(folder))
+    policy = native_policy(checkpoint.params, checkpoint.spec, name)
+    policy = replace(policy, notes=_unfinished(checkpoint.config, name))
+    return verify_rows(policy, str(folder))
+
+
+def _unfinished(config: Mapping[str, Any], name: str) -> tuple[Note, ...]:
+    """Return a note if the policy is from a training that was stopped."""
+    training = config.get("training", {})
+    done, settings = training.get("iteration"), training.get("config", {})
+    total = settings.get("optimizer", {}).get("iterations")
+    if done is None or total is None or done >= total:
+        return ()
+    text = f"{name}: its training was stopped after {done} of {total} gradient steps"
+    return (Note("training_unfinished", text, "repeat its suite train command to continue it"),)
 
 
 def native_policy(params: Mapping[str, Any], spec: PolicySpec, name: str) -> BlockPolicy:

@@ -46,6 +46,12 @@ OTHER_MARKS = ";\t"
 NO_COMMAS = (
     "the first line has no commas; separate the columns by commas, and write decimals with a point"
 )
+OTHERS = {
+    **dict.fromkeys(SUFFIXES, "a policy (suite check --policy)"),
+    ".toml": "a track (suite tracks) or a vehicle (suite check --vehicle)",
+    ".json": "a JSON file",
+}
+"""What files are that may be given in place of a flight log, by suffix."""
 NOT_CSV = "neither a Parquet file nor CSV in UTF-8"
 
 
@@ -63,8 +69,8 @@ def read_columns(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[st
         return _read_parquet(path)
     if path.suffix.lower() in (".parquet", ".pq"):
         raise FlightLogError(path, "not a Parquet file (or cut at its start); copy it again")
-    if path.suffix.lower() in SUFFIXES:
-        raise FlightLogError(path, "a policy, not a flight log; check it by suite check --policy")
+    if other := OTHERS.get(path.suffix.lower()):
+        raise FlightLogError(path, f"{other}, not a flight log")
     if b"\0" in head:
         raise FlightLogError(path, "neither a Parquet file nor CSV; suite import reads others")
     return _read_csv(path)

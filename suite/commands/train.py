@@ -14,7 +14,14 @@ from suite.common.running.hosts import ProcessOptions, connect, read_member
 from suite.common.stages import differences, first_changes
 from suite.common.startup import use_device
 from suite.train.config import TrainConfig
-from suite.train.overrides import PREFIX, check_owned, check_phases, phase_configs, with_changes
+from suite.train.overrides import (
+    PREFIX,
+    check_owned,
+    check_phases,
+    phase_configs,
+    phase_ends,
+    with_changes,
+)
 from suite.train.recipes import finetune, named_recipe, with_model, with_sensors
 from tracks.common.files import check_no_input, plain
 from tracks.input.ranges import Iterations, Range, Seed
@@ -46,7 +53,7 @@ class Config(Command):
     """Gradient steps, instead of the recipe's."""
     num_envs: Annotated[int, Range(1, 10**6)] | None = None
     """Environments per gradient step, instead of the recipe's; the same as --set episode.batch."""
-    lr: Annotated[float, Range(0.0, 10.0)] | None = None
+    lr: Annotated[float, Range(0.0, 10.0, above=True)] | None = None
     """Peak learning rate of every phase, instead of the recipe's; the same as --set
     optimizer.rate."""
     device: Literal["cpu", "gpu"] | None = None
@@ -133,6 +140,19 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from suite.train.run import start_params, train
 
     resolved = resolve(config)
+    if (config.out / CONFIG).exists():
+        raise ValueError(
+            f"--out {config.out} is the folder of a policy; give a folder for the new run, which "
+            "gets its policy in policy/"
+        )
+    ends = phase_ends(resolved)
+    for phase, begin, end in zip(phase_configs(resolved), (0, *ends), ends, strict=False):
+        if end - begin <= phase.optimizer.warmup:
+            console.note(
+                f"warning: {end - begin} gradient steps are not more than the warm-up "
+                f"(optimizer.warmup {phase.optimizer.warmup}), so the learning rate stays below "
+                "its peak"
+            )
     params, delta = None, None
     if config.init_from is not None:
         # The trained policy goes to out/policy, which must not be the one to start from.
@@ -167,5 +187,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         f"{last['collided']:.0%} collided, {last['speed']:.1f} m/s"
     )
     console.say(f"policy: {outcome.policy}")
-    console.say(f"next: suite eval --policy {outcome.policy} --difficulty 0")
+    given = {"--vehicle": config.vehicle, "--sensors": config.sensors}
+    options = "".join(f" {name} {value}" for name, value in given.items() if value is not None)
+    console.say(f"next: suite eval --policy {outcome.policy} --difficulty 0{options}")
     return plain(outcome)

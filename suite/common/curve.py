@@ -61,16 +61,24 @@ def read(folder: Path, name: str = CURVE) -> list[dict[str, Any]]:
     """Return the complete rows of the curve, each iteration once.
 
     A truncated last line and rows that an interrupted save wrote twice are left out.
+
+    Raises:
+        ValueError: if another line is damaged.
     """
     path = folder / name
     if not path.exists():
         return []
-    rows = []
-    for line in path.read_text(encoding="utf-8").splitlines():
+    rows, lines = [], path.read_text(encoding="utf-8").splitlines()
+    for number, line in enumerate(lines, start=1):
         try:
             row = json.loads(line)
         except ValueError:
-            break
+            if number == len(lines):
+                break
+            raise ValueError(
+                f"{path}: line {number} is damaged; restore the file, or move it away: the "
+                "training continues without its earlier curve"
+            ) from None
         if not rows or row["iteration"] > rows[-1]["iteration"]:
             rows.append(row)
     return rows

@@ -108,6 +108,12 @@ def verdict(
         f"and {significance(to_nominal, 'above', 'below')} the policy where nothing is hidden "
         f"(difference {points(to_nominal)})."
     )
+    (cost,) = (other.success for other in by_name[NOMINAL].differences if other.against == BEFORE)
+    if cost.low <= 0.0:
+        text += (
+            " The hidden effect does not lower the success rate significantly here, so there is "
+            "nothing to regain: raise --difficulty or --trials."
+        )
     if DELTA not in by_name:
         return text
     return (

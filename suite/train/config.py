@@ -227,7 +227,7 @@ class OptimizerConfig:
 
     iterations: Iterations = 2000
     """Gradient steps of the whole run."""
-    rate: Annotated[float, Range(0.0, 10.0)] = 2e-3
+    rate: Annotated[float, Range(0.0, 10.0, above=True)] = 2e-3
     """Peak learning rate."""
     warmup: Annotated[int, Range(0, 10**9)] = 20
     """Gradient steps of linear warm-up of each phase; the first has a learning rate of 0."""

@@ -66,6 +66,17 @@ def test_a_file_inside_a_checkpoint_and_other_kinds_are_pointed_on(checkpoint, t
         load_policy(tmp_path)
 
 
+def test_the_policy_of_a_stopped_training_has_a_note(checkpoint, tmp_path):
+    stored = load_policy_checkpoint(checkpoint)
+    for done in (48, 600):
+        training = {"iteration": done, "config": {"optimizer": {"iterations": 600}}}
+        folder = tmp_path / f"{done}"
+        save_policy(folder, stored.params, stored.spec, seed=1, training=training)
+        notes = load_policy(folder).notes
+        assert [note.fault for note in notes] == ["training_unfinished"] * (done == 48)
+        assert done == 600 or "stopped after 48 of 600 gradient steps" in notes[0].evidence
+
+
 @pytest.mark.parametrize("name", shipped.names())
 def test_what_is_shipped_is_whole_small_and_has_its_card(name):
     folder = shipped.locate(name)

@@ -51,7 +51,7 @@ def load_convex_parts(paths: Sequence[Path]) -> list[list[np.ndarray]]:
         if path.suffix.lower() not in KINDS:
             raise ValueError(f"{path}: a mesh file's name must end in one of {', '.join(KINDS)}")
         if not path.exists():
-            raise ValueError(f"{path}: no such mesh file")
+            raise ValueError(f"{path}: no such mesh file; paths are relative to the track's file")
         check_file(path, MESH_BYTES)
     if not paths:
         return []

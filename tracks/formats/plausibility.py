@@ -33,6 +33,10 @@ STEP_LEAST_M = 0.3
 """Smallest plausible distance between different gates that follow each other [m]."""
 AGAINST = -0.7
 """A gate is turned round if the cosines of its direction with the ways to and from it are less."""
+ALONG, ALONG_OTHERWISE, AMISS = 0.7, 0.85, 0.55
+"""Mean cosine of the gates' directions with the ways through them: the smallest usual one, one that
+another reading of the yaws must reach, and one that is a mistake without another reading. On the
+families' tracks it is 0.78 or more."""
 AWAY, TOWARDS = 0.7, 0.9
 """Cosines of the start's heading with the way to gate 0: surely away, and surely towards it."""
 
@@ -76,11 +80,48 @@ def track_notes(name: str, track: Track) -> list[str]:
         notes.append(f"gate {gate} faces against the path to and from it; turn its yaw by 180 deg?")
     if cosine[0][0] < AGAINST and 0 not in against:
         notes.append("the start is behind gate 0, on the side where the drone leaves it")
+    if (
+        not len(against)
+        and not written.any()
+        and (amiss := _misdirected(way_w, np.deg2rad(yaw_deg)))
+    ):
+        notes.append(amiss)
     # A gate may be listed again, for another lap, but not next to itself.
     step_w, turn = np.diff(center_w, axis=0), (ahead_w[1:] * ahead_w[:-1]).sum(axis=1)
     for gate in np.flatnonzero((np.linalg.norm(step_w, axis=1) < 1e-3) & (turn > 0.999))[:1]:
         notes.append(f"gates {gate} and {gate + 1} have the same place and direction")
     return [f"{name}: {note}" for note in [*notes, *_misplaced(track)]]
+
+
+def _misdirected(way_w: np.ndarray, yaw: np.ndarray) -> str:
+    """Return a note if the gates' directions are not along the path, and "" otherwise.
+
+    `way_w` (N, 3) are unit vectors to each gate, and `yaw` (N,) the gates' yaws [rad]. The way
+    through a gate is the mean of the horizontal ways to and from it; turns back have none.
+    """
+    through_w = (way_w + np.vstack([way_w[1:], way_w[-1:]]))[:, :2] / 2.0
+    size = np.linalg.norm(through_w, axis=1)
+    clear = size > 0.05
+    if clear.sum() < 3:
+        return ""
+    way = np.arctan2(through_w[clear, 1], through_w[clear, 0])
+
+    def along(read: np.ndarray) -> float:
+        return float(np.cos(read[clear] - way).mean())
+
+    if (found := along(yaw)) >= ALONG:
+        return ""
+    readings = {
+        "with all yaws turned by 90 deg": yaw + np.pi / 2.0,
+        "with all yaws turned by -90 deg": yaw - np.pi / 2.0,
+        "with the opposite sign of all yaws": -yaw,
+        "with yaws in radians": np.rad2deg(yaw),
+    }
+    best = max(readings, key=lambda name: along(readings[name]))
+    text = f"the gates' directions are not along the path: their mean cosine is {found:.2f}"
+    if along(readings[best]) >= ALONG_OTHERWISE:
+        return f"{text}, {best} {along(readings[best]):.2f}; yaw_deg is the direction of flight"
+    return f"{text}; check the order of the gates and each yaw_deg" if found < AMISS else ""
 
 
 def _in_radians(yaw_deg: np.ndarray | float) -> np.ndarray:

@@ -189,12 +189,22 @@ class JaxRace:
 
         At an episode's end the next one starts, and the observation is its first one. `info` has
         the `gates` passed, counted from the track's first, and `collided`, `tipped`, `finished`
-        and `truncated` (the time limit).
+        and `truncated` (the time limit). An action that is not finite ends the episode as a
+        collision does (`bad_action`).
+
+        Raises:
+            ValueError: for an action of another shape.
         """
+        if jnp.shape(action) != (3,):
+            raise ValueError(
+                f"the action has the shape {jnp.shape(action)}, allowed is (3,); for many "
+                "environments map this function by jax.vmap"
+            )
         # Fly one period.
         wind, pick, noise = jax.random.split(key, 3)
         world = _batch_of_one(worlds, state.world)
-        output = jnp.clip(action, -1.0, 1.0)
+        bad = ~jnp.isfinite(action).all()
+        output = jnp.where(bad, 0.0, jnp.clip(action, -1.0, 1.0))
         keys = world_keys(wind, world)
         episode, result = self._race.fly(world, state.episode, ACTION_LIMIT * output[None], keys)
         # Whether the episode is over, and its reward. A tilt beyond 90 degrees costs as much as a
@@ -203,13 +213,13 @@ class JaxRace:
         gates = episode.target[0]
         tipped = episode.state.rot_w[0, 2, 2] < 0.0
         finished = gates >= worlds.scene.gates.center_w.shape[1]
-        collided = result.collided[0]
+        collided = result.collided[0] | bad
         over = collided | tipped | finished
         truncated = ~over & (steps >= round(self.time_limit_s * self.config.spec.rate_hz))
         reward = self.reward_scale * (result.reward.total()[0] + COLLISION * (tipped & ~collided))
         info = {
             "gates": gates, "collided": collided, "tipped": tipped, "finished": finished,
-            "truncated": truncated,
+            "truncated": truncated, "bad_action": bad,
         }  # fmt: skip
         # At its end, start the next episode in a random world of the pool.
         done = over | truncated

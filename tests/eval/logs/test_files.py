@@ -79,6 +79,7 @@ def test_files_that_are_no_logs_are_refused(tmp_path):
         "text.parquet": (b"hello", "not a Parquet"),
         "binary.csv": (bytes(range(256)), "neither a Parquet file nor CSV"),
         "mine.onnx": (b"\x08\x08", "suite check --policy"),
+        "track.toml": (b"schema = 1", "a vehicle (suite check --vehicle), not a flight log"),
         "semicolons.csv": (text.replace(",", ";").encode(), "commas"),
         "header.csv": (lines[0].encode() + b"\n", "no whole rows"),
         "word.csv": (text.replace(lines[5].split(",")[0], "oops", 1).encode(), "oops"),

@@ -149,6 +149,11 @@ def test_training_goes_on_from_a_policy_by_its_name_and_does_not_write_over_it(
     own = shutil.copytree(shipped.locate("race-paper"), tmp_path / "policy")
     said = refused(capsys, "train --out", tmp_path, "--init-from", own)
     assert "config.json is also an input and would be overwritten" in said
+    said = refused(capsys, "train --init-from race-paper --out", own)
+    assert "is the folder of a policy; give a folder for the new run" in said
+    run("train --recipe race-paper --iterations 20 --out", tmp_path / "run")
+    assert "20 gradient steps are not more than the warm-up" in capsys.readouterr().err
+    assert "optimizer.rate" in refused(capsys, "train --set optimizer.rate=0 --out", tmp_path / "r")
 
 
 def test_a_delta_action_model_has_the_rate_of_every_phase(tmp_path, capsys, monkeypatch):

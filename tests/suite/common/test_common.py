@@ -122,6 +122,17 @@ def test_numbers_reach_tensorboard_from_the_first_step_or_the_missing_package_is
         curve.tensorboard(tmp_path)
 
 
+def test_a_cut_last_line_of_a_curve_is_left_out_and_another_damage_is_refused(tmp_path):
+    rows = [{"iteration": number} for number in range(3)]
+    curve.append(tmp_path, rows)
+    path = tmp_path / curve.CURVE
+    path.write_text(path.read_text() + '{"iterat')
+    assert curve.read(tmp_path) == rows
+    path.write_text(path.read_text().replace('"iteration": 1}', "garbage"))
+    with pytest.raises(ValueError, match=r"metrics\.jsonl: line 2 is damaged"):
+        curve.read(tmp_path)
+
+
 def _pad_one_box(to_boxes, center_w):
     none = np.zeros((0, 3))
     gates = Gates(none, np.zeros((0, 3, 3)), np.zeros((0, 4, 2)), np.zeros(0), np.zeros(0))

@@ -298,6 +298,7 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
         (39, 10, 40, ("and not significantly different from the policy where nothing is hidden",)),
         (20, 10, 40, ("and above the policy where nothing is hidden",)),
         (40, 10, 20, ("and below the policy where nothing is hidden",)),
+        (11, 10, 11, ("does not lower the success rate significantly here", "raise --difficulty")),
     ],
 )  # fmt: skip
 def test_the_verdict_claims_what_the_intervals_hold(nominal, control, named, words):
@@ -305,3 +306,4 @@ def test_the_verdict_claims_what_the_intervals_hold(nominal, control, named, wor
     standings = policy_results(results_of(won), ("before", "control", "nominal"))
     said = hidden_effect.verdict(standings, answer([NAMED]), 40)
     assert all(one in said for one in words), said
+    assert ("nothing to regain" in said) == (nominal == 11)

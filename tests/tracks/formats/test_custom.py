@@ -28,46 +28,6 @@ def write(folder, text):
     return path
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        (GATE.replace("1.5]", "1500]") + GATE.replace("0, 1.5]", "4000, 1500]"), "4000 m apart"),
-        (GATE.replace("1.0", "30.0").replace("1.5]", "40]"), "30 m wide"),
-        (GATE + GATE, "gates 0 and 1 have the same place and direction"),
-        (GATE + GATE.replace("0, 1.5]", "5, 1.5]\nyaw_deg = 1.5708"), "gate 1 has a yaw of 1.571"),
-        (GATE.replace("1.5]", "150]") + GATE.replace("0, 1.5]", "400, 150]"), "centimetres"),
-        (GATE + GATE.replace("[0, 0,", "[0.1, 0,"), "gates 0 and 1 are only 0.1 m apart"),
-        (GATE.replace("1.5]", "1.5]\nyaw_deg = 90.0")
-         + "[start]\nposition = [0, -3, 1.5]\nyaw_deg = 1.5708\n", "is start.yaw_deg in radians?"),
-        (GATE.replace("1.5]", "1.5]\nyaw_deg = 180") + GATE.replace("[0, 0, 1.5]", "[5, 0, 1.5]")
-         + "[start]\nposition = [-3, 0, 1.5]\n", "gate 0 faces against the path"),
-        (GATE + '[[spheres]]\nname = "tree"\ncenter = [0, 0, 1.5]\nradius = 0.3\n',
-         "'tree' is within 0.5 m in front of or behind the centre of gate 0"),
-        (GATE + GATE.replace("0, 1.5]", "5, 1.5]") + GATE.replace("0, 1.5]", "5.9, 1.5]"),
-         "'gate 1 frame' stands in the opening of gate 2"),
-        (GATE + '[[boxes]]\ncenter = [-0.4, 0, 1.5]\nsize = [0.002, 1, 1]\n', "'box 0' is within"),
-        (GATE + '[[boxes]]\ncenter = [2500, 0, 1]\nsize = [1, 1, 1]\n', "2.5e+03 m away from all"),
-        (GATE + '[[boxes]]\ncenter = [50, 0, 0]\nsize = [60, 60, 60]\n', "is its file in metres?"),
-        (GATE + "frame_width = 20.0\n", "with a frame of up to 20 m"),
-        (GATE + "[start]\nposition = [-250, 0, 1.5]\n", "start and gates are up to 250 m apart"),
-        (GATE + "[start]\nposition = [3, 0, 1.5]\n", "the start is behind gate 0"),
-        (GATE + "[start]\nposition = [-3, 0, 1.5]\nyaw_deg = 180\n", "the start faces away"),
-    ],
-)  # fmt: skip
-def test_probable_mistakes_in_a_track_are_noted(tmp_path, text, said):
-    (note,) = track_notes("mine", load_track(write(tmp_path, text)))
-    assert note.startswith("mine: ") and said in note
-
-
-def test_a_second_lap_through_the_same_gates_is_no_mistake(tmp_path):
-    lap = GATE + GATE.replace("0, 1.5]", "5, 1.5]")
-    assert not track_notes("mine", load_track(write(tmp_path, lap + lap)))
-    # Neither is a plate that can be flown round, nor a large floor.
-    plate = "[[boxes]]\ncenter = [-0.7, 0, 1.5]\nsize = [0.1, 0.5, 0.5]\n"
-    floor = "[[boxes]]\ncenter = [0, 0, 0.05]\nsize = [300, 300, 0.1]\nyaw_deg = 3600\n"
-    assert not track_notes("mine", load_track(write(tmp_path, lap + plate + floor)))
-
-
 def test_the_example_is_read_as_it_says(root):
     track = load_track(root / "tracks" / "examples" / "yard.toml")
     assert not track_notes("yard", track)

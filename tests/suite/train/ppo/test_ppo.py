@@ -297,5 +297,17 @@ def test_an_episode_that_ends_starts_another_and_says_why(worlds):
     assert ended[2]["truncated"][2]
 
 
+def test_an_action_of_another_shape_is_refused_and_one_that_is_not_finite_ends(worlds):
+    _, state = reset(KEYS, worlds)
+    action = jnp.zeros((3, 3)).at[1, 2].set(jnp.nan)
+    observation, _, reward, done, info = step(KEYS, state, action, worlds)
+    assert done.tolist() == info["bad_action"].tolist() == [False, True, False]
+    assert np.isfinite(observation.state).all() and np.isfinite(reward).all()
+    one = jax.tree.map(lambda leaf: leaf[0], state)
+    for shape in ((1,), (), (4,)):
+        with pytest.raises(ValueError, match=r"allowed is \(3,\)"):
+            ENV.step(KEYS[0], one, jnp.zeros(shape), worlds)
+
+
 def test_its_contract_is_that_of_the_judges_environments():
     assert ENV.contract == Races(RaceConfig(spec=ENV.config.spec), 1).contract
