@@ -133,6 +133,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
     import jax
 
+    from eval.logs.faults.vehicle import FOV_LEAST_DEG
     from policies.formats.checkpoint import CONFIG
     from policies.formats.policy_file import load_delta, load_policy_checkpoint
     from suite.delta.replay import check_corrects
@@ -144,6 +145,12 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         raise ValueError(
             f"--out {config.out} is the folder of a policy; give a folder for the new run, which "
             "gets its policy in policy/"
+        )
+    across, down = resolved.spec.camera.fov_deg
+    if max(across, down) < FOV_LEAST_DEG:
+        console.note(
+            f"warning: the camera sees only {across:g} x {down:g} deg; spec.camera.fov_deg is in "
+            "degrees, not radians"
         )
     ends = phase_ends(resolved)
     for phase, begin, end in zip(phase_configs(resolved), (0, *ends), ends, strict=False):

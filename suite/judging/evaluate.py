@@ -107,7 +107,7 @@ def evaluate(
     total = count * len(entries)
     needs = flying_estimate(total, workers, evaluation.simulator)
     journals = _open_journals(evaluation, trial_set, entries, out)
-    announce(console, f"{total} trials in {evaluation.simulator}", needs)
+    announce(console, f"{total} trial{'s' * (total != 1)} in {evaluation.simulator}", needs)
     show_notes(console, evaluation.simulator, trial_set)
     for warning in dict.fromkeys(each for policy in policies for each in notes_of(policy)):
         console.note(str(warning))
