@@ -157,6 +157,32 @@ def test_the_field_and_other_ways_to_learn():
         assert line.endswith(wanted), line
 
 
+DISTURBANCES = {
+    "command delay": ("latency", 80, 120),
+    "motor lag": ("motor lag", 50, 80),
+    "drag": ("drag", 8, 16),
+    "error of the gates' positions (standard deviation on each axis)": (
+        "gate-pose error",
+        0.1,
+        0.3,
+    ),
+    "delay of state and image": ("age of both", 80, 100),
+    "lost images": ("lost images", 50, 80),
+}
+"""Row of the results -> section of the page `robustness`, and the sizes of both columns."""
+
+
+def test_the_larger_disturbances_are_those_of_their_page():
+    page = (RESULTS / "robustness.md").read_text("utf-8")
+    results = (ROOT / "docs" / "results.md").read_text("utf-8")
+    for row, (section, *sizes) in DISTURBANCES.items():
+        (line,) = [line for line in results.splitlines() if line.startswith(f"| {row} |")]
+        made = page.split(f"\n{section}\n")[1].split("\n\n")[0]
+        for said, size in zip(line.strip("| ").split(" | ")[1:], sizes, strict=True):
+            (rate,) = re.findall(rf"^\| {size} \| (\d+ %)", made, re.MULTILINE)
+            assert said.startswith(f"{rate} "), (row, size, said)
+
+
 def intervals(value):
     """Yield every success with its interval."""
     if isinstance(value, dict):
