@@ -46,7 +46,7 @@ OTHER_MARKS = ";\t"
 NO_COMMAS = (
     "the first line has no commas; separate the columns by commas, and write decimals with a point"
 )
-OTHERS = {
+NO_LOGS = {
     **dict.fromkeys(SUFFIXES, "a policy (suite check --policy)"),
     ".toml": "a track (suite tracks) or a vehicle (suite check --vehicle)",
     ".json": "a JSON file",
@@ -69,7 +69,7 @@ def read_columns(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[st
         return _read_parquet(path)
     if path.suffix.lower() in (".parquet", ".pq"):
         raise FlightLogError(path, "not a Parquet file (or cut at its start); copy it again")
-    if other := OTHERS.get(path.suffix.lower()):
+    if other := NO_LOGS.get(path.suffix.lower()):
         raise FlightLogError(path, f"{other}, not a flight log")
     if b"\0" in head:
         raise FlightLogError(path, "neither a Parquet file nor CSV; suite import reads others")
