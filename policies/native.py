@@ -30,8 +30,8 @@ def load_native(folder: Path, name: str) -> BlockPolicy:
 
 def _unfinished(config: Mapping[str, Any], name: str) -> tuple[Note, ...]:
     """Return a note if the policy is from a training that was stopped."""
-    training = config.get("training", {})
-    done, settings = training.get("iteration"), training.get("config", {})
+    training = config.get("training") or {}
+    done, settings = training.get("iteration"), training.get("config") or {}
     total = settings.get("optimizer", {}).get("iterations")
     if done is None or total is None or done >= total:
         return ()
