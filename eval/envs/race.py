@@ -21,6 +21,8 @@ from tracks.track import Track
 
 ACTION_LIMIT = 20.0
 """Largest absolute value of a component of an action [m/s^2]."""
+FAR_BEYOND = 6.0
+"""Size of a component of an action from -1 to 1 that noise of a learner hardly reaches."""
 STATE_LIMIT = 1e4
 """Limit to which components of the state are clipped; flights are far below it."""
 GATE_REWARD = 5.0
@@ -127,6 +129,17 @@ class Race(OneTrial):
             "state": np.clip(state, -STATE_LIMIT, STATE_LIMIT).astype(np.float32),
             "image": image.astype(np.float32),
         }
+
+
+def unscaled(output: np.ndarray) -> list[str]:
+    """Return a warning if actions (N, size), which should be from -1 to 1, are far larger."""
+    largest = np.abs(output).max(initial=0.0)
+    if largest <= FAR_BEYOND:
+        return []
+    return [
+        f"an action has a component of {largest:.3g}, which is clipped: actions are from -1 to 1; "
+        "env.contract has their scale, by which an action in SI units must be divided"
+    ]
 
 
 def remaining_path(pos_w: np.ndarray, centres_w: np.ndarray, gates: int) -> float:

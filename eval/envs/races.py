@@ -22,6 +22,7 @@ from eval.envs.race import (
     GATE_REWARD,
     STATE_LIMIT,
     remaining_path,
+    unscaled,
 )
 from eval.judging.guard import ActionLimits, check_rate, first_action, guard_action, limits_of
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -44,6 +45,7 @@ from tracks.track import Track
 SEEDS = 2**31
 """Number of track seeds, from 0."""
 BAD_ACTION = "bad_action"
+NOT_FINITE = "the action is not finite: look for NaN in the learner's network"
 """Ending by an action that is not finite, in addition to `eval.worlds.trial.ENDINGS`."""
 
 
@@ -326,6 +328,7 @@ class Races:
         """
         output = np.asarray(output, float)
         finite = np.isfinite(output).all(-1)
+        warn_of(unscaled(output[finite]))
         flying = self.ended == FLYING
         guarded = guard_action(self._limits, output, self._action, 0.0, "of the environment's user")
         self._bad |= flying & ~finite
@@ -386,15 +389,12 @@ class Races:
     def info(self, slot: int) -> dict[str, Any]:
         """Return the info dict of the episode in `slot`, as Gymnasium's `step` returns it."""
         ending = self.ended_by(slot)
-        info = {
+        return {
             "track_seed": int(self.track_seed[slot]),
             "level": int(self.level[slot]),
             "gates": int(self.gates[slot]),
             "time_s": float(self.time_s[slot]),
             "ended_by": ending or "",
             "collided_with": self._world.collided_with(slot) if ending == "collision" else "",
-            "message": "",
+            "message": NOT_FINITE if ending == BAD_ACTION else "",
         }
-        if ending == BAD_ACTION:
-            info["message"] = "the action is not finite: look for NaN in the learner's network"
-        return info
