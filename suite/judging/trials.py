@@ -165,6 +165,8 @@ def read_trial_set(
         f"zero or left out; give one, such as {SENSORS[name].grows[0]!r}"
         for name in sensors.without_effect
     ]
+    if not sensors.models and sensors.name != "perfect":
+        notes.append(f"sensors {sensors.name!r}: no sensor model is in the file, so all is exact")
     if sensors.estimator is None and any(SENSORS[name].measure for name in sensors.models):
         notes.append(
             f"sensors {sensors.name!r}: the IMU has no effect, because only an estimator "

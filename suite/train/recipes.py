@@ -207,6 +207,10 @@ def with_sensors(config: TrainConfig, sensors: str) -> TrainConfig:
             f"--sensors {sensors}: its estimator follows flights of the judge, not of the "
             "trainer; train with vio, or with what suite identify --sensors writes"
         )
+    if not seen.models and seen.name != "perfect":
+        raise ValueError(
+            f"--sensors {sensors}: the file has no sensor model; add one or leave it out"
+        )
     acting = {name: seen.models[name] for name in seen.models if name not in seen.without_effect}
     if seen.models and not view_models(acting) and not seen.has_delay:
         raise ValueError(

@@ -125,6 +125,9 @@ def test_sensors_that_change_nothing_in_a_training_are_refused(tmp_path):
         file.write_text(f'schema = 1\nname = "mine"\n{model}')
         with pytest.raises(ValueError, match=r"(imu|tof) does not change what a policy sees"):
             resolve(Config(sensors=str(file)))
+    file.write_text('schema = 1\nname = "mine"\n')
+    with pytest.raises(ValueError, match="the file has no sensor model"):
+        resolve(Config(sensors=str(file)))
 
 
 def test_training_goes_on_from_a_policy_by_its_name_and_does_not_write_over_it(

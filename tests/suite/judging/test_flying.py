@@ -160,6 +160,8 @@ def test_sensors_without_random_numbers_give_equal_flights(tmp_path, stage, text
     assert len(trial_set.trials) == flights
     assert noted in trial_set.notes[-1] if noted else not trial_set.notes
     assert len(read_trial_set(replace(options, sensors="imu+gates")).trials) == 3
+    (tmp_path / "mine.toml").write_text('name = "mine"\n')
+    assert "no sensor model is in the file" in read_trial_set(options).notes[-1]
 
 
 def test_a_start_in_contact_is_refused_wherever_a_track_file_is_flown(tmp_path, capsys):
