@@ -131,9 +131,12 @@ class Race(OneTrial):
         }
 
 
-def unscaled(output: np.ndarray) -> list[str]:
-    """Return a warning if actions (N, size), which should be from -1 to 1, are far larger."""
-    largest = np.abs(output).max(initial=0.0)
+def unscaled(sizes: np.ndarray) -> list[str]:
+    """Return a warning if actions, which should be from -1 to 1, are far larger.
+
+    `sizes` (N,) are the largest components of the actions; NaN for those that are not finite.
+    """
+    largest = np.fmax.reduce(sizes, initial=0.0)
     if largest <= FAR_BEYOND:
         return []
     return [

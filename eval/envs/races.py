@@ -44,8 +44,8 @@ from tracks.track import Track
 
 SEEDS = 2**31
 """Number of track seeds, from 0."""
-BAD_ACTION = "bad_action"
 NOT_FINITE = "the action is not finite: look for NaN in the learner's network"
+BAD_ACTION = "bad_action"
 """Ending by an action that is not finite, in addition to `eval.worlds.trial.ENDINGS`."""
 
 
@@ -328,9 +328,9 @@ class Races:
         """
         output = np.asarray(output, float)
         finite = np.isfinite(output).all(-1)
-        warn_of(unscaled(output[finite]))
         flying = self.ended == FLYING
         guarded = guard_action(self._limits, output, self._action, 0.0, "of the environment's user")
+        warn_of(unscaled(guarded.largest))
         self._bad |= flying & ~finite
         flying &= finite
         gates_before, to_go_before, time_before_s = self.gates, self.to_go, self.time_s

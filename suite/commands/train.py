@@ -133,7 +133,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
     import jax
 
-    from eval.logs.faults.vehicle import FOV_LEAST_DEG
+    from eval.logs.faults.vehicle import narrow_view
     from policies.formats.checkpoint import CONFIG
     from policies.formats.policy_file import load_delta, load_policy_checkpoint
     from suite.delta.replay import check_corrects
@@ -146,14 +146,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             f"--out {config.out} is the folder of a policy; give a folder for the new run, which "
             "gets its policy in policy/"
         )
-    across, down = resolved.spec.camera.fov_deg
-    if max(across, down) < FOV_LEAST_DEG:
-        console.note(
-            f"warning: the camera sees only {across:g} x {down:g} deg; spec.camera.fov_deg is in "
-            "degrees, not radians"
-        )
+    if text := narrow_view(resolved.spec.camera.fov_deg):
+        console.note(f"warning: the policy: {text}; spec.camera.fov_deg is in degrees, not radians")
     ends = phase_ends(resolved)
-    for phase, begin, end in zip(phase_configs(resolved), (0, *ends), ends, strict=False):
+    for phase, begin, end in zip(phase_configs(resolved), (0, *ends[:-1]), ends, strict=True):
         if end - begin <= phase.optimizer.warmup:
             console.note(
                 f"warning: {end - begin} gradient steps are not more than the warm-up "

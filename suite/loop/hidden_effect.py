@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from eval.effects import EFFECTS
+from eval.judging.statistics import Interval
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import differences
@@ -94,12 +95,14 @@ def verdict(
 ) -> str:
     """Return the loop's result in a few sentences; `vehicle` is how they name the true vehicle."""
     by_name = {policy.name: policy for policy in policies}
-    differences = {other.against: other.success for other in by_name[NAMED].differences}
+
+    def minus(name: str) -> dict[str, Interval]:
+        return {other.against: other.success for other in by_name[name].differences}
 
     def percent(name: str) -> str:
         return f"{100 * by_name[name].success.value:.0f} %"
 
-    to_control, to_nominal = differences[CONTROL], differences[NOMINAL]
+    to_control, to_nominal = (minus(NAMED)[name] for name in (CONTROL, NOMINAL))
     text = (
         f"With {vehicle} {percent(BEFORE)} of {trials} trials succeed, with the simulation's "
         f"vehicle {percent(NOMINAL)}. The diagnosis names {named_effects(diagnosis)}. Fine-tuned "
@@ -108,8 +111,7 @@ def verdict(
         f"and {significance(to_nominal, 'above', 'below')} the policy where nothing is hidden "
         f"(difference {points(to_nominal)})."
     )
-    (cost,) = (other.success for other in by_name[NOMINAL].differences if other.against == BEFORE)
-    if cost.low <= 0.0:
+    if minus(NOMINAL)[BEFORE].low <= 0.0:
         text += (
             " The hidden effect does not lower the success rate significantly here, so there is "
             "nothing to regain: raise --difficulty or --trials."

@@ -56,7 +56,8 @@ def track_notes(name: str, track: Track) -> list[str]:
             f"start and gates are up to {step_m:g} m apart; is the file in centimetres or "
             "millimetres? Lengths are in metres"
         )
-    yaw_deg = np.rad2deg(np.arctan2(ahead_w[:, 1], ahead_w[:, 0]))
+    yaw = np.arctan2(ahead_w[:, 1], ahead_w[:, 0])
+    yaw_deg = np.rad2deg(yaw)
     written = _in_radians(yaw_deg)
     if written.any() and np.abs(yaw_deg).max() < 2.0 * np.pi + ROUNDING:
         gate = int(np.argmax(written))
@@ -80,12 +81,8 @@ def track_notes(name: str, track: Track) -> list[str]:
         notes.append(f"gate {gate} faces against the path to and from it; turn its yaw by 180 deg?")
     if cosine[0][0] < AGAINST and 0 not in against:
         notes.append("the start is behind gate 0, on the side where the drone leaves it")
-    if (
-        not len(against)
-        and not written.any()
-        and (amiss := _misdirected(way_w, np.deg2rad(yaw_deg)))
-    ):
-        notes.append(amiss)
+    if not len(against) and not written.any():
+        notes += _misdirected(way_w, yaw)
     # A gate may be listed again, for another lap, but not next to itself.
     step_w, turn = np.diff(center_w, axis=0), (ahead_w[1:] * ahead_w[:-1]).sum(axis=1)
     for gate in np.flatnonzero((np.linalg.norm(step_w, axis=1) < 1e-3) & (turn > 0.999))[:1]:
@@ -93,8 +90,8 @@ def track_notes(name: str, track: Track) -> list[str]:
     return [f"{name}: {note}" for note in [*notes, *_misplaced(track)]]
 
 
-def _misdirected(way_w: np.ndarray, yaw: np.ndarray) -> str:
-    """Return a note if the gates' directions are not along the path, and "" otherwise.
+def _misdirected(way_w: np.ndarray, yaw: np.ndarray) -> list[str]:
+    """Return a note if the gates' directions are not along the path.
 
     `way_w` (N, 3) are unit vectors to each gate, and `yaw` (N,) the gates' yaws [rad]. The way
     through a gate is the mean of the horizontal ways to and from it; turns back have none.
@@ -103,25 +100,25 @@ def _misdirected(way_w: np.ndarray, yaw: np.ndarray) -> str:
     size = np.linalg.norm(through_w, axis=1)
     clear = size > 0.05
     if clear.sum() < 3:
-        return ""
+        return []
     way = np.arctan2(through_w[clear, 1], through_w[clear, 0])
 
     def along(read: np.ndarray) -> float:
         return float(np.cos(read[clear] - way).mean())
 
     if (found := along(yaw)) >= ALONG:
-        return ""
-    readings = {
-        "with all yaws turned by 90 deg": yaw + np.pi / 2.0,
-        "with all yaws turned by -90 deg": yaw - np.pi / 2.0,
-        "with the opposite sign of all yaws": -yaw,
-        "with yaws in radians": np.rad2deg(yaw),
+        return []
+    otherwise = {
+        "with all yaws turned by 90 deg": along(yaw + np.pi / 2.0),
+        "with all yaws turned by -90 deg": along(yaw - np.pi / 2.0),
+        "with the opposite sign of all yaws": along(-yaw),
+        "with yaws in radians": along(np.rad2deg(yaw)),
     }
-    best = max(readings, key=lambda name: along(readings[name]))
+    best = max(otherwise, key=lambda name: otherwise[name])
     text = f"the gates' directions are not along the path: their mean cosine is {found:.2f}"
-    if along(readings[best]) >= ALONG_OTHERWISE:
-        return f"{text}, {best} {along(readings[best]):.2f}; yaw_deg is the direction of flight"
-    return f"{text}; check the order of the gates and each yaw_deg" if found < AMISS else ""
+    if otherwise[best] >= ALONG_OTHERWISE:
+        return [f"{text}, {best} {otherwise[best]:.2f}; yaw_deg is the direction of flight"]
+    return [f"{text}; check the order of the gates and each yaw_deg"] if found < AMISS else []
 
 
 def _in_radians(yaw_deg: np.ndarray | float) -> np.ndarray:

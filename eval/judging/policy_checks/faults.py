@@ -23,15 +23,15 @@ from eval.judging.policy_checks.in_flight import (
 from eval.judging.policy_checks.responses import (
     NEAR_M,
     Responses,
+    last_action,
     level_states,
     responses,
-    run,
 )
 from eval.judging.policy_checks.rows import check_rows
-from eval.logs.faults.vehicle import FOV_LEAST_DEG
+from eval.logs.faults.vehicle import narrow_view
 from policies.observation import encode_depth
 from policies.policy import Policy
-from policies.spec import ACTION_SIZE, STATE_SIZE, Note
+from policies.spec import Note
 
 LIFT = 3.0
 """If a policy's vertical acceleration is always above this [m/s^2], even towards a gate below, its
@@ -89,10 +89,8 @@ def object_faults(policy: Policy) -> tuple[Note, ...]:
 
 def probable_faults(policy: Policy) -> tuple[Note, ...]:
     """Return the probable faults of unit, scale, sign and frame of a policy."""
-    kind, fov_deg = policy.spec.action.kind, policy.spec.camera.fov_deg
-    notes = []
-    if max(fov_deg) < FOV_LEAST_DEG:
-        text = f"its camera sees only {fov_deg[0]:g} x {fov_deg[1]:g} deg"
+    kind, notes = policy.spec.action.kind, []
+    if text := narrow_view(policy.spec.camera.fov_deg):
         notes.append(Note("camera_fov", text, "camera.fov_deg in degrees, not radians"))
     checks = {"acceleration": _acceleration_faults, "ctbr": _ctbr_faults}
     if kind in checks:
@@ -184,7 +182,7 @@ def _input_faults(policy: Policy, found: Responses) -> list[Note]:
         text = f"has the same output for an image and for {IMAGE_FACTOR:g} times that image"
         fix = "an image without scale contains no distances: do not divide it by its maximum"
         notes.append(Note("image_scale", text, fix))
-    if np.sqrt((found.gate**2).sum(-1)).min() < CLEAR:
+    if np.linalg.norm(found.gate, axis=-1).min() < CLEAR:
         return notes
     damping_s, approach = found.damping_s, found.approach
     unlike = [axis for axis, value in zip(AXES, damping_s, strict=True) if value < DAMPING_WRONG_S]
@@ -213,8 +211,8 @@ def unused_inputs(policy: Policy) -> list[Note]:
     """Return a note on the inputs that never change the action, though the policy has them."""
     spec = policy.spec
     state, other = level_states(spec, np.zeros((2, 2))), level_states(spec, np.ones((2, 2)))
-    moved, last_action = state.copy(), slice(STATE_SIZE - ACTION_SIZE, spec.base_size)
-    moved[:, last_action] += 1.0
+    moved = state.copy()
+    moved[:, last_action(spec)] += 1.0
     depths_m = np.full((2, 2, *spec.image_shape), NEAR_M)
     depths_m[0] = spec.camera.range_m
     far, near = encode_depth(spec.depth, depths_m, spec.camera.range_m).astype(np.float32)
@@ -258,6 +256,7 @@ def _divides_images(policy: Policy) -> bool:
     rows = np.linspace(0.5, 2.0, spec.image_shape[-2])[:, None]
     falling = np.broadcast_to(rows if not spec.depth.uint8 else 50 * rows, spec.image_shape)
     image = np.stack([falling, IMAGE_FACTOR * falling, np.flip(falling, -2)]).astype(np.float32)
-    outputs = run(policy, level_states(spec, np.zeros((len(image), 2))), image)[1][0]
+    state, fresh = level_states(spec, np.zeros((len(image), 2))), np.ones(len(image), bool)
+    outputs = np.asarray(policy.act(policy.start(len(image)), state, image, fresh)[0], float)
     scaled, flipped = np.abs(outputs[1:] - outputs[0]).max(-1)
     return bool(scaled < NO_CHANGE * flipped)

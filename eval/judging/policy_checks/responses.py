@@ -10,7 +10,7 @@ from eval.effects.interface import GRAVITY
 from eval.judging.guard import ActionLimits
 from policies.observation import encode_depth
 from policies.policy import Policy
-from policies.spec import ACTION_SIZE, STATE_SIZE, PolicySpec
+from policies.spec import ACTION_SIZE, EXTRAS, STATE_SIZE, PolicySpec
 
 VEL_B, UP_B, GATE_B = slice(0, 3), slice(3, 6), slice(6, 9)
 """Parts of a state observation (`policies.observation`), in body axes: velocity, the world's z
@@ -64,20 +64,20 @@ class Responses(NamedTuple):
 def responses(policy: Policy) -> Responses:
     """Run a policy on synthetic observations and return its answers."""
     spec = policy.spec
-    aside, ahead = ASIDE_M * SIDES, np.zeros((5, 2))
-    state = level_states(spec, np.vstack([aside, ahead, ahead, ahead[:1]]))
-    state[5:9, 1:3] += DRIFT * SIDES
-    state[13:15, 0] = 0.0, 2.0 * SPEED
+    # Pairs of opposite changes: 4 gates, 4 velocities, 4 images, 2 speeds. Then no change.
+    state = level_states(spec, np.vstack([ASIDE_M * SIDES, np.zeros((11, 2))]))
+    state[4:8, 1:3] += DRIFT * SIDES
+    state[12:14, 0] = 0.0, 2.0 * SPEED
     depth_m = np.full((len(state), *spec.image_shape[-2:]), spec.camera.range_m)
     height, width = (size // 2 for size in depth_m.shape[1:])
     halves = np.s_[:, :width], np.s_[:, width:], np.s_[:height], np.s_[height:]
-    for row, half in enumerate(halves, start=9):
+    for row, half in enumerate(halves, start=8):
         depth_m[row][half] = NEAR_M
     image = encode_depth(spec.depth, depth_m, spec.camera.range_m).astype(np.float32)
     action, output = run(policy, state, image.reshape(len(state), *spec.image_shape))
-    opposite = action[[0, 2, 5, 7, 9, 11, 13]] - action[[1, 3, 6, 8, 10, 12, 14]]
+    opposite, gates = action[:14:2] - action[1:14:2], [0, 1, 2, 3, 14]
     return Responses(
-        action[:5], output[:, :5], opposite[:2], opposite[2:4], opposite[4:6], opposite[6]
+        action[gates], output[:, gates], opposite[:2], opposite[2:4], opposite[4:6], opposite[6]
     )
 
 
@@ -87,17 +87,20 @@ def level_states(spec: PolicySpec, offset: np.ndarray) -> np.ndarray:
     state[:, VEL_B], state[:, UP_B] = (SPEED, 0, 0), (0, 0, 1)
     state[:, GATE_B] = np.insert(offset, 0, AHEAD_M, axis=1)
     if spec.action.kind == "ctbr":
-        state[:, STATE_SIZE - ACTION_SIZE] = GRAVITY  # the last thrust
+        state[:, last_action(spec).start] = GRAVITY  # the last thrust
     next_entry = spec.base_size
-    for key, size in (("second_gate", 3), ("gate_axis", 3), ("second_axis", 3)):
+    for key, size in EXTRAS.items():
         if getattr(spec, key):
-            state[:, next_entry : next_entry + size] = (1, 0, 0)
+            state[:, next_entry] = spec.speed if key == "speed_input" else 1.0
             if key == "second_gate":
-                state[:, next_entry : next_entry + 3] = state[:, GATE_B] + (AHEAD_M, 0, 0)
+                state[:, next_entry : next_entry + size] = state[:, GATE_B] + (AHEAD_M, 0, 0)
             next_entry += size
-    if spec.speed_input:
-        state[:, -1] = spec.speed
     return state
+
+
+def last_action(spec: PolicySpec) -> slice:
+    """Return the part of a state observation that has the last action."""
+    return slice(STATE_SIZE - ACTION_SIZE, spec.base_size)
 
 
 def run(policy: Policy, state: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -107,13 +110,13 @@ def run(policy: Policy, state: np.ndarray, image: np.ndarray) -> tuple[np.ndarra
         The last actions (N, size) in SI units, and the outputs of all steps (STEPS, N, size).
     """
     spec = policy.spec
-    last_action = state[:, STATE_SIZE - ACTION_SIZE : spec.base_size]
-    hidden, outputs, action = policy.start(len(state)), [], last_action
+    flown = state[:, last_action(spec)]
+    hidden, outputs, action = policy.start(len(state)), [], flown
     for step in range(STEPS):
         fresh = np.full(len(state), step == 0)
         output, hidden = policy.act(hidden, state, image, fresh)
         outputs.append(output)
         action = np.asarray(spec.action.to_si(output), np.float32)
         norm = np.linalg.norm(action, axis=-1, keepdims=True)
-        last_action[:] = action * np.minimum(1.0, ActionLimits().size / np.maximum(norm, 1e-6))
+        flown[:] = action * np.minimum(1.0, ActionLimits().size / np.maximum(norm, 1e-6))
     return np.asarray(action, float), np.array(outputs, float)

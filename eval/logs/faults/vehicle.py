@@ -95,6 +95,13 @@ def check_vehicle_numbers(vehicle: Vehicle) -> list[Finding]:
     return found or [Finding("ok", "vehicle", f"full thrust is {lift:.3g} times the weight")]
 
 
+def narrow_view(fov_deg: Sequence[float]) -> str:
+    """Return what is doubtful if a camera's field of view [deg] is tiny, and "" otherwise."""
+    if max(fov_deg) >= FOV_LEAST_DEG:
+        return ""
+    return f"its camera sees only {fov_deg[0]:g} x {fov_deg[1]:g} deg"
+
+
 def vehicle_doubts(vehicle: Vehicle) -> list[str]:
     """Return the doubts of `check_vehicle_numbers` as sentences with their fixes."""
     return [
@@ -115,8 +122,7 @@ def _of_simulation(vehicle: Vehicle, arm: float) -> list[Finding]:
         fix = "body.half_size in m" + (f": divide by {' or '.join(units)}" if units else "")
         found.append(Finding("doubt", "vehicle", text, "vehicle_arms", size, UNSURE, fix))
     fov_deg = vehicle.camera.fov_deg
-    if max(fov_deg) < FOV_LEAST_DEG:
-        text = f"its camera sees only {fov_deg[0]:g} x {fov_deg[1]:g} deg"
+    if text := narrow_view(fov_deg):
         fix = "camera.fov_deg in degrees, not radians"
         found.append(Finding("doubt", "vehicle", text, "camera_fov", None, UNSURE, fix))
     if vehicle.motors is not None:

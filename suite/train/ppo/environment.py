@@ -189,8 +189,8 @@ class JaxRace:
 
         At an episode's end the next one starts, and the observation is its first one. `info` has
         the `gates` passed, counted from the track's first, and `collided`, `tipped`, `finished`
-        and `truncated` (the time limit). An action that is not finite ends the episode as a
-        collision does (`bad_action`).
+        and `truncated` (the time limit). An action that is not finite (`bad_action`) ends the
+        episode and counts as `collided`, but costs nothing.
 
         Raises:
             ValueError: for an action of another shape.
