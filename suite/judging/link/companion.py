@@ -94,8 +94,9 @@ class Companion:
         self._last: State | None = None
         self.gate = 0
         """Number of passed gates, which is the index of the next one."""
-        self.late_answers = self.bad_actions = self.missed_decisions = 0
-        """Numbers of late answers, of actions that were not finite, and of missed decisions."""
+        self.late_answers = self.bad_actions = self.limited_actions = self.missed_decisions = 0
+        """Numbers of late answers, of actions that were not finite or were limited, and of missed
+        decisions."""
         self.over: str | None = None
         """Reason of the handover; None before it."""
         self.rows: list[Row] = []
@@ -287,6 +288,7 @@ class Companion:
         except Exception as error:  # after any error the autopilot must take control
             return f"the policy failed: {type(error).__name__}: {error}"
         self._action_b, self._fresh = guarded.action_b, False
+        self.limited_actions += int(guarded.limited[0])
         late = bool(guarded.late[0])
         self.late_answers += late
         self._late_in_row = self._late_in_row + 1 if late else 0

@@ -117,6 +117,7 @@ def _fly_trial(
         "vehicle_slips": result.slips,
         "late_actions": companion.late_answers,
         "bad_actions": companion.bad_actions,
+        "limited_actions": companion.limited_actions,
         "missed_decisions": companion.missed_decisions,
         "file": write_log(companion, trial_row, out, console),
     }

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from eval.judging.monitor import Monitored
+from eval.judging.policy_checks.faults import notes_of
 from eval.worlds.trial import Rules, track_of
 from policies.block_policy import BlockPolicy, for_one_row
 from policies.policy import Policy
@@ -42,7 +43,7 @@ from suite.judging.link.server import COMPANION, VEHICLE, WAIT_S
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits, refuse_high_floor
 from suite.judging.requests import Evaluation
-from suite.judging.trials import TrialSet, read_trial_set, refuse_equal_names
+from suite.judging.trials import TrialSet, read_trial_set, refuse_equal_names, show_notes
 from tracks.common.files import write_json
 from tracks.common.grid import rich_table, table
 from tracks.common.provenance import stamp
@@ -97,6 +98,7 @@ def fly_over_link(
     # The commanded speed is part of how the policy is loaded; the monitor is added below.
     (plain,) = manners(evaluation.speed, monitor=False)
     loaded = load_in_manner(name, evaluation.trust, plain)
+    policy_notes = notes_of(loaded)
     # Some policies compute blocks of 64 rows (drones) at once, so that rounding does not depend on
     # the number of drones. The judge needs that; one vehicle needs one row only.
     flying = for_one_row(loaded) if isinstance(loaded, BlockPolicy) else loaded
@@ -108,6 +110,9 @@ def fly_over_link(
         raise ValueError(
             f"--out {out} holds earlier flights, which are not continued; give another --out"
         )
+    show_notes(console, evaluation.simulator, trial_set)
+    for note in policy_notes:
+        console.note(str(note))
     rules = Rules(time_limit_s=evaluation.time_limit_s)
     # The judge's trials come before the flights, since the judge may refuse the policy.
     judged = (

@@ -69,10 +69,8 @@ class UdpLink:
         while True:
             try:
                 data, sender = self._socket.recvfrom(MOST_BYTES)
-            except BlockingIOError:
+            except OSError:  # no further datagram, or the other end is closed
                 return received
-            except OSError:  # the other end is closed
-                continue
             if self._peer is None and self._is_from_peer(data):
                 self._peer = sender
             if sender == self._peer:

@@ -193,6 +193,13 @@ def test_late_answers_are_not_flown_and_hand_over_where_they_go_on(bench):
     assert one.companion.late_answers == 3
 
 
+def test_limited_actions_are_counted_as_in_the_judge(bench):
+    one = bench(Steady((80.0, 0.0, 0.0), spec=PolicySpec(rate_hz=50.0))).fly()
+    assert sum(row.decided for row in one.companion.rows) == one.companion.limited_actions == 3
+    np.testing.assert_allclose(one.companion.rows[-1].action_b, [50.0, 0.0, 0.0])
+    assert bench().fly().companion.limited_actions == 0
+
+
 def test_the_heading_turns_as_fast_whatever_the_rate_of_states(bench):
     aside = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
     wanted = []

@@ -13,7 +13,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec, track_of
 from policies.block_policy import BlockPolicy
 from policies.policy import load_policy
-from policies.spec import DepthEncoding, PolicySpec
+from policies.spec import DepthEncoding, Note, PolicySpec
 from suite.common.console import Console
 from suite.judging.link import fly, server
 from suite.judging.link.companion import Companion, Row
@@ -32,6 +32,7 @@ from suite.judging.link.messages import (
 from suite.judging.link.simulated import LOST_S, FlightRequest, SimulatedVehicle
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
+from suite.judging.trials import NO_LEVELS
 from tests.support.commands import answer, refused, run
 from tests.support.pilots import Pursuit
 from tracks.geometry.rotation import quat_to_rot
@@ -205,6 +206,7 @@ def test_datagrams_are_taken_from_one_caller_that_speaks_for_the_vehicle(links, 
     waiting.close()
     first.send([b"gone"])
     assert first.receive(0.01) == []
+    assert waiting.receive() == [], "an error of the socket that stays does not block"
     waiting = links("udpin:127.0.0.1:0", bench().companion._wire.is_from_peer)
     stranger, other, vehicle = (links(f"udpout:127.0.0.1:{waiting.port}") for _ in range(3))
     stranger.send([b"anybody there?"])
@@ -322,9 +324,11 @@ def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first
     assert config["link"] == "simulated" and config["evaluation"]["time_limit_s"] == 0.2
     fast = load_policy("race")
     assert isinstance(fast, BlockPolicy)
-    fast = replace(fast, spec=replace(fast.spec, rate_hz=2000.0))
+    assumed = (Note("contract", "race: no contract in it", "write one"),)
+    fast = replace(fast, spec=replace(fast.spec, rate_hz=2000.0), notes=assumed)
     monkeypatch.setattr(fly, "load_in_manner", lambda *_: fast)
-    assert "spec.rate_hz is 2000" in refused(capsys, asked, tmp_path / "b")
+    said = refused(capsys, asked, tmp_path / "b")
+    assert "spec.rate_hz is 2000" in said and "race: no contract in it; write one" in said
     assert not (tmp_path / "b").exists()
 
 
@@ -364,7 +368,11 @@ def test_a_speed_and_the_judges_monitor_fly_in_real_time_too(capsys, tmp_path, m
     asked = (REAL.replace("fly", "fly --policy race --confirm"),)
     assert run(*asked, tmp_path / "a", "--speed", "0.3") == run(*asked, tmp_path / "b") == 0
     assert [policy.spec.speed for policy in flown] == [0.3, load_policy("race").spec.speed]
-    found = answer(capsys, *asked, tmp_path / "c", "--monitor")
+    capsys.readouterr()
+    assert run(*asked, tmp_path / "c", "--monitor", "--difficulty", "9", "--json") == 0
+    written, notes = capsys.readouterr()
+    assert NO_LEVELS in notes
+    found = json.loads(written)
     policy = flown[-1]
     assert isinstance(policy, Monitored) and isinstance(policy.policy, BlockPolicy)
     assert policy.policy.block == 1
