@@ -144,6 +144,8 @@ def _flight_windows(
         next_s = time_s[first] + stride_s
         span = slice(first, first + rows + 1)
         delayed_rows = np.searchsorted(time_s, time_s[first] - ages_s, side="right") - 1
+        # With jitter a step may begin before the rows that were checked.
+        delayed_rows = np.maximum(delayed_rows, used.start)
         burn_in = burn_in_before(
             rot_w[decision_rows],
             log.vel_w[decision_rows],

@@ -235,6 +235,20 @@ def test_windows_start_at_decisions_with_what_was_under_way(logs):
     np.testing.assert_allclose(windows.past[0, :6, 1:], log.rate_cmd_b[rows], atol=1e-6)
 
 
+def test_commands_before_a_window_are_never_those_of_the_flights_end(logs):
+    """The rows before the first window follow fast: a step may be longer ago than the first row."""
+    config = QuadrotorConfig(TRUE)
+    usual = cut_quadrotor_windows(logs[:1], config, 0.5, 5.0)[0]
+    begin = int(np.flatnonzero(logs[0].policy_step)[1]) - 4
+    kept = np.arange(len(logs[0].time_s)) >= begin
+    extra = {name: np.asarray(column)[kept] for name, column in logs[0].extra.items()}
+    log = replace(rows(logs[0], kept), extra=extra)
+    log.time_s[:4] = log.time_s[4] - 0.0081 * np.arange(4, 0, -1)
+    past = cut_quadrotor_windows([log], config, 0.5, 5.0)[0].past
+    assert past.shape == usual.past.shape == (1, 7, 4)
+    assert past[0, -1, 0] == pytest.approx(log.thrust_cmd[0], rel=1e-6)
+
+
 @pytest.fixture(scope="module")
 def of_point_mass():
     replay = jax.jit(partial(replay_point_mass, nominal_model(PointMassConfig())))
