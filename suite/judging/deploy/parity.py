@@ -15,6 +15,7 @@ import numpy as np
 from eval.judging.judge import JudgeOptions, fly
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialSpec
+from policies.contract import contract_of
 from policies.formats.c.c_file import load_c
 from policies.formats.c.compiler import find_compiler
 from policies.formats.c.forward import Observed
@@ -36,21 +37,23 @@ class Parity(NamedTuple):
     given: str
     """Description of the inputs, the observations."""
     worst: float
-    """Largest difference of a component of an action [m/s^2]."""
+    """Largest difference of a component of an action, in `unit`."""
     median: float
-    """Median of these differences [m/s^2]."""
+    """Median of these differences."""
     timing: Timing | None
     """Times of a step of the export on this machine; None if nothing was measured."""
+    unit: str
+    """Units of an action's components."""
 
     @property
     def sentence(self) -> str:
         """The result as a sentence."""
-        if not self.steps or self.timing is None:
+        if self.timing is None:
             return "not compiled and not compared here: no C compiler (cc, or what CC names)"
         return (
             f"compared with the JAX policy over {self.steps} steps with memory ({self.given}): "
-            f"largest difference {self.worst:.2g} m/s^2, median {self.median:.2g}; a step takes "
-            f"{1e6 * self.timing.median_s:.0f} us on this machine"
+            f"largest difference {self.worst:.2g} {self.unit}, median {self.median:.2g}; a step "
+            f"takes {1e6 * self.timing.median_s:.0f} us on this machine"
         )
 
 
@@ -63,8 +66,9 @@ def parity(folder: Path, checkpoint: PolicyCheckpoint, observed: Observed | None
         PolicyError: if the export does not compile, or computes numbers that are not finite.
     """
     given = "on flights" if observed else "inputs drawn at random"
+    unit = " or ".join(dict.fromkeys(contract_of(checkpoint.spec).action.unit))
     if find_compiler() is None:
-        return Parity(0, given, np.nan, np.nan, None)
+        return Parity(0, given, np.nan, np.nan, None, unit)
     inputs = Observed(
         *(x[:STEPS] for x in observed or random_observations(checkpoint.spec, STEPS, seed=1))
     )
@@ -74,7 +78,7 @@ def parity(folder: Path, checkpoint: PolicyCheckpoint, observed: Observed | None
     if not np.isfinite(errors).all():
         raise PolicyError(f"{folder}: the compiled policy gives numbers that are not finite")
     timing = time_in_turn({"c": c_step(policy)}, rounds=5)["c"]
-    return Parity(len(errors), given, float(errors.max()), float(np.median(errors)), timing)
+    return Parity(len(errors), given, float(errors.max()), float(np.median(errors)), timing, unit)
 
 
 TRACK = "random"

@@ -1,6 +1,7 @@
 """Exports in C with their cards: what is written, how near it is, and how it is timed."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 
@@ -119,7 +120,7 @@ def test_files_of_a_project_are_not_written_over(file, folder, tmp_path, capsys)
 
 
 def test_a_card_has_the_success_of_a_shipped_policys_card(folder):
-    found, stored = parity.Parity(0, "", np.nan, np.nan, None), load_policy_checkpoint(folder)
+    found, stored = parity.Parity(0, "", np.nan, np.nan, None, ""), load_policy_checkpoint(folder)
 
     def card(name, stored=stored):
         return exporting.card_text(name, name, stored, "float32", found)
@@ -159,6 +160,9 @@ def test_the_engines_that_are_timed_are_one_policy(kind, tmp_path):
     spec = replace(SPEC, action=ActionSpec(kind))
     folder = save_policy(tmp_path / "tiny", lively(spec, 2), spec, seed=1)
     export_policy(folder, tmp_path, ["c"])
+    units = {"acceleration": "m/s^2", "ctbr": "m/s^2 or rad/s"}[kind]
+    sentence = parity.parity(tmp_path, load_policy_checkpoint(folder), None).sentence
+    assert re.search(rf"largest difference \S+ {re.escape(units)}, median", sentence)
     more = spec.action.size - SPEC.action.size  # also of the last action in the state
     assert multiply_adds(spec) - multiply_adds(SPEC) == 2 * more * spec.hidden_size
     checkpoint = load_policy_checkpoint(folder)
