@@ -129,9 +129,8 @@ def load_manifest(out: Path) -> Manifest:
 
 
 def simulator_of(out: Path) -> str:
-    """Return the simulator of the set in `out`; MuJoCo if it is not recorded."""
-    path = out / "set.json"
-    return str(read_json(path).get("simulator", MUJOCO)) if path.is_file() else MUJOCO
+    """Return the simulator of the set in `out`."""
+    return str(read_json(out / "set.json")["simulator"])
 
 
 def open_answers(out: Path) -> dict[str, dict[str, Any]]:

@@ -171,10 +171,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             )
     if config.delta is not None:
         stored = load_delta(config.delta)
-        fit = stored.config.get("fit", {})
         for phase in phase_configs(resolved):
             dynamics = phase.quadrotor or phase.physics
-            check_corrects(fit, dynamics, phase.spec.rate_hz, config.delta)
+            check_corrects(stored.config["fit"], dynamics, phase.spec.rate_hz, config.delta)
         delta = jax.tree.map(jax.numpy.asarray, stored.arrays)
     mirror = tensorboard(config.out) if config.tensorboard and not member.number else None
     outcome = train(resolved, config.out, console, params, delta, mirror=mirror)

@@ -127,21 +127,19 @@ def check_corrects(
 ) -> None:
     """Refuse a Delta Action Model of other dynamics than the training's.
 
-    `fit` is the description in the checkpoint (a folder, for the message). Without the key `model`
-    it counts as that of a point mass. Without `rate_hz` the network is valid for any rate of
-    decisions [Hz]; it makes one step per decision.
+    `fit` is the description in the checkpoint (a folder, for the message), `rate_hz` the rate of
+    decisions in the training [Hz]. The network makes one step per decision.
 
     Raises:
         ValueError: if model, rate or parameters differ.
     """
     training = describe_dynamics(dynamics)
-    model = fit.get("model", POINT)
-    if model != training["model"]:
+    if fit["model"] != training["model"]:
         raise ValueError(
-            f"--delta {checkpoint} corrects --model {model}, and this run has --model "
+            f"--delta {checkpoint} corrects --model {fit['model']}, and this run has --model "
             f"{training['model']}; train with the model that it was fitted to"
         )
-    rate = fit.get("rate_hz", rate_hz)
+    rate = fit["rate_hz"]
     if abs(rate - rate_hz) > RATE_SHARE * rate_hz:
         raise ValueError(
             f"--delta {checkpoint} was fitted to flights with {rate:.3g} decisions a second, and "
@@ -149,8 +147,7 @@ def check_corrects(
             f"flights of a policy of {rate_hz:g} Hz, or give --finetune if the recipe's last phase "
             f"has {round(rate)} Hz, or --set spec.rate_hz={round(rate)}"
         )
-    plant = fit.get("plant", training["plant"])
-    if plant == training["plant"]:
+    if fit["plant"] == training["plant"]:
         return
     if isinstance(dynamics, QuadrotorConfig):
         name = dynamics.vehicle.name
@@ -159,9 +156,9 @@ def check_corrects(
             f"--vehicle, or fit again with suite delta --model {QUAD} --vehicle"
         )
     raise ValueError(
-        f"--delta {checkpoint} corrects a point mass with {_plant_text(plant)}, and this run's has "
-        f"{_plant_text(training['plant'])}; take the --recipe it was fitted to, or fit again with "
-        "suite delta --recipe"
+        f"--delta {checkpoint} corrects a point mass with {_plant_text(fit['plant'])}, and this "
+        f"run's has {_plant_text(training['plant'])}; take the --recipe it was fitted to, or fit "
+        "again with suite delta --recipe"
     )
 
 

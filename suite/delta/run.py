@@ -51,10 +51,8 @@ def split(
     """Return (flights to fit, held-out flights), at least one of each.
 
     Raises:
-        ValueError: for fewer than two flights, or a share outside (0, 1).
+        ValueError: for fewer than two flights.
     """
-    if not 0.0 < share < 1.0:
-        raise ValueError(f"held_out is {share}, allowed is more than 0 and less than 1")
     if len(logs) < 2:
         raise ValueError(f"{len(logs)} flight given, at least 2 are needed: one is held out")
     order = np.random.default_rng(seed).permutation(len(logs))

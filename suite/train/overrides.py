@@ -95,10 +95,10 @@ def _check_model(config: object, keys: list[str], change: str) -> None:
         )
 
 
-def check_owned(changes: Iterable[str], owned: Mapping[str, str], option: str = "--set") -> None:
+def check_owned(changes: Iterable[str], owned: Mapping[str, str]) -> None:
     """Refuse changes of settings that the command sets itself.
 
-    Changes are PATH=VALUE, given with `option`. `owned` maps the path of a setting, or of a part
+    Changes are PATH=VALUE, given with --set. `owned` maps the path of a setting, or of a part
     with all its settings, to advice for the message.
 
     Raises:
@@ -108,7 +108,7 @@ def check_owned(changes: Iterable[str], owned: Mapping[str, str], option: str = 
         path = _path(_phase_of(change)[1])
         for owned_path, advice in owned.items():
             if is_within(path, owned_path):
-                raise ValueError(f"{option} {shown(change)}: this command sets {path}; {advice}")
+                raise ValueError(f"--set {shown(change)}: this command sets {path}; {advice}")
 
 
 def _with_value(config: T, path: list[str], text: str, change: str) -> T:

@@ -172,11 +172,11 @@ def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
     return replace(config, optimizer=replace(config.optimizer, iterations=iterations))
 
 
-def finetune(config: TrainConfig, share: float = 0.25) -> TrainConfig:
+def finetune(config: TrainConfig) -> TrainConfig:
     """Return the settings of fine-tuning a policy that was trained with `config`.
 
-    They are those of the last phase, with fewer steps, a lower learning rate and other tracks.
-    `share` is the number of gradient steps, as a share of those of the last phase.
+    They are those of the last phase, with a quarter of its gradient steps, a lower learning rate
+    and other tracks.
     """
     last = phase_configs(config)[-1]
     optimizer = last.optimizer
@@ -184,7 +184,7 @@ def finetune(config: TrainConfig, share: float = 0.25) -> TrainConfig:
         last,
         optimizer=replace(
             optimizer,
-            iterations=max(1, round(share * optimizer.iterations)),
+            iterations=max(1, round(0.25 * optimizer.iterations)),
             rate=0.3 * optimizer.rate,
         ),
         seed=config.seed + 1,

@@ -40,22 +40,18 @@ def bench_config(batch: int = BATCH, steps: int = STEPS) -> TrainConfig:
     return replace(base, episode=replace(base.episode, batch=batch, steps=steps))
 
 
-def bench_worlds(config: TrainConfig, seed: int = 0) -> Worlds:
+def bench_worlds(config: TrainConfig) -> Worlds:
     """Return worlds as in a training, but with exactly SOLIDS solids each.
 
     In a training, solids that a track lacks are "parked" far below the ground. Here they are placed
     at random 1.5 to 4 m from its gates, so that every world costs the same.
     """
-    worlds = sample_worlds(config, seed)
-    rng = np.random.default_rng(seed)
+    worlds, rng = sample_worlds(config, 0), np.random.default_rng(0)
     scene = worlds.scene
-    kinds = {
-        name: type(solids)(*(array[:, :limit].copy() for array in solids))
-        for name, solids, limit in (
-            (name, getattr(scene, name), getattr(SOLIDS, name))
-            for name in ("boxes", "cylinders", "capsules", "spheres")
-        )
-    }
+    kinds: dict[str, Any] = {}
+    for name in ("boxes", "cylinders", "capsules", "spheres"):
+        solids, limit = getattr(scene, name), getattr(SOLIDS, name)
+        kinds[name] = type(solids)(*(array[:, :limit].copy() for array in solids))
     for solids in kinds.values():
         is_parked = solids.center_w[..., 2] < PARKED_Z / 2
         solids.center_w[is_parked] = _near_gates(scene.gates, is_parked, rng)
