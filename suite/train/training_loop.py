@@ -170,10 +170,11 @@ def _iterate(
         if _is_missing(watch, run.folder, first, total):
             recorder.measure_if_due(state)
         for phase in phases:
+            # A run that is resumed within a phase has its converted state already. A phase without
+            # iterations converts the state, too: the next phase converts from its spec.
+            if int(state.iteration) == beginning:
+                state = phase.begin(state)
             if int(state.iteration) < phase.end:
-                # A run that is resumed within a phase has its converted state already.
-                if int(state.iteration) == beginning:
-                    state = phase.begin(state)
                 state = _iterate_phase(phase, state, recorder, show, ahead)
             beginning = phase.end
     return state

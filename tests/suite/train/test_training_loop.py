@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -191,3 +192,16 @@ def test_phases_follow_each_other_and_a_stop_at_a_boundary_begins_the_next_one_o
         for name, value in whole.params.items():
             np.testing.assert_array_equal(ours.params[name], value, err_msg=name)
         assert [row["iteration"] for row in curve.read(folder)] == list(range(7))
+
+
+def test_a_phase_without_iterations_converts_the_state_for_the_next_one(tmp_path):
+    """A recipe of three phases in two iterations: the conversions are from phase to phase."""
+    begun = []
+
+    def begin(number, state):
+        begun.append(number)
+        return state
+
+    phases = [counting(end)._replace(begin=partial(begin, k)) for k, end in enumerate((1, 1, 2))]
+    assert train(tmp_path, *phases).iterations == 2
+    assert begun == [0, 1, 2]
