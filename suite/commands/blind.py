@@ -64,13 +64,10 @@ USED_BY = {
 def run(config: Config, console: Console) -> dict[str, Any]:
     """Do the action `config.what`."""
     for name, actions in USED_BY.items():
-        value = getattr(config, name)
-        if config.what not in actions and value != getattr(Config, name):
-            shown = " ".join(value) if isinstance(value, tuple) else value
-            raise ValueError(
-                f"--{name} is {shown}, but `suite blind {config.what}` does not take it, only "
-                f"{' and '.join(actions)}; leave it out"
-            )
+        if config.what not in actions:
+            users = " and ".join(actions)
+            reason = f"`suite blind {config.what}` does not take it, only {users}"
+            config.refuse_unused([name], reason)
     workers = read_workers_option(config.workers, whole_cores=True)
     if config.what == "plan":
         return _plan(config, console)

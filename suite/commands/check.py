@@ -52,6 +52,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         raise ValueError("nothing to check: give flights, --vehicle or --policy")
     if config.fix and not config.flights:
         raise ValueError("--fix corrects flights, and none is given: add them, or leave it out")
+    if not config.policy:
+        config.refuse_unused(("trials", "trust"), "no --policy is given")
     answer: dict[str, Any] = {"findings": [], "not_identifiable": []}
     policy = None
     if config.policy:

@@ -39,6 +39,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         from suite.train.recipes import named_recipe
 
         return {"settings": list_settings(named_recipe(config.recipe), console)}
+    config.refuse_unused(("recipe",), "only `suite list settings` takes it")
     if not config.kind:
         all_names = {kind: sorted(_entries(kind)) for kind in KINDS}
         width = max(map(len, all_names))

@@ -124,13 +124,8 @@ def _choose_trials(
                 f"{folder}: this suite eval is not finished; repeat its command to fly the "
                 "remaining trials, then view it"
             )
-        for name in ("pick", "policy"):
-            value = getattr(config, name)
-            if value != getattr(Config, name):
-                raise ValueError(
-                    f"--{name} is {value}, but {folder} is not a finished run of suite eval; leave "
-                    "it out"
-                )
+        reason = f"{folder} is not a finished run of suite eval"
+        config.refuse_unused(("pick", "policy"), reason)
         if not locate(config.run).exists():
             raise ValueError(
                 f"{unknown_name('RUN', config.run, names())} The --out folder of a suite eval, a "
@@ -148,13 +143,8 @@ def _choose_trials(
         return evaluation, first_trials(evaluation)[: config.count], None, config.run
     from eval.judging.results import read_trials
 
-    for name in ("track", "difficulty", "vehicle", "seed", "speed"):
-        value = getattr(config, name)
-        if value != getattr(Config, name):
-            raise ValueError(
-                f"--{name} is {value}, but {folder} is a run, whose trials are flown again "
-                "unchanged; leave it out, or give a policy instead of the run"
-            )
+    reason = f"{folder} is a run, whose trials are flown again unchanged"
+    config.refuse_unused(("track", "difficulty", "vehicle", "seed", "speed"), reason)
     # A folder's record must not decide that the files that it names may run code.
     evaluation = replace(read_evaluation(folder), trust=config.trust)
     results = read_trials(folder / "trials.parquet")

@@ -12,7 +12,7 @@ import dataclasses
 import functools
 import inspect
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
@@ -49,6 +49,18 @@ class Command:
     def written(self) -> list[Path]:
         """Return the folders of the options in `LOCKED`."""
         return [getattr(self, name) for name in self.LOCKED]
+
+    def refuse_unused(self, names: Iterable[str], reason: str) -> None:
+        """Refuse options that have another value than by default, but no effect for a `reason`.
+
+        Raises:
+            ValueError: for the first of the fields `names` with such a value.
+        """
+        for name in names:
+            value = getattr(self, name)
+            if value != getattr(type(self), name):
+                shown = " ".join(value) if isinstance(value, tuple) else value
+                raise ValueError(f"--{name} is {shown}, but {reason}; leave it out")
 
 
 class Option(NamedTuple):

@@ -91,6 +91,12 @@ def test_an_option_of_another_work_is_refused(tmp_path, monkeypatch, capsys):
         ("plan --effects inflow gusts --out elsewhere", "--out is elsewhere, but"),
     ):
         assert words in refused(capsys, f"blind {args}")
+    for command, words in (
+        ("list policies --recipe quick", "--recipe is quick, but only `suite list settings`"),
+        ("check --vehicle racer5 --trials 9", "--trials is 9, but no --policy is given; leave it"),
+        ("view race --pick failed", "--pick is failed, but race is not a finished run of suite ev"),
+    ):
+        assert words in refused(capsys, command)
     assert not list(tmp_path.iterdir())
 
 
