@@ -84,7 +84,7 @@ class Companion:
         self._assembler = ImageAssembler(camera.height, camera.width, camera.range_m)
         # The last complete depth image; times of arrival; checks.
         self._depth: np.ndarray | None = None
-        self._depth_time_s = self._state_arrival_s = clock()
+        self._depth_time_s = self._state_arrival_s = self._new_state_s = clock()
         self._clock_check = ClockCheck(self._limits)
         # The policy's memory, its last action, the heading, and when it decides next.
         self._hidden, self._fresh = policy.start(1), True
@@ -204,7 +204,12 @@ class Companion:
             self._count_gates(state)
             if self.gate == len(self._gates.center_w):
                 return self._hand_over(FINISHED)
-        return self._fly(new[-1]) if new else []
+        if new:
+            self._new_state_s = self._state_arrival_s
+            return self._fly(new[-1])
+        if self._state_arrival_s - self._new_state_s > self._limits.silence_s:
+            return self._hand_over(f"no newer state for {self._limits.silence_s:g} s")
+        return []
 
     def _count_gates(self, state: State) -> None:
         """Count the next gate if the path from the last state to `state` crosses its opening."""

@@ -26,7 +26,7 @@ class Limits:
     """Limits of states, images and times; beyond any of them the companion hands over."""
 
     silence_s: Annotated[float, Range(0.01, 10.0)] = 0.1
-    """Hand over to the autopilot after this time without a state [s]."""
+    """Hand over to the autopilot after this time without a newer state [s]."""
     image_age_s: Annotated[float, Range(0.01, 10.0)] = 0.5
     """Hand over after this time without a depth image [s]."""
     tilt_deg: Annotated[float, Range(1.0, 180.0)] = 85.0

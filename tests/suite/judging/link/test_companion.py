@@ -247,6 +247,17 @@ def test_another_system_and_an_old_state_are_not_listened_to(bench):
     assert one.tell(one.state(time_s=one.now - 0.04)) == [] and one.companion.flying
 
 
+def test_a_state_that_is_sent_again_and_again_hands_over_as_silence_does(bench):
+    """The clock check alone would take 0.2 s, or as long as its limit allows."""
+    one = bench(limits=Limits(clock_jump_s=100.0)).fly()
+    frozen, begin = one.state(), one.now
+    while one.companion.flying and one.now < begin + 1.0:
+        one.tell(frozen)
+        one.now += 0.01
+    assert one.companion.over == "no newer state for 0.1 s"
+    assert one.now - begin == pytest.approx(0.12, abs=0.011)
+
+
 def test_depth_images_of_another_size_are_said_once(bench):
     one = bench()
     one.image = np.full((48, 64), 5.0)
