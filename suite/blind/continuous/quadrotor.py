@@ -2,7 +2,7 @@
 
 The continuous-time engine shares only definitions with the rest of the suite: the documented model
 of the nominal quadrotor, and the equations of the catalogue of effects. Its controller, rate loop
-and mixer, knows the nominal constants only, as on a real drone.
+and mixer, uses the nominal constants only, as on a real drone.
 """
 
 from __future__ import annotations

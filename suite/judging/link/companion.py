@@ -1,7 +1,7 @@
 """The companion computer of a vehicle: runs the policy on received states and images.
 
 It answers the newest state at once with a set point, the wanted body rates and thrust. If a
-decision of the policy is due, the policy decides before. The companion knows the track and counts
+decision of the policy is due, the policy decides before. The companion has the track, and counts
 the passed gates itself. If a check of the watchdog fails, it hands over: it stops sending set
 points, and the autopilot takes control. The clock is an argument, for tests.
 """
