@@ -33,7 +33,7 @@ class Config(Command):
     seed: Seed | None = None
     """Seed of another set, instead of --set."""
     count: Annotated[int, Range(1, 100_000)] | None = None
-    """Approximate number of cases, at least one of every kind. Without it all 244, or 60 with
+    """Approximate number of cases, at least one of every kind. Without it about 250, or 60 with
     another simulator."""
     simulator: Literal["mujoco", "rotorpy", "continuous"] = "mujoco"
     """What simulates the cases: mujoco, rotorpy (needs pip install 'diffracing-suite[rotorpy]'), or
