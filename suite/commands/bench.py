@@ -30,20 +30,14 @@ class Config(Command):
 def run(config: Config, console: Console) -> dict[str, Any]:
     """Run the benchmark `config.name`, and show the speeds of both sides and their ratio."""
     if not config.name:
-        if config.policy is not None:
-            raise ValueError(
-                f"--policy is {config.policy}, but no benchmark is named; write suite bench policy"
-            )
+        config.refuse_unused(["policy"], "no benchmark is named")
         for name, summary in BENCHES.items():
             console.say(f"{name:<12} {summary}")
         return {"benches": BENCHES}
     if config.name not in BENCHES:
         raise unknown_name("benchmark", config.name, BENCHES)
-    if config.policy is not None and config.name != "policy":
-        raise ValueError(
-            f"--policy is {config.policy}, but the benchmark {config.name} measures no policy; "
-            "leave it out"
-        )
+    if config.name != "policy":
+        config.refuse_unused(["policy"], f"the benchmark {config.name} measures no policy")
     from suite.experiments.bench.compare import load_warnings
 
     # Measured before the benchmark, while this process is idle.

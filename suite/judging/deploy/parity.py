@@ -24,6 +24,7 @@ from policies.formats.policy_file import PolicyCheckpoint
 from policies.policy import Hidden, Policy, Wrapper
 from policies.spec import PolicyError
 from suite.judging.deploy.latency import Timing, c_step, time_in_turn
+from suite.judging.trials import LEVELS
 
 STEPS = 1000
 """Number of compared steps."""
@@ -84,8 +85,6 @@ def parity(folder: Path, checkpoint: PolicyCheckpoint, observed: Observed | None
 TRACK = "random"
 """Family of the flights whose inputs are recorded. It is that of the training, so that the tracks
 of the results tables do not affect an export."""
-LEVELS = tuple(range(10))
-"""Levels of difficulty of these flights, one flight each."""
 SEED = 900_000
 """Seed of the first of these flights; no results table uses it."""
 
