@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eval.judging.guard import ActionLimits, first_action, guard_action, limits_of
+from eval.judging.policy_checks.in_flight import Outputs
 from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading, level_heading
 from eval.quadrotor.autopilot import ATTITUDE_HZ
 from eval.quadrotor.plant import unpack_command
@@ -94,9 +95,10 @@ class Companion:
         self._last: State | None = None
         self.gate = 0
         """Number of passed gates, which is the index of the next one."""
-        self.late_answers = self.bad_actions = self.limited_actions = self.missed_decisions = 0
-        """Numbers of late answers, of actions that were not finite or were limited, and of missed
-        decisions."""
+        self.missed_decisions = 0
+        """Number of missed decisions."""
+        self.outputs = Outputs(1, policy.spec.action)
+        """Statistics of the policy's answers, as in the judge."""
         self.over: str | None = None
         """Reason of the handover; None before it."""
         self.rows: list[Row] = []
@@ -293,12 +295,9 @@ class Companion:
         except Exception as error:  # after any error the autopilot must take control
             return f"the policy failed: {type(error).__name__}: {error}"
         self._action_b, self._fresh = guarded.action_b, False
-        self.limited_actions += int(guarded.limited[0])
-        late = bool(guarded.late[0])
-        self.late_answers += late
-        self._late_in_row = self._late_in_row + 1 if late else 0
+        self.outputs.add(guarded, state_b)
+        self._late_in_row = self._late_in_row + 1 if guarded.late[0] else 0
         if guarded.bad[0]:
-            self.bad_actions += 1
             return "the policy's answer is not finite"
         if self._late_in_row >= self._limits.late_most:
             return f"{self._late_in_row} late answers in a row"

@@ -110,14 +110,11 @@ def _fly_trial(
     finally:
         link.close()
     assert result is not None
-    trial_row = result.trial._asdict()
+    trial_row = {**result.trial._asdict(), **companion.outputs.columns(0)}
     row = {
         **trial_row,
         "handed_over": None if companion.over == FINISHED else companion.over,
         "vehicle_slips": result.slips,
-        "late_actions": companion.late_answers,
-        "bad_actions": companion.bad_actions,
-        "limited_actions": companion.limited_actions,
         "missed_decisions": companion.missed_decisions,
         "file": write_log(companion, trial_row, out, console),
     }

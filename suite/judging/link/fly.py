@@ -182,7 +182,8 @@ def _fly_real_vehicle(
         raise
     finally:
         link.close()
-        row = {**trial._asdict(), "handed_over": companion.over}
+        answers = companion.outputs.columns(0)
+        row = {**trial._asdict(), **answers, "handed_over": companion.over}
         file = write_log(companion, row, out, console)
     if not companion.rows:
         reason = f"no vehicle sent a state (ODOMETRY) and a depth image within {WAIT_S:g} s"
@@ -197,7 +198,7 @@ def _fly_real_vehicle(
     _warn_of_missed_decisions(companion.missed_decisions, console)
     return {
         **delays(companion.rows, limits.deadline_s),
-        "late_answers": companion.late_answers,
+        "late_answers": row["late_actions"],
         "missed_decisions": companion.missed_decisions,
         "gates_passed": companion.gate,
         "success": companion.over == FINISHED,

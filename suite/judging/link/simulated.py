@@ -151,7 +151,10 @@ class SimulatedVehicle:
         return attitude_command(controller, force_w, motion.rot_w, heading_w)
 
     def result(self) -> TrialResult:
-        """Return the trial's result so far; an unfinished one counts as a timeout."""
+        """Return the trial's result so far; an unfinished one counts as a timeout.
+
+        The companion counts the actions, here their numbers are 0.
+        """
         columns = result_columns(self._judged.progress, 0, self.dt)
         is_collision = columns["ended_by"] == "collision"
         return TrialResult(

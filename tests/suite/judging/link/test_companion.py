@@ -190,14 +190,16 @@ def test_late_answers_are_not_flown_and_hand_over_where_they_go_on(bench):
     assert (one.companion.rows[-1].action_b == 0).all()
     assert isinstance(one.tell()[0], OperatorText)
     assert one.companion.over == "3 late answers in a row"
-    assert one.companion.late_answers == 3
+    assert one.companion.outputs.columns(0)["late_actions"] == 3
 
 
-def test_limited_actions_are_counted_as_in_the_judge(bench):
+def test_answers_are_counted_as_in_the_judge(bench):
     one = bench(Steady((80.0, 0.0, 0.0), spec=PolicySpec(rate_hz=50.0))).fly()
-    assert sum(row.decided for row in one.companion.rows) == one.companion.limited_actions == 3
+    found = one.companion.outputs.columns(0)
+    assert sum(row.decided for row in one.companion.rows) == found["decisions"] == 3
+    assert (found["limited_actions"], found["output_max"]) == (3, 80.0)
     np.testing.assert_allclose(one.companion.rows[-1].action_b, [50.0, 0.0, 0.0])
-    assert bench().fly().companion.limited_actions == 0
+    assert bench().fly().companion.outputs.columns(0)["limited_actions"] == 0
 
 
 def test_the_heading_turns_as_fast_whatever_the_rate_of_states(bench):
