@@ -76,9 +76,13 @@ def test_the_policy_of_a_stopped_training_has_a_note(checkpoint, tmp_path, capsy
         notes = load_policy(folder).notes
         assert [note.fault for note in notes] == ["training_unfinished"] * (done == 48)
         assert done == 600 or "stopped after 48 of 600 gradient steps" in notes[0].evidence
-    asked = ["export", "--policy", str(tmp_path / "48"), "--format", "onnx", "--out", str(tmp_path)]
-    assert main(asked) == 0
-    assert "stopped after 48 of 600 gradient steps; repeat" in capsys.readouterr().err
+    unfinished, out = str(tmp_path / "48"), ["--out", str(tmp_path / "out")]
+    for asked, code in (
+        (["export", "--policy", unfinished, "--format", "onnx"], 0),
+        (["train", "--init-from", unfinished], 2),  # its inputs are not those of the recipe
+    ):
+        assert main([*asked, *out]) == code
+        assert "stopped after 48 of 600 gradient steps; repeat" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", shipped.names())
