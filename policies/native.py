@@ -13,7 +13,7 @@ import numpy as np
 from policies.block_policy import BlockPolicy, verify_rows
 from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks import network
-from policies.spec import Note, PolicySpec
+from policies.spec import PolicySpec
 
 
 def load_native(folder: Path, name: str) -> BlockPolicy:
@@ -24,19 +24,7 @@ def load_native(folder: Path, name: str) -> BlockPolicy:
     """
     checkpoint = load_policy_checkpoint(folder)
     policy = native_policy(checkpoint.params, checkpoint.spec, name)
-    policy = replace(policy, notes=_unfinished(checkpoint.config, name))
-    return verify_rows(policy, str(folder))
-
-
-def _unfinished(config: Mapping[str, Any], name: str) -> tuple[Note, ...]:
-    """Return a note if the policy is from a training that was stopped."""
-    training = config.get("training") or {}
-    done, settings = training.get("iteration"), training.get("config") or {}
-    total = settings.get("optimizer", {}).get("iterations")
-    if done is None or total is None or done >= total:
-        return ()
-    text = f"{name}: its training was stopped after {done} of {total} gradient steps"
-    return (Note("training_unfinished", text, "repeat its suite train command to continue it"),)
+    return verify_rows(replace(policy, notes=checkpoint.notes(name)), str(folder))
 
 
 def native_policy(params: Mapping[str, Any], spec: PolicySpec, name: str) -> BlockPolicy:

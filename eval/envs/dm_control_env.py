@@ -15,7 +15,7 @@ from eval.envs.race import ACTION_LIMIT, Race
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.engine import course_notes, warn_of
-from eval.worlds.trial import Rules
+from eval.worlds.trial import Rules, check_rules
 from policies.spec import ACTION_SIZE, PolicySpec
 from tracks.families import make_track
 from tracks.input.ranges import check_type
@@ -112,12 +112,12 @@ def load(
     check_type("track", track, (Track, NoneType), "a Track or None")
     check_type("vehicle", vehicle, (Vehicle, NoneType), "a Vehicle or None")
     check_type("spec", spec, (PolicySpec, NoneType), "a PolicySpec or None")
-    check_type("rules", rules, (Rules, NoneType), "an eval.worlds.trial.Rules or None")
+    rules = check_rules(Rules() if rules is None else rules)
     vehicle = vehicle or load_vehicle("reference")
     if track is not None:
         warn_of(course_notes(track.family, track, vehicle))
     track = track or make_track(family, level, seed)
-    race = Race(track, vehicle, spec or PolicySpec(), rules or Rules())
+    race = Race(track, vehicle, spec or PolicySpec(), rules)
     physics = RacePhysics.from_model(wrapper.MjModel(race.model))
     physics.race = race
     return control.Environment(

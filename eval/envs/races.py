@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from numbers import Integral, Real
+from numbers import Integral
 from types import NoneType
 from typing import Any, NamedTuple
 
@@ -30,7 +30,7 @@ from eval.vehicles.vehicle import Vehicle
 from eval.worlds.engine import course_notes, warn_of
 from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.slots import layout_of
-from eval.worlds.trial import ENDINGS, FLYING, Rules, TrialSpec, steps_to_next
+from eval.worlds.trial import ENDINGS, FLYING, Rules, TrialSpec, check_rules, steps_to_next
 from policies.contract import Contract, contract_of
 from policies.formats.policy_file import load_policy_checkpoint
 from policies.observation import View, observe
@@ -39,7 +39,7 @@ from policies.spec import ActionSpec, PolicySpec, check_spec
 from tracks.common.names import unknown_name
 from tracks.families import LEVELS, check_family, make_track
 from tracks.formats.custom import load_track
-from tracks.input.ranges import PATH, check_type
+from tracks.input.ranges import PATH, Range, check_number, check_type
 from tracks.track import Track
 
 SEEDS = 2**31
@@ -132,8 +132,8 @@ class RaceConfig:
             check_type(name, getattr(config, name), (bool, np.bool_), "True or False")
         check_type("rewards", config.rewards, (Mapping,), "weights by name of the reward term")
         for name, weight in config.rewards.items():
-            check_type(f"rewards[{name!r}]", weight, (Real,), "a number")
-        check_type("rules", config.rules, (Rules,), "an eval.worlds.trial.Rules")
+            check_number(f"rewards[{name!r}]", weight, Range(-1e6, 1e6))
+        check_rules(config.rules)
         return config
 
 

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from eval.quadrotor.plant import Motion, Wrench
 from tracks.families import make_track
 from tracks.geometry.crossing import NEAR_RADIUS_M, crossing, is_near
 from tracks.geometry.scene import Array, Gates
+from tracks.input.ranges import Range, TimeLimit, check_ranges, check_type
 from tracks.track import Track
 
 FLYING = 0
@@ -102,18 +103,30 @@ def track_of(tracks: Mapping[str, Track], trial: TrialSpec) -> Track:
 class Rules:
     """Rules for the end and the score of a trial."""
 
-    time_limit_s: float = 20.0
+    time_limit_s: TimeLimit = 20.0
     """A trial ends at this time [s]."""
-    short_window_s: float = 8.0
+    short_window_s: Annotated[float, Range(0.0, 3600.0)] = 8.0
     """Gates passed by this time count as `gates_8s` [s]."""
-    near_radius_m: float = NEAR_RADIUS_M
+    near_radius_m: Annotated[float, Range(0.0, 100.0)] = NEAR_RADIUS_M
     """By the baseline's rule a gate counts within this distance of its centre [m]."""
-    speed_limit: float = 1e3
+    speed_limit: Annotated[float, Range(0.0, 1e3, above=True)] = 1e3
     """A body faster than this [m/s] has diverged."""
-    rate_limit: float = 1e4
+    rate_limit: Annotated[float, Range(0.0, 1e4, above=True)] = 1e4
     """A body turning faster than this [rad/s] has diverged."""
-    wrench_limit: float = 1e6
+    wrench_limit: Annotated[float, Range(0.0, 1e6, above=True)] = 1e6
     """A trial with a force [N] or torque [N m] on the body beyond this has diverged."""
+
+
+def check_rules(rules: object) -> Rules:
+    """Return `rules`.
+
+    Raises:
+        ValueError: for another type, or a number outside its range.
+    """
+    check_type("rules", rules, (Rules,), "an eval.worlds.trial.Rules")
+    check_ranges(rules, "rules.")
+    assert isinstance(rules, Rules)
+    return rules
 
 
 class Course(NamedTuple):

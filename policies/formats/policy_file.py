@@ -23,7 +23,7 @@ from policies.formats.checkpoint import (
     save_arrays,
 )
 from policies.formats.spec_json import spec_from_json
-from policies.spec import PolicyError, PolicySpec, check_network
+from policies.spec import Note, PolicyError, PolicySpec, check_network
 
 POLICY, DELTA = "policy", "delta"
 """Kinds of checkpoint."""
@@ -44,6 +44,16 @@ class PolicyCheckpoint:
     def seed(self) -> int | None:
         """Seed of its training; None where unknown."""
         return self.config.get("seed")
+
+    def notes(self, name: str) -> tuple[Note, ...]:
+        """Return a note on the policy `name` if its training was stopped."""
+        training = self.config.get("training") or {}
+        done, settings = training.get("iteration"), training.get("config") or {}
+        total = settings.get("optimizer", {}).get("iterations")
+        if done is None or total is None or done >= total:
+            return ()
+        text = f"{name}: its training was stopped after {done} of {total} gradient steps"
+        return (Note("training_unfinished", text, "repeat its suite train command to continue it"),)
 
 
 def save_policy(

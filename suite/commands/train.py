@@ -162,6 +162,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         folder, phases = checkpoint_folder(config.init_from, "--init-from"), phase_configs(resolved)
         check_no_input(config.out / "policy" / CONFIG, [folder / CONFIG])
         start = load_policy_checkpoint(folder)
+        for note in start.notes(config.init_from):
+            console.note(str(note))
         params = start_params(start, phases[0].spec)
         if changes := differences(plain(start.spec), plain(phases[-1].spec)):
             console.note(

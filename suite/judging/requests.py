@@ -12,10 +12,7 @@ from typing import Annotated
 import tyro
 
 from suite.common.options import Advanced
-from tracks.input.ranges import Range, Seed, Trials
-
-TimeLimit = Annotated[float, Range(0.0, 3600.0, above=True)]
-"""Time limit of a trial [s], as in `eval.worlds.trial.Rules`."""
+from tracks.input.ranges import Range, Seed, TimeLimit, Trials
 
 
 @dataclass(frozen=True)

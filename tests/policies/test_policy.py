@@ -24,6 +24,7 @@ from policies.formats.spec_json import KEY as SPEC_KEY
 from policies.networks import network
 from policies.policy import load_policy
 from policies.spec import ActionSpec, DepthEncoding, PolicyError, PolicySpec
+from suite.cli import main
 from tests.support.policy_files import SPEC, action_of, lively
 from tests.support.tools import program, python
 
@@ -66,7 +67,7 @@ def test_a_file_inside_a_checkpoint_and_other_kinds_are_pointed_on(checkpoint, t
         load_policy(tmp_path)
 
 
-def test_the_policy_of_a_stopped_training_has_a_note(checkpoint, tmp_path):
+def test_the_policy_of_a_stopped_training_has_a_note(checkpoint, tmp_path, capsys):
     stored = load_policy_checkpoint(checkpoint)
     for done in (48, 600):
         training = {"iteration": done, "config": {"optimizer": {"iterations": 600}}}
@@ -75,6 +76,13 @@ def test_the_policy_of_a_stopped_training_has_a_note(checkpoint, tmp_path):
         notes = load_policy(folder).notes
         assert [note.fault for note in notes] == ["training_unfinished"] * (done == 48)
         assert done == 600 or "stopped after 48 of 600 gradient steps" in notes[0].evidence
+    unfinished, out = str(tmp_path / "48"), ["--out", str(tmp_path / "out")]
+    for asked, code in (
+        (["export", "--policy", unfinished, "--format", "onnx"], 0),
+        (["train", "--init-from", unfinished], 2),  # its inputs are not those of the recipe
+    ):
+        assert main([*asked, *out]) == code
+        assert "stopped after 48 of 600 gradient steps; repeat" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", shipped.names())

@@ -60,6 +60,8 @@ Iterations = Annotated[int, Range(1, 10**9)]
 """A number of iterations."""
 Trials = Annotated[int, Range(1, 100_000)]
 """A number of trials or flights."""
+TimeLimit = Annotated[float, Range(0.0, 3600.0, above=True)]
+"""Time limit of a trial [s]."""
 
 
 def check_type(name: str, value: object, kinds: tuple[Any, ...], allowed: str) -> None:
@@ -99,13 +101,22 @@ def check_ranges(config: Any, where: str = "", options: bool = False) -> None:
         name = f"--{path[-1].replace('_', '-')}" if options else where + ".".join(path)
         ends = value if isinstance(value, tuple) else (value,)
         text = " ".join(map(shown, ends)) if options else shown(value)
-        number, kind = ("a whole number, ", Integral) if allowed.whole else ("a number, ", Real)
         for end in ends:
-            check_type(name, end, (kind,), f"{number}{allowed}")
-        if not all(allowed.holds(end) for end in ends):
-            raise ValueError(f"{name} is {text}, allowed is {allowed}")
+            check_number(name, end, allowed, text)
         if allowed.ordered and list(ends) != sorted(ends):
             raise ValueError(f"{name} is {text}; give the lower end of the range first")
+
+
+def check_number(name: str, value: Any, allowed: Range, text: str = "") -> None:
+    """Refuse a value that is no number, or outside its range.
+
+    Raises:
+        ValueError: with the name, the value, or `text` in its place, and what is allowed.
+    """
+    number, kind = ("a whole number, ", Integral) if allowed.whole else ("a number, ", Real)
+    check_type(name, value, (kind,), f"{number}{allowed}")
+    if not allowed.holds(value):
+        raise ValueError(f"{name} is {text or shown(value)}, allowed is {allowed}")
 
 
 def ranged(config: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any, Range]]:

@@ -49,6 +49,8 @@ def export(
     name, checkpoint = exported_checkpoint(policy)
     files = [(*file_names(name, each), *[CARD] * (each == "c")) for each in formats]
     _record_source(policy, out, files, checkpoint.seed)
+    for note in checkpoint.notes(policy):
+        console.note(str(note))
     # Inputs in flight set the scales of the activations in 8 bits.
     observed = None
     if dtype == "int8":

@@ -190,7 +190,7 @@ class JaxRace:
         At an episode's end the next one starts, and the observation is its first one. `info` has
         the `gates` passed, counted from the track's first, and `collided`, `tipped`, `finished`
         and `truncated` (the time limit). An action that is not finite (`bad_action`) ends the
-        episode and counts as `collided`, but costs nothing.
+        episode, counts as `collided` and costs as much.
 
         Raises:
             ValueError: for an action of another shape.
@@ -207,16 +207,19 @@ class JaxRace:
         output = jnp.where(bad, 0.0, jnp.clip(action, -1.0, 1.0))
         keys = world_keys(wind, world)
         episode, result = self._race.fly(world, state.episode, ACTION_LIMIT * output[None], keys)
-        # Whether the episode is over, and its reward. A tilt beyond 90 degrees costs as much as a
-        # collision.
+        # Whether the episode is over, and its reward. A tilt beyond 90 degrees and a bad action
+        # cost as much as a collision.
         steps = state.steps + 1
         gates = episode.target[0]
         tipped = episode.state.rot_w[0, 2, 2] < 0.0
         finished = gates >= worlds.scene.gates.center_w.shape[1]
-        collided = result.collided[0] | bad
+        hit = result.collided[0]
+        collided = hit | bad
         over = collided | tipped | finished
         truncated = ~over & (steps >= round(self.time_limit_s * self.config.spec.rate_hz))
-        reward = self.reward_scale * (result.reward.total()[0] + COLLISION * (tipped & ~collided))
+        reward = self.reward_scale * (
+            result.reward.total()[0] + COLLISION * ((tipped | bad) & ~hit)
+        )
         info = {
             "gates": gates, "collided": collided, "tipped": tipped, "finished": finished,
             "truncated": truncated, "bad_action": bad,

@@ -1,5 +1,6 @@
 """Settings, actions and seeds that the environments refuse or accept."""
 
+import math
 import os
 import warnings
 from dataclasses import replace
@@ -15,6 +16,7 @@ import suite
 import tracks
 from eval.envs.gymnasium_env import RaceEnv, RaceVectorEnv
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds.trial import Rules
 from policies.spec import ActionSpec, DepthEncoding, PolicySpec
 from tests.support.courses import IN_CONTACT
 from tracks.formats.custom import load_track
@@ -52,7 +54,8 @@ REFUSED = {
         ({"track": "zigzag"}, "track is 'zigzag', allowed is a Track or None"),
         ({"vehicle": "racer5"}, "vehicle is 'racer5', allowed is a Vehicle or None"),
         ({"spec": "race"}, "spec is 'race', allowed is a PolicySpec or None"),
-        ({"rules": {}}, "rules is {}, allowed is an eval.worlds.trial.Rules or None"),
+        ({"rules": {}}, "rules is {}, allowed is an eval.worlds.trial.Rules"),
+        ({"rules": Rules(near_radius_m=-1.0)}, "rules.near_radius_m is -1.0, allowed is 0 to 100"),
     ],
     RaceVectorEnv: [
         ({"rewards": {"gates": 1.0}}, "unknown reward term 'gates'. Did you mean 'gate'"),
@@ -61,6 +64,8 @@ REFUSED = {
         ({"vehicle": {}}, "vehicle is {}, allowed is a name"),
         ({"track": ["zigzag"]}, r"track is \['zigzag'\], allowed is a track family or"),
         ({"rewards": {"gate": "x"}}, r"rewards\['gate'\] is 'x', allowed is a number"),
+        ({"rewards": {"gate": math.nan}}, r"rewards\['gate'\] is nan, allowed is -1000000 to"),
+        ({"rules": Rules(time_limit_s=0.0)}, "rules.time_limit_s is 0.0, allowed is above 0"),
         ({"level": 10}, "level is 10, allowed is 0 to 9"),
         ({"spec": "raec"}, "unknown policy .* 'raec'. Did you mean 'race'"),
         ({"num_envs": 0}, "num_envs is 0, allowed is a whole number, 1 or more"),

@@ -19,6 +19,7 @@ from suite.train.ppo import update as run
 from suite.train.ppo.config import PpoConfig, ppo_like
 from suite.train.ppo.environment import JaxRace
 from suite.train.ppo.objective import Actor, Sequences, action_means, advantages, clipped_loss
+from suite.train.ppo.reward import COLLISION
 from suite.train.ppo.rollout import log_probability, make_rollout
 from suite.train.rollout import world_keys
 from tests.support.training import (
@@ -302,7 +303,10 @@ def test_an_action_of_another_shape_is_refused_and_one_that_is_not_finite_ends(w
     action = jnp.zeros((3, 3)).at[1, 2].set(jnp.nan)
     observation, _, reward, done, info = step(KEYS, state, action, worlds)
     assert done.tolist() == info["bad_action"].tolist() == [False, True, False]
-    assert np.isfinite(observation.state).all() and np.isfinite(reward).all()
+    assert np.isfinite(observation.state).all()
+    assert float(reward[1]) == pytest.approx(
+        float(reward[0]) + ENV.reward_scale * COLLISION, abs=0.05
+    )
     one = jax.tree.map(lambda leaf: leaf[0], state)
     for shape in ((1,), (), (4,)):
         with pytest.raises(ValueError, match=r"allowed is \(3,\)"):
