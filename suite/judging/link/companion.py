@@ -20,7 +20,6 @@ from eval.quadrotor.plant import unpack_command
 from eval.vehicles.vehicle import Vehicle
 from policies.observation import observe, view_of
 from policies.policy import Policy
-from policies.spec import PolicyError
 from suite.judging.link.messages import (
     Heartbeat,
     ImageAssembler,
@@ -65,19 +64,12 @@ class Companion:
 
         The track is in the frame of the vehicle's states. `clock` returns monotonic time [s]. The
         vehicle gives mass, thrust and attitude gains.
-
-        Raises:
-            PolicyError: for a policy that commands motors.
         """
         self._policy, self._vehicle, self._wire, self._clock = policy, vehicle, wire, clock
         self._limits = limits or Limits()
         self.action_kind = policy.spec.action.kind
         """The policy's kind of action, `acceleration` or `ctbr`."""
-        if self.action_kind == "motors":
-            raise PolicyError(
-                f"{policy.name}: commands motors, but a link carries body rates and thrust; fly a "
-                "policy with actions of kind acceleration or ctbr"
-            )
+
         self._gates = track.scene.gates
         points = np.vstack([self._gates.center_w, np.reshape(track.start_pos_w, (1, 3))])
         self._box = allowed_box(points, self._limits)

@@ -18,6 +18,7 @@ from eval.judging.policy_checks.faults import notes_of
 from eval.worlds.trial import Rules, track_of
 from policies.block_policy import BlockPolicy, for_one_row
 from policies.policy import Policy
+from policies.spec import PolicyError
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.provenance import refuse_other_run, write_run_record
@@ -84,7 +85,7 @@ def fly_over_link(
         The contents of fly.json, and `out`.
 
     Raises:
-        ValueError: for invalid options, before the first flight.
+        ValueError: for invalid options or a policy that commands motors, before the first flight.
         WorkFailed: if pymavlink is missing, or no vehicle answers.
     """
     dialect()
@@ -98,6 +99,11 @@ def fly_over_link(
     # The commanded speed is part of how the policy is loaded; the monitor is added below.
     (plain,) = manners(evaluation.speed, monitor=False)
     loaded = load_in_manner(name, evaluation.trust, plain)
+    if loaded.spec.action.kind == "motors":
+        raise PolicyError(
+            f"{name}: commands motors, but a link carries body rates and thrust; fly a policy with "
+            "actions of kind acceleration or ctbr"
+        )
     policy_notes = notes_of(loaded)
     # Some policies compute blocks of 64 rows (drones) at once, so that rounding does not depend on
     # the number of drones. The judge needs that; one vehicle needs one row only.

@@ -64,6 +64,8 @@ class State(NamedTuple):
     """How often the vehicle's state estimator has reset its estimate, which then jumps."""
     fault: str = ""
     """Reason for which the message cannot be used, or ""."""
+    component: int = 1
+    """Number of the MAVLink component that sent it."""
 
 
 class SetPoint(NamedTuple):
@@ -274,6 +276,7 @@ def _state_of(message: Any) -> State:
         rate_b=flip_axes((message.rollspeed, message.pitchspeed, message.yawspeed)),
         resets=message.reset_counter,
         fault=fault,
+        component=message.get_srcComponent(),
     )
 
 

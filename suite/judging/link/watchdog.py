@@ -99,6 +99,9 @@ def jump_fault(last: State, state: State, limits: Limits) -> str | None:
 
     If the estimated position jumps, a gate could be counted that was not passed, or missed.
     """
+    if state.component != last.component:
+        numbers = f"{last.component} and {state.component}"
+        return f"ODOMETRY of the components {numbers}; route that of the autopilot alone"
     if state.resets != last.resets:
         return "the vehicle's estimator reset its state"
     moved_m = float(np.linalg.norm(state.pos_w - last.pos_w))

@@ -79,13 +79,13 @@ def test_a_state_that_cannot_be_flown_on_hands_over(bench, changed, reason):
     assert reason in one.companion.over and reason in one.companion.events[-1]
 
 
-def odometry(quality=0, frames=(1, 12), vel=(2.0, 0.0, 0.0)):
+def odometry(quality=0, frames=(1, 12), vel=(2.0, 0.0, 0.0), component=1, time_s=100.0):
     """Return a datagram of a vehicle that has turned a quarter to the left, as PX4 counts it."""
-    mav = dialect().MAVLink(None, srcSystem=1, srcComponent=1)
+    mav = dialect().MAVLink(None, srcSystem=1, srcComponent=component)
     left = [np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)]
     made = mav.odometry_encode(
-        100_000_000, *frames, 0.0, 0.0, -1.0, left, *vel, 0.0, 0.0, 0.0, [0.0] * 21, [0.0] * 21,
-        3, 0, quality,
+        int(1e6 * time_s), *frames, 0.0, 0.0, -1.0, left, *vel, 0.0, 0.0, 0.0,
+        [0.0] * 21, [0.0] * 21, 3, 0, quality,
     )  # fmt: skip
     return made.pack(mav)
 
@@ -104,6 +104,15 @@ def test_a_velocity_is_in_the_frame_of_its_message_and_other_frames_are_not_flow
         one.show()
         one.companion.receive([odometry(**changed)])
         assert reason in one.companion.over
+
+
+def test_states_of_two_components_are_not_mixed(bench):
+    one = bench()
+    one.show()
+    for component, time_s in ((1, 100.0), (1, 100.01), (197, 100.02)):
+        assert one.companion.over is None
+        one.companion.receive([odometry(component=component, time_s=time_s)])
+    assert "ODOMETRY of the components 1 and 197" in one.companion.over
 
 
 def test_of_a_backlog_the_newest_state_is_flown_and_gates_are_counted_in_all(bench):

@@ -13,7 +13,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec, track_of
 from policies.block_policy import BlockPolicy
 from policies.policy import load_policy
-from policies.spec import DepthEncoding, Note, PolicySpec
+from policies.spec import ActionSpec, DepthEncoding, Note, PolicySpec
 from suite.common.console import Console
 from suite.judging.link import fly, server
 from suite.judging.link.companion import Companion, Row
@@ -64,7 +64,7 @@ def test_states_set_points_and_words_come_as_they_went():
     (found,) = companion.decode([vehicle.encode(state)])
     assert isinstance(found, State)
     assert found.time_s == pytest.approx(state.time_s, abs=2e-6)
-    assert found[5:] == state[5:] == (0, "")
+    assert found[5:] == state[5:] == (0, "", 1)
     for one, other in zip(found[:5], state[:5], strict=True):
         np.testing.assert_allclose(one, other, atol=2e-6)
     wanted = SetPoint(np.array([0.5, -0.25, 2.0]), 0.375)
@@ -329,6 +329,8 @@ def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first
     monkeypatch.setattr(fly, "load_in_manner", lambda *_: fast)
     said = refused(capsys, asked, tmp_path / "b")
     assert "spec.rate_hz is 2000" in said and "race: no contract in it; write one" in said
+    fast = replace(fast, spec=replace(fast.spec, action=ActionSpec("motors")))
+    assert "race: commands motors" in refused(capsys, asked, tmp_path / "b")
     assert not (tmp_path / "b").exists()
 
 
