@@ -12,6 +12,7 @@ from eval.logs.faults.checked import check_flights, lines_of
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.position import check_jumps
 from eval.logs.faults.reading import parse_readings, read_rows
+from eval.logs.faults.sensors import check_barometer
 from eval.logs.flight_log import FlightLog, columns_from_log, log_from_columns, write_flight
 from suite.commands.check import Config, run
 from suite.common.console import Console
@@ -103,6 +104,18 @@ def test_a_stored_finding_on_another_vehicle_file_is_not_repeated_and_one_on_the
 
     assert faults(CheckContext()) == ["motor_map", "voltage"]
     assert faults(CheckContext(PLAIN)) == ["voltage"]
+
+
+@pytest.mark.parametrize("lost", ["baro", "pos"])
+def test_a_barometer_without_samples_around_the_start_is_not_checked(lost):
+    time_s = np.arange(0.0, 5.0, 0.01)
+    rows = {
+        "time": time_s, "throttle": np.where(time_s > 2.0, 0.5, 0.0)[:, None],
+        "baro": np.zeros((500, 1)), "pos": np.zeros((500, 3)),
+    }  # fmt: skip
+    assert [finding.status for finding in check_barometer(rows)] == ["ok"]
+    rows[lost][190:320] = np.nan
+    assert not check_barometer(rows)
 
 
 def test_a_long_pause_of_the_rows_has_a_note():
