@@ -184,9 +184,7 @@ def check_flights(
         )
 
 
-def steer(
-    vehicle: Vehicle, wanted: Reference, motion: Motion, summed_w: np.ndarray
-) -> Command:
+def steer(vehicle: Vehicle, wanted: Reference, motion: Motion, summed_w: np.ndarray) -> Command:
     """Return the command that follows `wanted`, computed for the nominal vehicle.
 
     `wanted` and the true states `motion` are (N, ...). `summed_w` (N, 3) is the integral of the

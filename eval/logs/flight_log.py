@@ -1,9 +1,8 @@
 """Flight logs: one flight as arrays, read from and written to Parquet or CSV.
 
 The columns and their units are in `docs/flight_logs.md`, the rules for a valid file in
-`eval/logs/columns.py`. The suite
-also records the policy's action, the rows of its decisions and the next gate, as extra columns.
-Unknown columns of any origin are kept.
+`eval/logs/columns.py`. The suite also records the policy's action, the rows of its decisions and
+the next gate, as extra columns. Unknown columns of any origin are kept.
 """
 
 from __future__ import annotations
@@ -97,7 +96,7 @@ class FlightLog:
 
     @property
     def partial(self) -> tuple[str, ...]:
-        """Required groups of columns that a partial log lacks; () for a whole log.
+        """Required groups of columns that a partial log lacks, and `command`; () for a whole log.
 
         Where `pos`, `quat` or `rate` is among them, that array is NaN in every row.
         """

@@ -318,7 +318,7 @@ def filled(time_s: np.ndarray, value: np.ndarray) -> np.ndarray:
 
 def _filled_attitude(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
     """Return attitudes (T, 4) as `filled` does, of unit norm and by the shorter way round."""
-    known = np.isfinite(quat).all(axis=1)
+    known = np.asarray(np.isfinite(quat).all(axis=1))
     same_sign = quat.copy()
     same_sign[known] = continuous(quat[known])
     value = filled(time_s, same_sign)
