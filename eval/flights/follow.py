@@ -7,7 +7,6 @@ Its commands are collective thrust and body rates (CTBR). A simulator is used th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -15,14 +14,19 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.flights.trajectory import Reference, Trajectory
 from eval.quadrotor.attitude import attitude_command
-from eval.quadrotor.plant import Command, Motion, Wrench
+from eval.quadrotor.plant import Command, Motion
 from eval.vehicles.vehicle import Vehicle
-from tracks.geometry.scene import Array
 
 FURTHEST_M = 4.0
 """Distance from its trajectory at which a flight has failed [m]."""
 LOWEST_M = 0.02
 """Height below which a flight has failed [m]."""
+PER_POSITION, PER_VELOCITY, PER_SUM = 5.0, 3.5, 2.0
+"""Gains of the position loop: acceleration per error of the position [1/s^2] and of the velocity
+[1/s], and per integral of the position error [1/s^3]. Attitude and rate loops have the vehicle
+file's gains."""
+CORRECTION_MOST = 8.0
+"""Largest correction of each component of the acceleration [m/s^2]."""
 SUM_MOST = 1.0
 """Limit of each component of the integral of the position error [m s]."""
 LIFT_PER_FLAT, LIFT_LEAST = 0.36, 1.0
@@ -51,11 +55,6 @@ class Recording(NamedTuple):
     """(K, 3) specific force in the previous step [m/s^2]."""
     voltage: np.ndarray
     """(K,) battery voltage [V]."""
-    acting: Command
-    """(K, ...) commands that act, before the vehicle's delay: `command`, unless an
-    `eval.flights.simulate.Extra` (physics that no effect describes) changed it."""
-    extra: Wrench
-    """(K, 3) force and torque that an `Extra` added."""
     integrator: str | None = None
     """`euler` if the simulator integrates by Euler steps of `dt`; None if the flight counts as
     continuous in time."""
@@ -72,10 +71,6 @@ class Step(NamedTuple):
     """(N, 4) rotor speeds at the start of the step [rad/s]."""
     voltage: np.ndarray
     """(N,) battery voltage [V]."""
-    acting: Command
-    """(N, ...) commands, as `Recording.acting`."""
-    extra: Wrench
-    """(N, 3) added force and torque, as `Recording.extra`."""
     acc_b: np.ndarray
     """(N, 3) specific force [m/s^2]."""
 
@@ -113,7 +108,6 @@ def follow(
     wanted: Reference,
     period: int,
     dt: float,
-    gains: PilotGains | None = None,
 ) -> list[Recording]:
     """Fly N trajectories at once, each with its own vehicle, and return their recordings.
 
@@ -124,14 +118,13 @@ def follow(
         wanted: their set points, from `reference_of`.
         period: physics steps for which a command is held.
         dt: length of a physics step [s].
-        gains: gains of the pilot; None: the defaults.
 
     Raises:
         FlightFailed: where a flight tips over, hits the ground or leaves its trajectory.
     """
     count = len(trajectories)
     steps = [round(path.duration_s / dt) for path in trajectories]
-    gains, summed_w = gains or PilotGains(), np.zeros((count, 3))
+    summed_w = np.zeros((count, 3))
     command = Command(np.zeros(count), np.zeros((count, 3)))
     acc_b = np.zeros((count, 3)) + [0.0, 0.0, GRAVITY]
     rows = []
@@ -143,9 +136,9 @@ def follow(
             check_flights(motion, now, np.full(count, step * dt), step < np.array(steps))
             summed_w = summed_w + period * dt * (now.pos_w - motion.pos_w)
             summed_w = np.clip(summed_w, -SUM_MOST, SUM_MOST)
-            command = steer(nominal, gains, now, motion, summed_w)
-        speed, voltage, acting, extra, next_acc_b = bodies.step(motion, command, step * dt)
-        rows.append((motion, quat, speed, command, acc_b, voltage, acting, extra))
+            command = steer(nominal, now, motion, summed_w)
+        speed, voltage, next_acc_b = bodies.step(motion, command, step * dt)
+        rows.append((motion, quat, speed, command, acc_b, voltage))
         acc_b = next_acc_b
     time_s = np.arange(max(steps)) * dt
     return [
@@ -169,7 +162,7 @@ def _flight_of(rows: Sequence[Any], index: int) -> Any:
 
 
 def check_flights(
-    motion: Motion, wanted: Reference, time_s: np.ndarray, flying: np.ndarray | bool = True
+    motion: Motion, wanted: Reference, time_s: np.ndarray, flying: np.ndarray
 ) -> None:
     """Check that N flights are upright, above the ground and near their trajectories.
 
@@ -191,57 +184,16 @@ def check_flights(
         )
 
 
-@dataclass(frozen=True)
-class PilotGains:
-    """Gains of the pilot's position loop; attitude and rate loops have the vehicle file's gains."""
-
-    position: float = 5.0
-    """Acceleration per position error [1/s^2]."""
-    velocity: float = 3.5
-    """Acceleration per velocity error [1/s]."""
-    integral: float = 2.0
-    """Acceleration per integral of the position error [1/s^3]."""
-    correction: float = 8.0
-    """Largest correction of each component of the acceleration [m/s^2]."""
-
-
-def corrected(
-    gains: PilotGains,
-    acc_w: Array,
-    pos_error_w: Array,
-    vel_error_w: Array,
-    summed_w: Array | float = 0.0,
-) -> Array:
-    """Return the acceleration of a path plus the correction of position and velocity errors.
-
-    Args:
-        gains: gains of the position loop.
-        acc_w: (..., 3) acceleration of the path [m/s^2].
-        pos_error_w: (..., 3) path minus vehicle, position [m].
-        vel_error_w: (..., 3) path minus vehicle, velocity [m/s].
-        summed_w: (..., 3) integral of `pos_error_w` over time [m s].
-
-    Returns:
-        The wanted acceleration (..., 3) in world axes [m/s^2].
-    """
-    xp = acc_w.__array_namespace__()
-    correction = (
-        gains.position * pos_error_w + gains.velocity * vel_error_w + gains.integral * summed_w
-    )
-    return acc_w + xp.clip(correction, -gains.correction, gains.correction)
-
-
-def steer(
-    vehicle: Vehicle, gains: PilotGains, wanted: Reference, motion: Motion, summed_w: np.ndarray
-) -> Command:
+def steer(vehicle: Vehicle, wanted: Reference, motion: Motion, summed_w: np.ndarray) -> Command:
     """Return the command that follows `wanted`, computed for the nominal vehicle.
 
     `wanted` and the true states `motion` are (N, ...). `summed_w` (N, 3) is the integral of the
     position error over time [m s].
     """
-    pos_error_w, vel_error_w = wanted.pos_w - motion.pos_w, wanted.vel_w - motion.vel_w
-    acc_w = corrected(gains, wanted.acc_w, pos_error_w, vel_error_w, summed_w)
-    force_w = acc_w + np.array([0.0, 0.0, GRAVITY])
+    correction_w = PER_POSITION * (wanted.pos_w - motion.pos_w)
+    correction_w = correction_w + PER_VELOCITY * (wanted.vel_w - motion.vel_w)
+    correction_w = np.clip(correction_w + PER_SUM * summed_w, -CORRECTION_MOST, CORRECTION_MOST)
+    force_w = wanted.acc_w + correction_w + np.array([0.0, 0.0, GRAVITY])
     # The tilt is limited, because a commanded free fall would turn the vehicle over.
     level = np.sqrt((force_w[:, :2] ** 2).sum(-1))
     force_w[:, 2] = np.maximum(force_w[:, 2], np.maximum(LIFT_PER_FLAT * level, LIFT_LEAST))

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from eval.effects.log_faults import apply_log_faults
-from eval.flights.follow import PilotGains, Recording, Step, follow, reference_of
+from eval.flights.follow import Recording, Step, follow, reference_of
 from eval.flights.trajectory import Reference, Trajectory
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant, uses_noise
@@ -49,7 +49,6 @@ def fly(
     extra: Extra | None = None,
     rng: np.random.Generator | None = None,
     has_voltage: bool = False,
-    gains: PilotGains | None = None,
 ) -> list[Recording]:
     """Fly N trajectories at once, each with its own vehicle, and return their recordings.
 
@@ -61,7 +60,6 @@ def fly(
         extra: physics that no effect describes; None: none.
         rng: random generator for random wind; None: no random wind.
         has_voltage: whether effects depend on the battery's voltage, as for logs that contain it.
-        gains: gains of the position controller; None: the defaults.
 
     Raises:
         FlightFailed: where a flight tips over, hits the ground or leaves its trajectory.
@@ -81,7 +79,7 @@ def fly(
         steps = round(max(path.duration_s for path in trajectories) * frequency)
         noise = rng.standard_normal((steps + 1, len(trajectories), 3))
     bodies = _MujocoBodies(truth, plant, wanted, dt, extra, noise, has_voltage)
-    return follow(bodies, nominal, trajectories, wanted, period, dt, gains)
+    return follow(bodies, nominal, trajectories, wanted, period, dt)
 
 
 class _MujocoBodies:
@@ -117,7 +115,6 @@ class _MujocoBodies:
             self._step1(self._model, data)
         self._state = hover_state(plant, (count,), noise=None if noise is None else noise[0])
         self._hover = (self._state.rotor_speed**2).sum(-1)
-        self._no_wrench = Wrench(np.zeros((count, 3)), np.zeros((count, 3)))
 
     def motion(self) -> tuple[Motion, np.ndarray]:
         pose = np.array([data.qpos for data in self._datas])
@@ -127,7 +124,7 @@ class _MujocoBodies:
 
     def step(self, motion: Motion, command: Command, time_s: float) -> Step:
         """Simulate one physics step; see `eval.flights.follow.Bodies`."""
-        speed, added = self._state.rotor_speed, self._no_wrench
+        speed = self._state.rotor_speed
         power = (speed**2).sum(-1) / self._hover - 1.0
         drop = FALL_V_PER_S * time_s + SAG_V * power
         acting = command if self._extra is None else self._extra.command(command, time_s)
@@ -149,7 +146,7 @@ class _MujocoBodies:
             self._step2(self._model, data)
             self._step1(self._model, data)
         acc_b = wrench.force_b / self._plant.constants.mass
-        return Step(speed, FULL_V - drop, acting, added, acc_b)
+        return Step(speed, FULL_V - drop, acc_b)
 
 
 @dataclass(frozen=True)

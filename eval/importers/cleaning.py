@@ -122,9 +122,8 @@ def without_repeats(recording: Recording) -> Recording:
             continue
         _keep(signals, OF_POSE, samples, is_new)
         text = f"{100 * share:.0f} % of the poses repeat the one before: left out"
-        noted = recording.noting(Finding("corrected", TEXTS[name], text))
-        return replace(noted, signals=signals)
-    return recording
+        recording = recording.noting(Finding("corrected", TEXTS[name], text))
+    return replace(recording, signals=signals)
 
 
 def without_far(recording: Recording) -> Recording:

@@ -68,8 +68,12 @@ def recording_of(
         if part is None:
             if mapping.optional or signal == "time":
                 continue
-            missing_column = next(c for c in alternatives[0].names if find((c,)) is None)
-            raise FlightLogError(name, missing(missing_column), missing_column)
+            names = alternatives[0].names
+            absent = next((c for c in names if find((c,)) is None), None)
+            if absent is None:
+                reason = f"not in one kind of event with {', '.join(names[1:])}; log them together"
+                raise FlightLogError(name, reason, names[0])
+            raise FlightLogError(name, missing(absent), absent)
         if options.source and column.source not in ("", options.source):
             if signal == "pos":
                 reason = f"has no position of the {options.source}; it has --source {column.source}"

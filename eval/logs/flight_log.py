@@ -1,21 +1,20 @@
 """Flight logs: one flight as arrays, read from and written to Parquet or CSV.
 
 The columns and their units are in `docs/flight_logs.md`, the rules for a valid file in
-`eval/logs/columns.py`. The suite
-also records the policy's action, the rows of its decisions and the next gate, as extra columns.
-Unknown columns of any origin are kept.
+`eval/logs/columns.py`. The suite also records the policy's action, the rows of its decisions and
+the next gate, as extra columns. Unknown columns of any origin are kept.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from eval.logs.columns import GROUPS, KNOWN, NEEDED, FlightLogError, check_columns
+from eval.logs.columns import COMMANDS, GROUPS, KNOWN, NEEDED, FlightLogError, check_columns
 from eval.logs.files import read_columns, write_columns
 from eval.logs.flight import Flight
 from eval.logs.velocity import velocity_from_position
@@ -97,12 +96,11 @@ class FlightLog:
 
     @property
     def partial(self) -> tuple[str, ...]:
-        """Required groups of columns that a partial log lacks; () for a whole log.
+        """Required groups of columns that a partial log lacks, and `command`; () for a whole log.
 
         Where `pos`, `quat` or `rate` is among them, that array is NaN in every row.
         """
-        groups = self.about.get("partial")
-        return tuple(str(group) for group in groups) if isinstance(groups, list) else ()
+        return _partial_groups(self.about)
 
     @property
     def command(self) -> np.ndarray | None:
@@ -210,13 +208,17 @@ def log_from_columns(
     """Return `columns` (column name to (T,) values) as a log.
 
     Rows without a time are left out. Quaternions are normalised. A missing velocity is computed
-    (`eval/logs/velocity.py`). Where `about` has `partial`, missing required groups are NaN. Without
-    `limits` values are accepted that no flight has (`columns.LIMITS`).
+    (`eval/logs/velocity.py`). Where `about` lists groups under `partial`, any required group may be
+    missing: it is NaN, and `partial` of the log lists it. Without `limits` values are accepted that
+    no flight has (`columns.LIMITS`).
 
     Raises:
         FlightLogError: where the columns break a rule; it names column, row and reason.
     """
-    checked, rows, warnings = check_columns(columns, name, bool(about.get("partial")), limits)
+    is_partial = bool(_partial_groups(about))
+    checked, rows, warnings = check_columns(columns, name, is_partial, limits)
+    if is_partial:
+        about = {**about, "partial": _missing_groups(checked)}
 
     values: dict[str, np.ndarray] = {
         _FIELDS[key]: np.full((len(checked["time"]), len(GROUPS[key])), np.nan)
@@ -244,6 +246,18 @@ def log_from_columns(
         warnings=tuple(warnings),
         **values,
     )
+
+
+def _partial_groups(about: Mapping[str, Any]) -> tuple[str, ...]:
+    groups = about.get("partial")
+    return tuple(str(group) for group in groups) if isinstance(groups, list) else ()
+
+
+def _missing_groups(columns: Container[str]) -> list[str]:
+    """Return the required groups that a log with these columns lacks; "command" for the last."""
+    has = {group for group, names in GROUPS.items() if names[0] in columns}
+    missing = [group for group in NEEDED if group not in has]
+    return missing + ["command"] * (not any(has.issuperset(groups) for groups in COMMANDS))
 
 
 def columns_from_log(log: FlightLog) -> dict[str, np.ndarray]:

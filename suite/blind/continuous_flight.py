@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from eval.flights.follow import SUM_MOST, PilotGains, check_flights, steer
+from eval.flights.follow import SUM_MOST, check_flights, steer
 from eval.flights.simulate import FALL_V_PER_S, FULL_V, SAG_V, Extra, Sensors
 from eval.flights.trajectory import Reference, Trajectory
 from eval.logs.flight_log import FlightLog
@@ -104,7 +104,7 @@ class _Pilot:
         error_w = reference.pos_w - states.pos_w
         self._integral_w = self._integral_w + dt[:, None] * error_w
         self._integral_w = np.clip(self._integral_w, -SUM_MOST, SUM_MOST)
-        command = steer(self._nominal, PilotGains(), reference, motion, self._integral_w)
+        command = steer(self._nominal, reference, motion, self._integral_w)
         if self._extra is None:
             return command.packed, command.packed
         return command.packed, self._extra.command(command, float(states.time_s[0])).packed

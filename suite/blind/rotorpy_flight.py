@@ -23,7 +23,7 @@ from eval.effects.interface import GRAVITY
 from eval.flights.follow import Recording, Step, follow, reference_of
 from eval.flights.simulate import FULL_V
 from eval.flights.trajectory import Reference, Trajectory
-from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
+from eval.quadrotor.plant import Command, Motion, make_plant
 from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle, with_effects
 from eval.worlds.rotorpy import Multirotor, StepInput
@@ -98,8 +98,7 @@ class _RotorpyBodies:
         )
         acc_b = self._multirotor.specific_force_b(self._qpos, self._qvel, self._speed)
         voltage = np.full(len(speed), FULL_V)
-        no_wrench = Wrench(self._no_wind_w, self._no_wind_w)
-        return Step(speed, voltage, command, no_wrench, acc_b)
+        return Step(speed, voltage, acc_b)
 
 
 def hub_damping(effects: Sequence[Mapping[str, Any]], vehicle: Vehicle) -> np.ndarray:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from eval.effects.interface import GRAVITY
+from eval.importers.rows import continuous
 from eval.logs.columns import GROUPS
 from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.clocks.delay import check_clock
@@ -229,13 +230,14 @@ def check_log(
     findings, readings, _ = run_checks(rows, checks, against, fix)
     action = {} if log.action_b is None else {"action": log.action_b}
     measured = {"time": log.time_s, **action, **signals_of(columns_from_log(log))}
+    measured = read_rows(measured, readings)
     findings += check_controller_rate(measured, against.policy_hz)
-    time_s = read_rows({"time": log.time_s}, readings)["time"]
-    if log.pos_w is not None:
+    time_s = measured["time"]
+    if "pos" in measured:
         # Between stamps that jitter, a usual step seems to be a jump.
         is_jittery = any(finding.fault == "clock_jitter" for finding in findings)
-        even_s = with_even_stamps(rows)["time"] if is_jittery else log.time_s
-        findings += check_jumps(even_s, log.pos_w)
+        even_s = with_even_stamps(read_rows(rows, readings))["time"] if is_jittery else time_s
+        findings += check_jumps(even_s, measured["pos"])
     findings += check_pause(time_s)
     step_s = float(np.median(np.diff(time_s)))
     if len(log.time_s) < LEAST_ROWS or step_s > SLOWEST_S:
@@ -255,7 +257,7 @@ def with_fixes(log: FlightLog, readings: Readings) -> FlightLog:
     columns = columns_from_log(log)
     signals = {**GROUPS, "throttle": ("throttle",)}  # a checked column that no group has
     rows = {"time": log.time_s, **signals_of(columns, signals)}
-    attitude = {"quat": filled(log.time_s, rows["quat"])} if "quat" in rows else {}
+    attitude = {"quat": _filled_attitude(log.time_s, rows["quat"])} if "quat" in rows else {}
     corrected = read_rows(rows | attitude, readings)
     if "quat" in corrected:  # missing attitudes serve other signals, but stay missing
         corrected["quat"] = read_rows({"time": log.time_s, "quat": rows["quat"]}, readings)["quat"]
@@ -293,7 +295,8 @@ def rows_of(log: FlightLog) -> dict[str, np.ndarray]:
             is_far = jumps_of(log.time_s, value, in_metres=False) > 0.0
             value = np.where(is_far[:, None], np.nan, value)
         if np.isfinite(value).all(axis=1).sum() > LEAST_ROWS:
-            rows[group] = filled(log.time_s, value)
+            fill = _filled_attitude if group == "quat" else filled
+            rows[group] = fill(log.time_s, value)
     for name in ("throttle", "baro"):
         if name in columns and np.asarray(columns[name]).dtype.kind in "fiu":
             rows[name] = np.asarray(columns[name], dtype=np.float64)[:, None]
@@ -311,6 +314,15 @@ def filled(time_s: np.ndarray, value: np.ndarray) -> np.ndarray:
     too_far = (known_time[after] - known_time[after - 1] > 0.5) & ~known
     result[too_far | (time_s < known_time[0]) | (time_s > known_time[-1])] = np.nan
     return result
+
+
+def _filled_attitude(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    """Return attitudes (T, 4) as `filled` does, of unit norm and by the shorter way round."""
+    known = np.asarray(np.isfinite(quat).all(axis=1))
+    same_sign = quat.copy()
+    same_sign[known] = continuous(quat[known])
+    value = filled(time_s, same_sign)
+    return np.where(known[:, None], quat, value / np.linalg.norm(value, axis=1, keepdims=True))
 
 
 def signals_of(

@@ -66,18 +66,13 @@ def line(finding: Finding) -> str:
 
 
 def findings_of(about: Mapping[str, Any]) -> tuple[Finding, ...]:
-    """Return the findings in a log's metadata `about`; invalid records are left out.
-
-    Older logs use other names for the fields, which are translated.
-    """
-    new_names = {"level": "status", "subject": "signal", "text": "evidence"}
+    """Return the findings in a log's metadata `about`; invalid records are left out."""
     findings = []
     records = about.get("findings")
     for record in records if isinstance(records, list) else ():
         if not isinstance(record, dict):
             continue
-        fields = {new_names.get(key, key): value for key, value in record.items()}
-        fields = {key: value for key, value in fields.items() if key in Finding._fields}
+        fields = {key: value for key, value in record.items() if key in Finding._fields}
         typed = all(
             isinstance(value, float | int | None if key in ("size", "confidence") else str)
             for key, value in fields.items()

@@ -248,6 +248,8 @@ def jumps_of(time_s: np.ndarray, pos: np.ndarray, in_metres: bool) -> np.ndarray
     limit[:half] = limit[-half:] = FAR * least  # the median is not around the ends
     # Outliers move the median, so that their neighbours seem to jump too: compare with the rest.
     bad, good = np.flatnonzero(distance > limit), np.flatnonzero(distance <= limit)
+    if len(bad) > len(good):
+        return jump  # noise, or the positions of two bodies: most have nothing to come back to
     after = np.searchsorted(good, bad)
     before_s = time_s[bad] - time_s[good[np.maximum(after - 1, 0)]]
     after_s = time_s[good[np.minimum(after, len(good) - 1)]] - time_s[bad]

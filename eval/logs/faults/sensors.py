@@ -134,17 +134,16 @@ def check_barometer(rows: Rows) -> list[Finding]:
     if running.all() or not running.any():
         text = "the log has no row before the motors start"
         return unseen("barometer", text, "barometer_spin_up")
-    time_s, value = rows["time"], height[:, 0]
-    start_s = time_s[np.argmax(running)]
+    start_s = rows["time"][np.argmax(running)]
+    up = rows["pos"][:, 2] if "pos" in rows else np.zeros(len(height))
+    known = np.isfinite(height[:, 0]) & np.isfinite(up)
+    time_s, value, up = rows["time"][known], height[known, 0], up[known]
     before, after = time_s < start_s, (time_s > start_s) & (time_s < start_s + 1.0)
     shortly_before = before & (time_s > start_s - 2.0)
     if not shortly_before.any() or not after.any():
         return []
-    true = 0.0
-    if "pos" in rows:
-        up = rows["pos"][:, 2]
-        true = float(np.nanmedian(up[after]) - np.nanmedian(up[before]))
-    fall = float(np.nanmin(value[after]) - np.nanmedian(value[shortly_before])) - min(true, 0.0)
+    rise = float(np.median(up[after]) - np.median(up[before]))
+    fall = float(np.min(value[after]) - np.median(value[shortly_before])) - min(rise, 0.0)
     if fall < -SUNK_M:
         text = f"its height falls by {-fall:.2g} m in the second in which the motors start"
         fix = "foam over the barometer, or a height from elsewhere; leave baro out"

@@ -168,6 +168,14 @@ def test_broken_crazyflie_logs_are_refused_by_name(tmp_path, change, reason):
         import_log(path)
 
 
+def test_columns_of_one_signal_in_two_kinds_of_events_are_refused(tmp_path):
+    map_file = tmp_path / "split.toml"
+    map_file.write_text('[rate]\ncolumns = ["gyro.x", "gyro.y", "pm.vbat"]\n')
+    path = made.write_usd(tmp_path / "log00", span=(0, 2))
+    with pytest.raises(FlightLogError, match="gyro.x: not in one kind of event with gyro.y, pm.vb"):
+        import_log(path, None, ImportOptions(map=map_file))
+
+
 def test_a_crazyflie_log_is_read_up_to_where_it_breaks(tmp_path):
     path = made.write_usd(tmp_path / "log00", span=(0, 8))
     data = path.read_bytes()

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from eval.importers import import_log
+from eval.importers.cleaning import without_repeats
 from eval.importers.formats.table import unwrapped
 from eval.importers.options import ImportOptions
-from eval.importers.signals import collect
+from eval.importers.signals import Recording, Signal, collect
 from eval.logs.faults.check import check_log
 from eval.logs.faults.drive.commands import has_both_signs
 from eval.logs.faults.position import jumps_of
@@ -76,6 +77,21 @@ def test_the_neighbours_of_outliers_do_not_jump(in_metres):
     pos, bad = known_flight.fly(time).pos * 2.0, [100, 102, 103, 200, 250, 251]
     pos[bad] = -50.0
     assert np.flatnonzero(jumps_of(time, pos, in_metres)).tolist() == bad
+
+
+def test_noise_without_neighbours_has_no_jumps():
+    pos = np.random.default_rng(0).uniform(-100.0, 100.0, (60, 3))
+    assert not jumps_of(0.01 * np.arange(60), pos, in_metres=True).any()
+
+
+def test_repeats_of_position_and_attitude_are_left_out_each_at_its_times():
+    time_s = np.arange(0.0, 4.0, 0.01)
+    wave = np.stack([np.cos(time_s), np.sin(time_s), 0.0 * time_s, 0.0 * time_s], axis=1)
+    held = wave[np.arange(400) // 2 * 2]
+    poses = {"quat": Signal(time_s, held), "pos": Signal(time_s + 0.003, held[:, :3])}
+    left = without_repeats(Recording("log", poses))
+    assert [len(signal.time_s) for signal in left.signals.values()] == [200, 200]
+    assert [finding.signal for finding in left.findings] == ["attitude", "position"]
 
 
 @pytest.mark.parametrize("fix", [True, False])

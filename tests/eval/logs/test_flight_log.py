@@ -96,6 +96,17 @@ def test_one_bad_flight_among_many_is_named_and_all_bad_is_an_error(tmp_path):
         flight_log.read_flights([])
 
 
+def test_a_partial_log_lists_what_it_lacks_and_another_entry_makes_none():
+    lacking = {name: v for name, v in columns().items() if not name.startswith(("pos", "quat"))}
+    for listed in (["pos"], ["pos", "quat"]):
+        log = flight_log.log_from_columns(lacking, {"partial": listed}, "a")
+        assert log.partial == ("pos", "quat")
+    assert flight_log.log_from_columns(columns(), {"partial": ["pos"]}, "a").partial == ()
+    for entry in (True, "pos", {"pos": 1}):
+        with pytest.raises(flight_log.FlightLogError, match="pos_x: missing"):
+            flight_log.log_from_columns(lacking, {"partial": entry}, "a")
+
+
 def test_a_row_that_lacks_a_torque_is_not_whole():
     torque = np.array([[0.0, 0.0, 0.0], [0.0, np.nan, 0.0], [0.0, 0.0, 0.0]])
     thrust_cmd = np.array([9.0, 9.0, np.nan])

@@ -93,7 +93,7 @@ def test_nothing_is_concluded_of_a_log_with_an_open_fault(tmp_path, capsys, flig
         assert "gyro_scale" in refused(capsys, *line, "--accept", "gyro_scales")
 
 
-def test_what_an_import_left_open_is_repeated_and_findings_of_earlier_versions_are_read(
+def test_what_an_import_left_open_is_repeated_and_invalid_records_are_left_out(
     tmp_path, capsys, flight
 ):
     doubt = Finding("doubt", "motors", "6 motors turn", "motor_count", 6.0, 0.97, "none")
@@ -108,9 +108,9 @@ def test_what_an_import_left_open_is_repeated_and_findings_of_earlier_versions_a
     assert "motor_count" in {f["fault"] for f in answered["findings"]}
     line = ("diagnose --vehicle", tmp_path / "plain.toml", "--out", tmp_path / "out", path)
     assert "6 motors turn" in refused(capsys, *line, lines=3)
-    old = {"level": "doubt", "subject": "attitude", "text": "39 % off"}
+    short = {"status": "doubt", "signal": "attitude", "evidence": "39 % off"}
     odd = ["odd", doubt._asdict() | {"confidence": "high"}, doubt._asdict() | {"fault": [1]}]
-    assert findings_of({"findings": [old, *odd]}) == (Finding("doubt", "attitude", "39 % off"),)
+    assert findings_of({"findings": [short, *odd]}) == (Finding("doubt", "attitude", "39 % off"),)
 
 
 def test_logs_of_several_vehicles_are_named(tmp_path, capsys, flight):

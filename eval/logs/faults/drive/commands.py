@@ -168,6 +168,9 @@ def check_thrust_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Fin
     name = possible_units[0] if is_one_unit else ""
     if name != "in m/s^2" and abs(np.log(ratio)) < np.log(THRUST_EFFECT):
         text = f"{figures}: an effect, or a mass that is off"
+        if sign < 0.0:
+            about = ("thrust_command_unit", -1.0, 0.97, option(("cmd_thrust", "-1")))
+            return [Finding("corrected", subject, f"{text}, and down is positive", *about)]
         return [Finding("note", subject, text, "thrust_scale", ratio, 0.9)]
     if not name:
         text = f"{figures}: another unit, a share of full thrust, or a mass that is far off"

@@ -81,7 +81,7 @@ class Drive(NamedTuple):
 
     @property
     def exponent(self) -> float:
-        """D log(thrust) / d log(command) by the file, at the median command."""
+        """Power of the command with which thrust grows by the file, at the median command."""
         if self.motors is None:
             return 1.0
         command = self.command_quantile(0.5)

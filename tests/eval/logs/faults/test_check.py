@@ -5,18 +5,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from eval.importers.frames import rotate
 from eval.logs.faults.catalogue import FAULTS
-from eval.logs.faults.check import DRIVE, POSE, CheckContext, check_log, run_checks
+from eval.logs.faults.check import DRIVE, POSE, CheckContext, check_log, run_checks, with_fixes
 from eval.logs.faults.checked import check_flights, lines_of
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.position import check_jumps
 from eval.logs.faults.reading import parse_readings, read_rows
-from eval.logs.flight_log import columns_from_log, log_from_columns, write_flight
+from eval.logs.faults.sensors import check_barometer
+from eval.logs.flight_log import FlightLog, columns_from_log, log_from_columns, write_flight
 from suite.commands.check import Config, run
 from suite.common.console import Console
 from tests.support.diagnosis_flights import fly
 from tests.support.imported import flight
 from tests.support.vehicles import PLAIN
+
+
+def flight_at_rest(time_s):
+    still = np.zeros((len(time_s), 3))
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (len(time_s), 1))
+    return FlightLog("log", time_s, still, level, still, still, np.full(len(time_s), 9.81), still)
 
 
 def faults(parts):
@@ -96,6 +104,18 @@ def test_a_stored_finding_on_another_vehicle_file_is_not_repeated_and_one_on_the
 
     assert faults(CheckContext()) == ["motor_map", "voltage"]
     assert faults(CheckContext(PLAIN)) == ["voltage"]
+
+
+@pytest.mark.parametrize("lost", ["baro", "pos"])
+def test_a_barometer_without_samples_around_the_start_is_not_checked(lost):
+    time_s = np.arange(0.0, 5.0, 0.01)
+    rows = {
+        "time": time_s, "throttle": np.where(time_s > 2.0, 0.5, 0.0)[:, None],
+        "baro": np.zeros((500, 1)), "pos": np.zeros((500, 3)),
+    }  # fmt: skip
+    assert [finding.status for finding in check_barometer(rows)] == ["ok"]
+    rows[lost][190:320] = np.nan
+    assert not check_barometer(rows)
 
 
 def test_a_long_pause_of_the_rows_has_a_note():
@@ -178,6 +198,17 @@ def test_a_slow_position_that_is_held_in_fast_rows_does_not_jump(held):
     assert not check_jumps(np.append(time_s, time_s[-1]), np.append(pos, pos[-1:], axis=0))
 
 
+def test_a_velocity_in_body_axes_is_turned_right_where_a_missing_attitude_changes_its_sign():
+    angle = 2.0 * np.arange(0.0, 4.0, 0.005)
+    quat = np.stack([np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)], axis=1)
+    quat = np.where(quat[:, :1] < 0.0, -quat, quat)  # one sign of w, as many programs write
+    log, forward_w = flight_at_rest(angle / 2.0), rotate(quat, np.array([1.0, 0.0, 0.0]))
+    seen = np.where(np.arange(len(angle))[:, None] % 2, np.nan, quat)
+    log = replace(log, quat_wxyz=seen, vel_w=np.zeros_like(forward_w) + [1.0, 0.0, 0.0])
+    fixed = with_fixes(log, parse_readings(["vel=from-body"])).vel_w
+    np.testing.assert_allclose(fixed[:-1], forward_w[:-1], atol=1e-9)
+
+
 def test_another_vehicles_name_is_a_note_and_an_implausible_file_is_in_doubt():
     log = replace(fly(PLAIN, 0, duration_s=3.0, motors=True), about={"vehicle": "other"})
     fast = replace(PLAIN, rotors=replace(PLAIN.rotors, speed_max=10.0 * PLAIN.rotors.speed_max))
@@ -198,6 +229,18 @@ def test_the_rate_of_slow_commands_is_that_of_their_own_rows():
         return [one.status for one in found if one.signal == "controller"]
 
     assert status(row_hz / 10) == ["ok"] and status(row_hz / 5) == ["doubt"]
+
+
+@pytest.mark.parametrize("per_s", [1.0, 1e3])
+def test_a_wrong_unit_of_time_hides_no_jump_and_is_no_other_rate(per_s):
+    log = fly(PLAIN, 0, duration_s=4.0)
+    pos_w = log.pos_w + [3.0, 0.0, 0.0] * (log.time_s > 2.0)[:, None]
+    held = np.repeat(log.rate_cmd_b[::10], 10, axis=0)[: len(log.time_s)]
+    row_hz = 1.0 / float(np.median(np.diff(log.time_s)))
+    log = replace(log, time_s=per_s * log.time_s, pos_w=pos_w, rate_cmd_b=held)
+    found, _ = check_log(log, CheckContext(policy_hz=row_hz / 10), True)
+    assert [f.status for f in found if f.signal == "controller"] == ["ok"]
+    assert ["position_jump"] == [f.fault for f in found if f.is_open]
 
 
 def test_a_log_that_is_too_slow_to_check_has_no_clean_bill(tmp_path, capsys):

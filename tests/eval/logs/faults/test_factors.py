@@ -178,7 +178,10 @@ def test_a_command_near_the_force_is_fine():
 
 
 def test_a_unit_or_a_sign_of_the_thrust_is_corrected():
-    for factor, fix in ((1 / 9.81, 9.81), (0.92 / 9.81, 9.81), (-1.0, -1), (-1 / 9.81, -9.81)):
+    for factor, fix in (
+        (1 / 9.81, 9.81), (0.92 / 9.81, 9.81), (-1.0, -1), (-1 / 9.81, -9.81), (-0.67, -1),
+        (-1.6, -1),
+    ):  # fmt: skip
         (finding,) = thrust(factor)
         assert (finding.status, finding.fix) == ("corrected", f"--read cmd_thrust={fix}")
 
