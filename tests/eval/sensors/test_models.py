@@ -225,6 +225,8 @@ DEPTHS = [
     # Disparities of 20, 10, 5 and 2.5 become 21, 9, 6 and 3, and what is too near is a hole.
     ("stereo", STEREO | {"step": 3.0, "near": 1.5}, {}, RANGES, [10.0, 20 / 9, 20 / 6, 20 / 3] * 2),
     ("stereo", STEREO | {"noise": 0.1, "least": 4.0}, {}, RANGES, [1.0, 2.0, 4.0, 10.0] * 2),
+    ("stereo", STEREO | {"noise": 0.1}, {"grain": 1.0}, STEPS + 4.0 * (STEPS == 6.0),
+     [10.0, 10, 20 / (20 / 3 + 0.1), 20 / (20 / 3 + 0.1), 10, 10, 10, 10]),
     ("stereo", STEREO | {"edge_holes": 1.0}, {"chance": 0.5}, EDGES, [6, 6, 10, 3, 10, 10, 2, 2]),
     ("stereo", STEREO | {"thin_holes": 1.0}, {"chance": 0.5}, EDGES, [6, 6, 6, 6, 6, 6, 2, 2]),
     ("stereo", STEREO | {"smear": 1.0}, {"chance": 0.5}, EDGES, [6, 6, 3, 3, 3, 2, 2, 2]),
