@@ -102,7 +102,7 @@ def _compile(compiler: list[str], files: list[Path], out: Path) -> None:
     # A link is not resolved, since policy.h may be only in the folder of the link.
     source = policy_c.absolute()
     arguments = [f"-I{source.parent}", str(source), str(library_c), "-o", str(out), "-lm"]
-    message = ""
+    message = ""  # of the last attempt, since the first one may only refuse `NATIVE_FLAGS`
     for flags in ((*FLAGS, *NATIVE_FLAGS), FLAGS):
         try:
             result = subprocess.run(
@@ -120,7 +120,7 @@ def _compile(compiler: list[str], files: list[Path], out: Path) -> None:
             ) from None
         if result.returncode == 0:
             return
-        message = message or result.stderr.decode(errors="replace").strip()
+        message = result.stderr.decode(errors="replace").strip()
         for number in MACHINE_ERRORS:
             if os.strerror(number) in message:
                 path = re.search(r"(/\S+): " + re.escape(os.strerror(number)), message)
