@@ -192,7 +192,7 @@ class MjxWorld(Slots):
         course, scene = self._on_device
         with jax.default_matmul_precision(PRECISION):
             view = self._view(self._state, course, scene, bool(wanted.any()))
-        return View(*(np.asarray(field, np.float64) for field in view))
+        return jax.tree.map(lambda field: np.asarray(field, np.float64), view)
 
     @functools.partial(jax.jit, static_argnums=(0, 4))
     def _view(self, state: SlotStates, course: Course, scene: Scene, images: bool) -> View:

@@ -210,9 +210,9 @@ class SceneSlots(Slots, ABC):
             rotor_speed = self._loops.plant.rotor_speed
             draws = self._draws_at(step + 1)
             loops, push = self._control(motion, action_b, gate_w, step, draws)
-            due = flying & has_new_command(self._autopilot, self._loops, loops, step)
-            self._loops = make_contiguous(select(flying, loops, self._loops))
+            before, self._loops = self._loops, make_contiguous(select(flying, loops, self._loops))
             if record:
+                due = flying & has_new_command(self._autopilot, before, loops, step)
                 rows += self._rows(due, rotor_speed)
             invalid = self._move(flying, motion, push)
             self._progress = self._progress._replace(step=step + flying)
