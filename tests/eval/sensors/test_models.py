@@ -198,6 +198,15 @@ def test_a_gate_that_is_not_found_stays_where_it_was_last_seen():
     assert np.array_equal(unseen.gate_w, behind.gate_w), "behind the camera there is the map alone"
 
 
+def test_an_older_view_is_shown_without_the_estimates_of_later_gates():
+    """With delays that vary, a view before a gate may follow one after it."""
+    later = view(pos=(4.5, 0.0, 0.0), gate=(8.0, 2.0, 0.0), number=1)
+    older = view(pos=(3.9, 0.0, 0.0))  # too near to its gate to see the corners
+    shown = seen_through("gate_detection", {"smoothing": 0.1}, [view(), later, older, later])
+    for seen, truth in zip(shown, (view(), later, older, later), strict=True):
+        assert seen.gate_w[0] == pytest.approx(truth.gate_w[0])
+
+
 def test_a_gap_in_detections_stays_with_its_gate_when_the_one_before_is_passed():
     values = as_arrays(SENSORS["gate_detection"].values(0.0, 0.5, 10.0, 0.5, 0.1, 0.0))
     sensor = SENSORS["gate_detection"]
