@@ -339,7 +339,7 @@ class Races:
         self._action = np.where(flying[:, None], guarded.action_b, self._action)
         self._output = np.where(flying[:, None], clipped, self._output)
         period = 1.0 / (self.spec.rate_hz * self._world.dt)
-        steps = np.where(flying, np.maximum(1, steps_to_next(self._decision, period)), 0)
+        steps = np.where(flying, steps_to_next(self._decision, period), 0)
         self._decision += flying
         self._world.advance(self._action, steps, False)
         endings = [self.ended_by(slot) for slot in range(self.slots)]

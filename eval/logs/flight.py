@@ -8,7 +8,9 @@ import numpy as np
 
 
 class Flight(NamedTuple):
-    """One flight, sampled once every period of the attitude loop (100 Hz by default).
+    """One flight, sampled at every period of the attitude loop (100 Hz by default).
+
+    For a policy of kind `ctbr` there are also rows at its new commands.
 
     Row k holds what was measured at `time_s[k]` before the command of row k acts; that command
     holds until `time_s[k + 1]`. The last row is the state at the end of the trial; its command is

@@ -133,6 +133,20 @@ def attitude_step(
     return AutopilotState(state.plant, command, select(due, heading_w, state.heading_w))
 
 
+def has_new_command(
+    autopilot: Autopilot, before: AutopilotState, after: AutopilotState, step: Array
+) -> Array:
+    """Return whether a physics step may begin with a new command (N,), for rows of flight logs.
+
+    The attitude loop computes commands at its own steps. A policy of kind `ctbr` may change thrust
+    and body rates at any step. `before` and `after` are the states around `attitude_step`.
+    """
+    due = step % autopilot.attitude_every == 0
+    if autopilot.action.kind != "ctbr":
+        return due
+    return due | (after.command.packed != before.command.packed).any(-1)
+
+
 def motor_speed_command(autopilot: Autopilot, action: Array) -> Array | None:
     """Return the rotor speeds (N, 4) of motor commands [rad/s]; None for other actions."""
     if autopilot.action.kind != "motors":

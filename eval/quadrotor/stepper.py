@@ -138,7 +138,7 @@ def loop_update(
         memory: state of the loop, as `PlantState.loop`.
         command: (...) thrust and body rates, already delayed.
         rate_b: (..., 3) current body rates [rad/s].
-        dt: (...,) time since the last update [s].
+        dt: time since the last update [s], a number or (..., 1).
     """
     nominal = plant.nominal
     if plant.loop is not None:

@@ -62,7 +62,8 @@ def stereo_sense(values: Stereo, memory: Array, seen: View, moment: Moment) -> t
     missed = thin & (chance[..., 2, :, :] < over_image(values.thin_holes))
     matched_m = xp.where(smeared, nearer, xp.where(missed, further, depth_m))
     measured_m = in_disparity(values, memory, matched_m, grain[..., 0, :, :], moment.camera)
-    measured_m = xp.where(hole | (matched_m < over_image(values.near)), range_m, measured_m)
+    no_depth = hole | (matched_m < over_image(values.near)) | (matched_m >= range_m)
+    measured_m = xp.where(no_depth, range_m, measured_m)
     return seen._replace(depth_m=measured_m), memory
 
 

@@ -68,13 +68,16 @@ def sense(
     axes_w = xp.stack([seen.axis_w, seen.second_axis_w], axis=-2)
     true_w = xp.stack([truth.gate_w, truth.second_w], axis=-2)
     # When a gate is passed, the second one becomes the next, with its stored estimate and gap.
-    passed = column(truth.gate_number > memory["number"])
+    change = truth.gate_number - memory["number"]
+    passed = column(change == 1)
     next_w = xp.concatenate([memory["gates_w"][..., 1:, :], map_w[..., 1:, :]], axis=-2)
     held, missed = (
         xp.where(passed, xp.concatenate([flag[..., 1:], flag[..., 1:] & False], axis=-1), flag)
         for flag in (memory["held"], memory["missed"])
     )
     stored_w = xp.where(column(passed), next_w, memory["gates_w"])
+    # After another change, such as to an older view by varying delays, they are of other gates.
+    held = held & column((change == 0) | (change == 1))
     stored_w = xp.where(column(held), stored_w, map_w)  # without an estimate, the map
 
     # Detect gates in view, and measure their positions with the errors of PnP.

@@ -19,7 +19,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from eval.quadrotor.autopilot import AutopilotState, autopilot_step, start_autopilot
+from eval.quadrotor.autopilot import (
+    AutopilotState,
+    autopilot_step,
+    has_new_command,
+    start_autopilot,
+)
 from eval.quadrotor.model import compile_quadrotor
 from eval.quadrotor.plant import Motion
 from eval.vehicles.vehicle import Vehicle
@@ -187,7 +192,7 @@ class MjxWorld(Slots):
         course, scene = self._on_device
         with jax.default_matmul_precision(PRECISION):
             view = self._view(self._state, course, scene, bool(wanted.any()))
-        return View(*(np.asarray(field, np.float64) for field in view))
+        return jax.tree.map(lambda field: np.asarray(field, np.float64), view)
 
     @functools.partial(jax.jit, static_argnums=(0, 4))
     def _view(self, state: SlotStates, course: Course, scene: Scene, images: bool) -> View:
@@ -274,7 +279,7 @@ class MjxWorld(Slots):
             if not record:
                 return (after, near), None
             before = state._replace(loops=loops)
-            due = flying & (step % self._autopilot.attitude_every == 0)
+            due = flying & has_new_command(self._autopilot, state.loops, loops, step)
             ended = flying & (after.progress.ended != FLYING) & (after.progress.ended != DIVERGED)
             return (after, near), (
                 self._rows(due, before, state.loops.plant.rotor_speed),

@@ -16,7 +16,12 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from eval.quadrotor.autopilot import AutopilotState, autopilot_step, start_autopilot
+from eval.quadrotor.autopilot import (
+    AutopilotState,
+    autopilot_step,
+    has_new_command,
+    start_autopilot,
+)
 from eval.quadrotor.plant import MAX_DELAY, Motion, make_plant
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import Rows, rows_of
@@ -205,9 +210,9 @@ class SceneSlots(Slots, ABC):
             rotor_speed = self._loops.plant.rotor_speed
             draws = self._draws_at(step + 1)
             loops, push = self._control(motion, action_b, gate_w, step, draws)
-            self._loops = make_contiguous(select(flying, loops, self._loops))
+            before, self._loops = self._loops, make_contiguous(select(flying, loops, self._loops))
             if record:
-                due = flying & (step % self._autopilot.attitude_every == 0)
+                due = flying & has_new_command(self._autopilot, before, loops, step)
                 rows += self._rows(due, rotor_speed)
             invalid = self._move(flying, motion, push)
             self._progress = self._progress._replace(step=step + flying)

@@ -83,18 +83,11 @@ def described_policy(loaded: ModelProcess, path: Path, metadata: PolicyMetadata)
     """Return the policy of a loaded program that describes the shapes of its inputs.
 
     Raises:
-        PolicyError: where inputs or outputs are not those of a policy, or its hidden state is not
-            the one of its contract.
+        PolicyError: where inputs or outputs are not those of a policy or of its contract.
     """
     shapes = {port.name: port.shape for port in loaded.inputs}
     order = sorted(shapes, key=(*INPUTS, *shapes).index)
     block, hidden_shape = check_inputs({n: shapes[n] for n in order}, metadata.spec, str(path))
-    memory = metadata.contract.memory if metadata.contract else None
-    if memory is not None and tuple(memory) != (hidden_shape if hidden_shape != (0,) else ()):
-        raise PolicyError(
-            f"{path}: its contract says a memory of shape {list(memory)}, its input 'hidden' has "
-            f"{list(hidden_shape)}; export the policy again with its own contract"
-        )
     return program_policy(loaded, path, metadata, hidden_shape, block)
 
 
@@ -110,10 +103,17 @@ def program_policy(
     `hidden_shape` is the shape of a row's hidden state; (0,) for a program without one.
 
     Raises:
-        PolicyError: where the outputs are not the action, and the hidden state if there is one.
+        PolicyError: where the outputs are not the action, and the hidden state if there is one, or
+            the hidden state is not that of the contract.
     """
     names = [port.name for port in loaded.inputs]
     has_memory = hidden_shape != (0,)
+    memory = metadata.contract.memory if metadata.contract else None
+    if memory is not None and memory != (hidden_shape if has_memory else ()):
+        raise PolicyError(
+            f"{path}: its contract says a memory of shape {list(memory)}, its input 'hidden' has "
+            f"{list(hidden_shape)}; export the policy again with its own contract"
+        )
 
     def model(
         state: np.ndarray, image: np.ndarray, hidden: np.ndarray

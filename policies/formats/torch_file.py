@@ -50,8 +50,10 @@ def load_script(path: Path, trust: bool = False) -> BlockPolicy:
     loaded = _loaded(path, "script", "TorchScript", trust)
     metadata = extract(loaded.labels, str(path))
     names = _check_names(path, loaded)
-    hidden_shape = (metadata.spec.hidden_size,) if names == INPUTS else (0,)
-    return program_policy(loaded, path, metadata, hidden_shape)
+    # A script does not store the shape of its hidden state.
+    memory = metadata.contract.memory if metadata.contract else None
+    hidden_shape = memory or (metadata.spec.hidden_size,)
+    return program_policy(loaded, path, metadata, hidden_shape if names == INPUTS else (0,))
 
 
 def _loaded(path: Path, kind: str, words: str, trust: bool) -> ModelProcess:

@@ -76,7 +76,7 @@ def update(
         force_z: (...,) wanted collective thrust [N].
         rate_cmd_b: (..., 3) commanded body rates [rad/s].
         rate_b: (..., 3) current body rates [rad/s].
-        dt: time since the last update [s].
+        dt: time since the last update [s], a number or (..., 1).
         scale: (..., 3) factor on the loop's output, by the effect `rate_gain`.
     """
     xp = rate_b.__array_namespace__()

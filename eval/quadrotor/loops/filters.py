@@ -27,7 +27,7 @@ class Request(NamedTuple):
     rate_b: Array
     """(..., 3) current body rates [rad/s]."""
     dt: Array
-    """Time since the last update [s]."""
+    """Time since the last update [s], a number or (..., 1)."""
     scale: Array
     """(..., 3) factor on the outputs, by the effect `rate_gain`."""
 

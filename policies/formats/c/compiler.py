@@ -13,9 +13,9 @@ import subprocess
 from pathlib import Path
 
 from policies.formats.c.source import TEMPLATES
+from policies.formats.program_inputs import read_model
 from policies.spec import PolicyError
 from tracks.common.files import replacing_file, user_cache
-from tracks.input.reading import MODEL_BYTES, InputError, read_bytes
 
 FLAGS = ("-std=c99", "-O3", "-ffp-contract=fast", "-fPIC", "-shared")
 """Compiler options that every machine supports."""
@@ -69,7 +69,7 @@ def compiled_library(policy_c: Path) -> Path:
     another header that they include is not detected.
 
     Raises:
-        PolicyError: where there is no compiler, or it refuses the file.
+        PolicyError: where there is no compiler, it refuses the file, or a file cannot be read.
     """
     compiler = find_compiler()
     if compiler is None:
@@ -79,13 +79,9 @@ def compiled_library(policy_c: Path) -> Path:
             "name it in the environment's CC"
         )
     files = [*source_files(policy_c), TEMPLATES / "library.c"]
-    try:
-        texts = [read_bytes(file, MODEL_BYTES) for file in files]
-    except InputError as error:
-        raise PolicyError(str(error)) from None
     key = hashlib.sha256(repr((compiler, FLAGS, NATIVE_FLAGS, platform.machine())).encode())
-    for text in texts:
-        key.update(hashlib.sha256(text).digest())
+    for file in files:
+        key.update(hashlib.sha256(read_model(file)).digest())
     # Machines may share a home directory, but not compiled code, since processors differ.
     folder = user_cache() / "c" / (platform.node() or "here")
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -102,7 +98,7 @@ def _compile(compiler: list[str], files: list[Path], out: Path) -> None:
     # A link is not resolved, since policy.h may be only in the folder of the link.
     source = policy_c.absolute()
     arguments = [f"-I{source.parent}", str(source), str(library_c), "-o", str(out), "-lm"]
-    message = ""
+    message = ""  # of the last attempt, since the first one may only refuse `NATIVE_FLAGS`
     for flags in ((*FLAGS, *NATIVE_FLAGS), FLAGS):
         try:
             result = subprocess.run(
@@ -120,7 +116,7 @@ def _compile(compiler: list[str], files: list[Path], out: Path) -> None:
             ) from None
         if result.returncode == 0:
             return
-        message = message or result.stderr.decode(errors="replace").strip()
+        message = result.stderr.decode(errors="replace").strip()
         for number in MACHINE_ERRORS:
             if os.strerror(number) in message:
                 path = re.search(r"(/\S+): " + re.escape(os.strerror(number)), message)

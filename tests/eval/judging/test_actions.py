@@ -21,7 +21,7 @@ from suite.common.console import Console
 from suite.judging.checking import policy_findings
 from tests.support.courses import end_of, fly_on, straight
 from tests.support.judged_cells import cut_short
-from tests.support.pilots import Pursuit, Steady
+from tests.support.pilots import Pursuit, Scripted, Steady
 
 VEHICLE = load_vehicle("reference")
 RULES = Rules(time_limit_s=0.8)
@@ -73,6 +73,19 @@ def test_flights_of_other_kinds_of_action_become_logs(kind, second, tmp_path):
     assert (
         log.action_b is None and log.whole.all() and (log.thrust_cmd is None) == (kind == "motors")
     )
+
+
+@pytest.mark.parametrize("world", ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)])
+def test_a_log_has_a_row_at_every_new_command_of_body_rates(world):
+    swinging = np.array([[GRAVITY, (-1) ** k * 0.2, 0.0, 0.0] for k in range(12)])
+    policy = Scripted(swinging, PolicySpec(action=ActionSpec("ctbr")))
+    how = {"vehicle": VEHICLE, "world": world, "slots": 1, "record": Record()}
+    how["rules"] = Rules(time_limit_s=0.4)
+    (flight,) = fly_on(policy, straight(height=30.0), **how)[1]
+    new = np.flatnonzero(np.diff(flight.rate_cmd_b[:, 0])) + 1
+    np.testing.assert_allclose(flight.time_s[new], np.rint(np.arange(1, 12) * 500 / 30) / 500)
+    assert flight.policy_step[new].all()
+    assert np.isin(np.arange(0, 200, 5), np.rint(500 * flight.time_s)).all()
 
 
 @pytest.mark.parametrize("kind", ["ctbr", "motors"])

@@ -198,6 +198,15 @@ def test_a_gate_that_is_not_found_stays_where_it_was_last_seen():
     assert np.array_equal(unseen.gate_w, behind.gate_w), "behind the camera there is the map alone"
 
 
+def test_an_older_view_is_shown_without_the_estimates_of_later_gates():
+    """With delays that vary, a view before a gate may follow one after it."""
+    later = view(pos=(4.5, 0.0, 0.0), gate=(8.0, 2.0, 0.0), number=1)
+    older = view(pos=(3.9, 0.0, 0.0))  # too near to its gate to see the corners
+    shown = seen_through("gate_detection", {"smoothing": 0.1}, [view(), later, older, later])
+    for seen, truth in zip(shown, (view(), later, older, later), strict=True):
+        assert seen.gate_w[0] == pytest.approx(truth.gate_w[0])
+
+
 def test_a_gap_in_detections_stays_with_its_gate_when_the_one_before_is_passed():
     values = as_arrays(SENSORS["gate_detection"].values(0.0, 0.5, 10.0, 0.5, 0.1, 0.0))
     sensor = SENSORS["gate_detection"]
@@ -225,6 +234,8 @@ DEPTHS = [
     # Disparities of 20, 10, 5 and 2.5 become 21, 9, 6 and 3, and what is too near is a hole.
     ("stereo", STEREO | {"step": 3.0, "near": 1.5}, {}, RANGES, [10.0, 20 / 9, 20 / 6, 20 / 3] * 2),
     ("stereo", STEREO | {"noise": 0.1, "least": 4.0}, {}, RANGES, [1.0, 2.0, 4.0, 10.0] * 2),
+    ("stereo", STEREO | {"noise": 0.1}, {"grain": 1.0}, STEPS + 4.0 * (STEPS == 6.0),
+     [10.0, 10, 20 / (20 / 3 + 0.1), 20 / (20 / 3 + 0.1), 10, 10, 10, 10]),
     ("stereo", STEREO | {"edge_holes": 1.0}, {"chance": 0.5}, EDGES, [6, 6, 10, 3, 10, 10, 2, 2]),
     ("stereo", STEREO | {"thin_holes": 1.0}, {"chance": 0.5}, EDGES, [6, 6, 6, 6, 6, 6, 2, 2]),
     ("stereo", STEREO | {"smear": 1.0}, {"chance": 0.5}, EDGES, [6, 6, 3, 3, 3, 2, 2, 2]),

@@ -13,7 +13,9 @@ import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
+from policies import contract
 from policies.block_policy import BlockPolicy
+from policies.contract import contract_of
 from policies.formats import onnx_file
 from policies.formats.onnx_file import files_of
 from policies.formats.program_inputs import check_inputs
@@ -334,6 +336,32 @@ def test_torchscript_needs_trust_and_flies_on_after_a_failure(tmp_path):
         action_of(policy, np.full((2, 12), 1e4))
     assert len(str(refused.value).splitlines()) == 1
     np.testing.assert_array_equal(action_of(policy, np.ones((2, 12))), np.ones((2, 3)))
+
+
+class Counting(torch.nn.Module):
+    """Counts its steps in a memory of two rows, as that of an LSTM."""
+
+    def forward(
+        self, state: torch.Tensor, image: torch.Tensor, hidden: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        return hidden[:, 1, :3], hidden + 1.0
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
+def test_the_memory_of_a_script_is_that_of_its_contract(tmp_path):
+    path = tmp_path / "it.pt"
+    for module, memory in ((Counting(), (2, 4)), (Failing(), (5,))):
+        text = contract_of(PolicySpec(), memory).text
+        torch.jit.save(torch.jit.script(module), str(path), _extra_files={contract.KEY: text})
+        if memory == (2, 4):
+            policy = load_policy(path, trust=True)
+            hidden = policy.start(2)
+            for step in range(2):
+                inputs = np.ones((2, 12)), np.ones((2, 24, 32)), np.zeros(2, bool)
+                action, hidden = policy.act(hidden, *inputs)
+                assert hidden.shape == (2, 2, 4) and (action == step).all()
+    with pytest.raises(PolicyError, match=r"a memory of shape \[5\], its input 'hidden' has \[0\]"):
+        load_policy(path, trust=True)
 
 
 def test_answers_are_those_of_torch_here_to_the_bit(exported):

@@ -4,7 +4,7 @@ static float leaky(float x)
     return x > 0.0f ? x : $LEAK * x;
 }
 
-/* Lambert's continued fraction of tanh (1768), cut at 12 terms: 4e-7 off at most. */
+/* Lambert's continued fraction of tanh (1768), cut at 12 terms; the error is below 4e-7. */
 static float tanh_of(float x)
 {
     const float c = x < -8.0f ? -8.0f : x > 8.0f ? 8.0f : x;
@@ -28,7 +28,7 @@ static int all_finite(const float *x, int n)
     return !bad;
 }
 
-/* Whether an input is not finite; the action is then NaN. */
+/* Returns whether an input is not finite; the action is then set to NaN. */
 static int refused(const float *observation, const float *image, float *action)
 {
     const int bad = !all_finite(observation, INPUTS) || !all_finite(image, HEIGHT * WIDTH);
@@ -38,7 +38,7 @@ static int refused(const float *observation, const float *image, float *action)
     return bad;
 }
 
-/* The largest of every 2 x 2 pixels: near things win. */
+/* Takes the largest of every 2 x 2 pixels, so that near objects remain. */
 static void pool(float *restrict out, const float *restrict image)
 {
     for (int row = 0; row < HEIGHT / 2; row++) {
@@ -51,7 +51,7 @@ static void pool(float *restrict out, const float *restrict image)
     }
 }
 
-/* 2 x 2 pixels to CHANNELS1 numbers, stride 2. */
+/* Maps 2 x 2 pixels to CHANNELS1 numbers, with stride 2. */
 static void first_layer(float *restrict out, const float *restrict x)
 {
     for (int row = 0; row < ROWS1; row++) {
@@ -68,8 +68,8 @@ static void first_layer(float *restrict out, const float *restrict x)
     }
 }
 
-/* The state's part of the embedding. */
-static void felt(float *restrict out, const float *restrict observation)
+/* Computes the embedding of the state. */
+static void embed_state(float *restrict out, const float *restrict observation)
 {
     for (int j = 0; j < PADDED; j++) {
         out[j] = state_bias[j];
@@ -88,7 +88,7 @@ static void activate(float *embedding)
     }
 }
 
-/* The gated recurrent unit: reset, update and new, each HIDDEN numbers of either side. */
+/* Updates the gated recurrent unit; its gates reset, update and new have HIDDEN numbers each. */
 static void gru(float *restrict hidden, const float *restrict from_input,
                 const float *restrict from_hidden)
 {

@@ -1,5 +1,5 @@
 
-/* Sums are kept in eight vectors of the processor, where the compiler has such; else in floats. */
+/* Eight sums are kept in vector registers if the compiler supports vectors, else in floats. */
 #if !defined(POLICY_PLAIN) && defined(__GNUC__) && defined(__AVX512F__)
 enum { LANES = 16 };
 typedef float vector __attribute__((vector_size(64), aligned(4), may_alias));
@@ -30,8 +30,8 @@ static void store(float *to, vector value)
     *(vector *)to = value;
 }
 
-/* out[outputs] += x[inputs] times weights; inputs is a multiple of 4. Backwards or not is the same
- * to the bit; see policy_step. */
+/* out[outputs] += x[inputs] times weights; inputs is a multiple of 4. `backwards` reverses the order
+ * of the blocks (see policy_step), which does not change the result. */
 static void dense(float *restrict out, const float *restrict x, const float *restrict weights,
                   int inputs, int outputs, int backwards)
 {
@@ -71,8 +71,8 @@ static void dense(float *restrict out, const float *restrict x, const float *res
     }
 }
 
-/* 3 x 3 pixels of `inputs` channels to `outputs`, no padding, four pixels and two vectors at a
- * time; the last four may be some of the ones before. */
+/* Maps 3 x 3 pixels of `inputs` channels to `outputs` channels, without padding, four pixels and
+ * two vectors at a time. The last pixel is repeated to complete the last four. */
 static void convolve(float *restrict out, const float *restrict x, const float *restrict weights,
                      int rows, int columns, int inputs, int outputs)
 {
@@ -128,8 +128,8 @@ static void convolve(float *restrict out, const float *restrict x, const float *
     }
 }
 
-/* from_hidden = the memory's part of the unit. */
-static void remember(policy_state *state)
+/* Computes the contribution of the hidden state to the gates. */
+static void gates_from_hidden(policy_state *state)
 {
     for (int j = 0; j < GATES; j++) {
         state->gates[j] = gru_hidden_bias[j];
@@ -144,18 +144,18 @@ void policy_step(policy_state *state, const float *observation, const float *ima
     if (refused(observation, image, action)) {
         return;
     }
-    /* Every other step begins with what the one before ended with, and goes through each layer the
-     * other way round: what was used last still lies in the processor's cache, which may be a
-     * little too small for all weights. The sums are the same. */
+    /* Every second step uses the weights in the opposite order, and so begins with those that the
+     * step before used last. They are still in the processor's cache, which may be slightly too
+     * small for all weights. The result is the same. */
     state->odd = !state->odd;
     if (state->odd) {
-        remember(state);
+        gates_from_hidden(state);
     }
     pool(second, image);
     first_layer(first, second);
     convolve(second, first, conv2_weight, ROWS1, COLUMNS1, CHANNELS1, CHANNELS2);
     convolve(first, second, conv3_weight, ROWS2, COLUMNS2, CHANNELS2, CHANNELS3);
-    felt(embedding, observation);
+    embed_state(embedding, observation);
     dense(embedding, first, image_weight, FEATURES, PADDED, state->odd);
     activate(embedding);
     for (int j = 0; j < GATES; j++) {
@@ -163,7 +163,7 @@ void policy_step(policy_state *state, const float *observation, const float *ima
     }
     dense(from_input, embedding, gru_input_weight, PADDED, GATES, state->odd);
     if (!state->odd) {
-        remember(state);
+        gates_from_hidden(state);
     }
     gru(state->hidden, from_input, state->gates);
     act(action, state->hidden);

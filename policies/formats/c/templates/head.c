@@ -18,8 +18,8 @@ enum {
     FEATURES = ROWS3 * COLUMNS3 * CHANNELS3,
     INPUTS = POLICY_STATE_SIZE,
     HIDDEN = $HIDDEN_SIZE, /* units */
-    PADDED = $PADDED,      /* of a layer of HIDDEN units, a multiple of BLOCK; the rest is zero */
-    GATES = $GATES,        /* of a layer of 3 HIDDEN units, likewise */
-    BLOCK = 32             /* outputs whose weights lie side by side, input after input */
+    PADDED = $PADDED,      /* HIDDEN padded with zeros to a multiple of BLOCK */
+    GATES = $GATES,        /* 3 HIDDEN padded in the same way */
+    BLOCK = 32             /* outputs whose weights are neighbours in memory */
 };
 

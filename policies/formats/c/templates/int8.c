@@ -2,8 +2,9 @@
 typedef signed char byte;
 typedef char int_holds_the_sums[sizeof(int) >= 4 ? 1 : -1];
 
-/* sums[BLOCK] += x[inputs] times weights; inputs is even. Two products of bytes, the weights from
- * -127 on, fit into 16 bits, which processors multiply many of at a time; x is held so, too. */
+/* sums[BLOCK] += x[inputs] times weights; inputs is even. The sum of two products of bytes fits
+ * into 16 bits, since weights are at least -127. Processors compute many such products at once, so
+ * x has 16 bits as well. */
 static void products(int *restrict sums, const short *restrict x, const byte *restrict weights,
                      int inputs)
 {
@@ -16,7 +17,7 @@ static void products(int *restrict sums, const short *restrict x, const byte *re
     }
 }
 
-/* Numbers in units of 1 / inverse from -128 to 127, where `zero` stands for 0. */
+/* Rounds x * inverse + zero to whole numbers from -128 to 127; `zero` represents 0. */
 static void to_bytes(short *restrict out, const float *restrict x, float inverse, int zero, int n)
 {
     for (int i = 0; i < n; i++) {
@@ -26,7 +27,7 @@ static void to_bytes(short *restrict out, const float *restrict x, float inverse
     }
 }
 
-/* out[outputs] += x[inputs] times weights, in units of scale, the bytes' zero taken off. */
+/* out[outputs] += x[inputs] times weights, times scale; `offset` cancels the zero of x. */
 static void dense(float *restrict out, const short *restrict x, const byte *restrict weights,
                   const float *restrict scale, const float *restrict offset, int inputs,
                   int outputs)
@@ -40,7 +41,7 @@ static void dense(float *restrict out, const short *restrict x, const byte *rest
     }
 }
 
-/* 3 x 3 pixels of `inputs` channels to `outputs`, no padding. */
+/* Maps 3 x 3 pixels of `inputs` channels to `outputs` channels, without padding. */
 static void convolve(float *restrict out, const short *restrict x, const byte *restrict weights,
                      const float *restrict scale, const float *restrict offset, int rows,
                      int columns, int inputs, int outputs)
@@ -80,7 +81,7 @@ void policy_step(policy_state *state, const float *observation, const float *ima
     convolve(first, bytes, conv3_weight, conv3_scale, conv3_offset, ROWS2, COLUMNS2, CHANNELS2,
              CHANNELS3);
     to_bytes(bytes, first, IMAGE_INVERSE, IMAGE_ZERO, FEATURES);
-    felt(embedding, observation);
+    embed_state(embedding, observation);
     dense(embedding, bytes, image_weight, image_scale, image_offset, FEATURES, PADDED);
     activate(embedding);
     for (int j = 0; j < GATES; j++) {

@@ -1,4 +1,4 @@
-/* What diffracing-suite calls in a policy.c that it compiled; any with the same door will do. */
+/* Functions by which diffracing-suite calls a compiled policy.c, also one that it did not write. */
 #include <stddef.h>
 
 #include "policy.h"

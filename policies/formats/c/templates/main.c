@@ -1,4 +1,4 @@
-/* Checks policy.c on this machine against the answers it was exported with. Exit 0: they agree. */
+/* Compares the actions of policy.c on this machine with those of its export. Exit 0: they agree. */
 #include <stdio.h>
 
 #include "policy.h"
@@ -14,11 +14,11 @@ int main(void)
         policy_step(&state, observations[k], images[k], action);
         for (int j = 0; j < POLICY_ACTION_SIZE; j++) {
             const float error = action[j] - actions[k][j], size = error < 0.0f ? -error : error;
-            wrong += !(size <= TOLERANCE); /* a NaN is wrong, too */
+            wrong += !(size <= TOLERANCE); /* also for NaN */
             worst = size > worst ? size : worst;
         }
     }
-    printf("%d steps, %d numbers wrong, largest error %g m/s^2, allowed %g\n", VECTORS, wrong,
+    printf("%d steps, %d numbers wrong, largest error %g, allowed %g\n", VECTORS, wrong,
            (double)worst, (double)TOLERANCE);
     return wrong != 0;
 }

@@ -1,6 +1,7 @@
 """The exported C: what it looks like, that it compiles without a word, and what it answers."""
 
 import errno
+import shlex
 import shutil
 import subprocess
 from dataclasses import replace
@@ -177,8 +178,16 @@ def test_what_is_not_trusted_or_compiled_is_said_in_plain_words(exports, tmp_pat
         load_policy(exports["odd"].folder / "policy.c")
     folder = shutil.copytree(exports["odd"].folder, tmp_path / "copy")
     (folder / "policy.c").write_text('#include "policy.h"\nvoid policy_reset(policy_state *s) {')
-    with pytest.raises(PolicyError, match="refuses it"):
-        load_c(folder, trust=True)
+    old = tmp_path / "old"  # a compiler without -march=native
+    old.write_text('#!/bin/sh\ncase "$*" in *native*) echo "error: native" >&2; exit 1;; esac\n'
+                   f'exec {shlex.join(find_compiler())} "$@"\n')  # fmt: skip
+    old.chmod(0o700)
+    for command in (None, str(old)):
+        if command:
+            monkeypatch.setenv("CC", command)
+        with pytest.raises(PolicyError, match="refuses it .*error: expected"):
+            load_c(folder, trust=True)
+    monkeypatch.undo()
     (folder / "policy.h").unlink()
     with pytest.raises(PolicyError, match="policy.h: missing"):
         load_c(folder, trust=True)
