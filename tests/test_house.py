@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from tests.support.tools import program
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("tracks", "policies", "eval", "suite")
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
@@ -31,3 +33,12 @@ def test_a_packages_root_is_seen_at_one_glance():
     for package in PACKAGES:
         entries = [path.name for path in (ROOT / package).iterdir() if path.name not in hidden]
         assert len(entries) <= ENTRIES_MOST, (package, entries)
+
+
+def test_every_fault_to_plant_has_its_text_in_the_code_and_its_tests():
+    tool = program(ROOT / "tools" / "plant_faults.py")
+    folders = [ROOT / name for name in (*PACKAGES, "tests")]
+    files = [path for folder in folders for path in folder.rglob("*.*") if path.is_file()]
+    names = [path.relative_to(ROOT).as_posix() for path in files]
+    for fault in tool.FAULTS:
+        assert tool.place_of(fault, names, ROOT).is_file() and tool.tests_of(fault, names)

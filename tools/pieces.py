@@ -190,12 +190,12 @@ def costs(count: int, args: argparse.Namespace) -> None:
           f"{with_flight / MB:.3f} MB with its flight")  # fmt: skip
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        config = with_iterations(named_recipe("race"), 10)
-        train(config, folder / "run", Silent())
-        clock.say("a training of race: start and 10 of 2,000 iterations")
+        recipe = named_recipe("race-paper")
+        train(with_iterations(recipe, 10), folder / "run", Silent())
+        clock.say(f"a training, point mass: start, 10 of {recipe.optimizer.iterations} iterations")
         sizes = [path.stat().st_size for path in (folder / "run").rglob("*") if path.is_file()]
         print(f"  {sum(sizes) / MB:.1f} MB received")
-        train(with_iterations(named_recipe("race"), 30), folder / "longer", Silent())
+        train(with_iterations(recipe, 30), folder / "longer", Silent())
         clock.say("the same with 30 iterations")
         case = next(iter(DRAWERS["mujoco"](0, 12).values()))
         built = build(case)

@@ -50,8 +50,8 @@ FAULTS = (
           "test_geometry"),
     Fault("tracks", "fraction = -before[..., 0] /", "fraction = before[..., 0] /", "test_geometry"),
     Fault(
-        "tracks", "2 * (x * y - w * z), 2 * (x * z + w * y)",
-        "2 * (x * y + w * z), 2 * (x * z + w * y)", "test_geometry",
+        "tracks", "2 * (xy - wz), 2 * (xz + wy)",
+        "2 * (xy + wz), 2 * (xz + wy)", "test_geometry",
     ),
     Fault(
         "tracks", "half_u * (1 - (2 * np.arange(camera.width) + 1) /",

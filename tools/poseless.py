@@ -122,12 +122,12 @@ def errors(truth: Any, effect: dict[str, Any]) -> Iterator[float]:
     `truth` has the true values, `effect` is the entry of the diagnosis.
     """
     parameters = effect["parameters"]
-    rotor = parameters.get("index", {}).get("value")
+    rotors = parameters.get("index", {}).get("value")  # a number, or a list of several
     for key, entry in parameters.items():
         if key == "index" or entry["ci95"] is None:
             continue
         true = np.atleast_1d(getattr(truth, key))
-        true = true[[int(rotor) - 1]] if rotor is not None else true
+        true = true if rotors is None else true[np.atleast_1d(rotors).astype(int) - 1]
         intervals = entry["ci95"] if isinstance(entry["value"], list) else [entry["ci95"]]
         for value, interval in zip(true, intervals, strict=False):
             if interval is not None and None not in interval and interval[1] > interval[0]:

@@ -126,9 +126,10 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
 
 
 def select_sensor_sets(only: Sequence[str]) -> tuple[dict[str, SensorSet], dict[str, SensorSet]]:
-    """Return the presets, and the single sensor models at their usual size.
+    """Return the presets, and single sensor models at their usual size.
 
-    With names in `only`, both parts have these entries alone.
+    The models are those of the presets `all` and `tof-depth`, without the inertial sensor. With
+    names in `only`, both parts have these entries alone.
 
     Raises:
         ValueError: for an unknown name.

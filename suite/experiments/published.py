@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,10 +52,11 @@ def page_states(folder: Path) -> dict[str, dict[str, Any]]:
             states[name] = {"commit": "", "newer": None}
             continue
         page = json.loads(path.read_text(encoding="utf-8"))
-        flown = re.findall(r"([\w-]+), SHA-256 ([0-9a-f]{16})", json.dumps(page["made_by"]))
-        # Other policies than the shipped ones stand for themselves: nothing can be newer.
-        digests = [(policy, digest) for policy, digest in flown if policy in shipped.names()]
-        newer = ["policy"] if any(policy_digest(p)[:16] != digest for p, digest in digests) else []
+        # A policy's fact is its source and digest. Other policies than the shipped ones stand for
+        # themselves: nothing can be newer.
+        facts = [text.partition(", SHA-256 ") for text in page["made_by"].values()]
+        flown = [(policy, sha) for policy, _, sha in facts if sha and policy in shipped.names()]
+        newer = ["policy"] if any(policy_digest(p)[:16] != sha for p, sha in flown) else []
         newer += ["code"] if page.get("code_sha256") != page_code(name) else []
         states[name] = {"commit": page["git_commit"] or "", "newer": newer}
     return states

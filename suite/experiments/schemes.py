@@ -39,8 +39,9 @@ trials first reaches each of them."""
 class Config(options.FourGateOptions):
     """Train by PPO, by our method, and by ours without the field, and measure them as they learn.
 
-    All three share policy, dynamics, worlds and the number of environment steps. A training is
-    reused if its configuration and its measurements have the same hash.
+    All three share policy, dynamics, worlds and, without --ppo-iterations, the number of
+    environment steps. A training is reused if its configuration and its measurements have the same
+    hash.
     """
 
     progress: Annotated[float, Range(0.0, 1e6)] = 0.4

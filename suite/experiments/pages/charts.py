@@ -167,7 +167,8 @@ def bars_chart(
 def curves_chart(rows: Sequence[Summary], names: Sequence[str]) -> bytes:
     """Return a chart of measures over steps (above) and over time (below), a column per measure.
 
-    A line is the mean over the training seeds of a scheme, a band the range from least to most.
+    A line is the mean over the training seeds of a scheme, a band the range from least to most,
+    both without diverged trainings.
     """
     figure = Figure(figsize=(12.5, 5.6), layout="constrained")
     upper, lower = figure.subplots(2, len(names), sharey="col")
@@ -180,9 +181,8 @@ def curves_chart(rows: Sequence[Summary], names: Sequence[str]) -> bytes:
                 x = [point[key].mean / divisor for point in row.at]
                 mean, least, most = scale * np.array([point[name] for point in row.at]).T
                 axes.fill_between(x, least, most, color=colour, alpha=0.15, lw=0)
-                axes.plot(
-                    x, mean, "o-", ms=3, color=colour, label=f"{row.label}, {row.seeds} seeds"
-                )
+                text = f"{row.label}, {len(row.trainings)} seeds"
+                axes.plot(x, mean, "o-", ms=3, color=colour, label=text)
             axes.set_xlabel(label, fontsize=9)
             titled(axes, METRICS[name].heading)
         if scale == 100:
