@@ -233,6 +233,7 @@ def test_a_run_whose_files_have_changed_is_not_flown_again(
     files = {"policy": Path(pilots["diver"])}
     files["vehicle"] = Path(shutil.copy(root / "eval/vehicles/racer5.toml", tmp_path))
     files["track"] = shutil.copytree(root / "tracks/examples", tmp_path / "tracks") / "yard.toml"
+    files["sensors"] = Path(shutil.copy(root / "eval/sensors/presets/vio.toml", tmp_path))
     flown = [text for name, file in files.items() for text in (f"--{name}", file)]
     out, again = tmp_path / "out", ("view --out", tmp_path / "seen", tmp_path / "out")
     assert evaluate(out, "--trials 1 --time-limit-s 0.5", *flown) == 0
@@ -252,6 +253,8 @@ def test_a_run_whose_files_have_changed_is_not_flown_again(
         assert f"{what} {files[what]}: has changed since these trials were judged" in said
         assert "restore the judged version" in said
         files[what].write_text(old)
+    files["sensors"].write_text('name = "vio"\n')  # without any model
+    assert f"sensors {files['sensors']}: has changed" in refused(capsys, *again)
 
 
 def test_a_run_is_held_to_its_policy(pilots, tmp_path, capsys):
