@@ -183,7 +183,7 @@ def test_trials_that_are_not_asked_for_again_are_kept_and_said(pilots, tmp_path,
 ONE = "--track zigzag --trials 1 --policy"
 
 
-def test_view_flies_the_chosen_trials_again(pilots, tmp_path, capfd):
+def test_view_flies_the_chosen_trials_again(pilots, tmp_path, monkeypatch, capfd):
     out, seen = tmp_path / "out", tmp_path / "seen"
     assert evaluate(out, "--track ellipse --trials 2 --seed 2 --policy", pilots["diver"]) == 0
     again = ("view --out", seen, out)
@@ -196,6 +196,10 @@ def test_view_flies_the_chosen_trials_again(pilots, tmp_path, capfd):
     # A finished evaluation keeps trials of an earlier command in a journal.
     (out / "journal-0.jsonl").write_text("{}\n")
     assert run(*again, *"--count 1".split()) == 0
+    assert "was judged as" not in capfd.readouterr().err
+    cut_short(monkeypatch, seconds=0.1)  # as a machine on which the trial ends otherwise
+    assert run(*again, *"--count 1".split()) == 0
+    assert "ellipse-0-2 was judged as collision after" in capfd.readouterr().err
 
 
 @pytest.mark.slow
