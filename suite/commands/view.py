@@ -16,7 +16,7 @@ from tracks.input.ranges import Range, Seed
 
 if TYPE_CHECKING:
     from eval.view.recording import Rollout
-    from eval.worlds.trial import TrialSpec
+    from eval.worlds.trial import TrialResult, TrialSpec
     from suite.judging.requests import Evaluation
 
 
@@ -60,7 +60,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """Fly the chosen trials again and write the files."""
     recording = config.out / "trials.rrd"
     check_place(recording)
-    evaluation, trials, digests, label = _choose_trials(config, console)
+    evaluation, trials, digests, label, judged = _choose_trials(config, console)
     from eval.view.picture import write_picture
     from eval.view.recording import write_recording
     from suite.judging.replay import fly_again
@@ -79,6 +79,12 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             f"{_name(rollout)}: {result.gates_passed} gates, {result.ended_by}{collision} after "
             f"{result.time_s:.1f} s"
         )
+        before = judged.get(result.trial, result)
+        if (before.ended_by, before.time_s) != (result.ended_by, result.time_s):
+            console.note(
+                f"warning: {_name(rollout)} was judged as {before.ended_by} after "
+                f"{before.time_s:.1f} s; this machine or version flies it otherwise"
+            )
     for ending, is_requested in ((".mp4", config.video), (".gif", config.gif)):
         if is_requested:
             name = f"{_name(rollouts[0])}{ending}"
@@ -107,10 +113,10 @@ def _name(rollout: Rollout) -> str:
 
 def _choose_trials(
     config: Config, console: Console
-) -> tuple[Evaluation, list[TrialSpec], dict[str, str] | None, str]:
-    """Return the evaluation of one policy, the chosen trials, the inputs' SHA-256 and the label.
+) -> tuple[Evaluation, list[TrialSpec], dict[str, str] | None, str, dict[TrialSpec, TrialResult]]:
+    """Return the evaluation of one policy, the trials, the inputs' SHA-256, the label and results.
 
-    The SHA-256 is None if RUN is a policy: there is no evaluation to compare the inputs with.
+    The SHA-256 is None, and there are no results, if RUN is a policy: nothing was judged.
     """
     from policies.shipped import locate, names
     from suite.judging.flying import default_policy, manners
@@ -140,7 +146,7 @@ def _choose_trials(
             trust=config.trust,
             speed=() if config.speed is None else (config.speed,),
         )
-        return evaluation, first_trials(evaluation)[: config.count], None, config.run
+        return evaluation, first_trials(evaluation)[: config.count], None, config.run, {}
     from eval.judging.results import read_trials
 
     reason = f"{folder} is a run, whose trials are flown again unchanged"
@@ -169,5 +175,6 @@ def _choose_trials(
         policies=(sources[number],),
         speed=() if manner.speed is None else (manner.speed,),
     )
-    trials = [result.trial for result in results if result.policy == label]
-    return evaluation, trials[: config.count], read_digests(folder, number), label
+    judged = {result.trial: result for result in results if result.policy == label}
+    trials = list(judged)[: config.count]
+    return evaluation, trials, read_digests(folder, number), label, judged

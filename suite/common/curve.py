@@ -72,14 +72,15 @@ def read(folder: Path, name: str = CURVE) -> list[dict[str, Any]]:
     for number, line in enumerate(lines, start=1):
         try:
             row = json.loads(line)
-        except ValueError:
+            iteration = row["iteration"]
+        except (ValueError, KeyError, TypeError):
             if number == len(lines):
                 break
             raise ValueError(
                 f"{path}: line {number} is damaged; restore the file, or move it away: the "
                 "training continues without its earlier curve"
             ) from None
-        if not rows or row["iteration"] > rows[-1]["iteration"]:
+        if not rows or iteration > rows[-1]["iteration"]:
             rows.append(row)
     return rows
 

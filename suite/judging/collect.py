@@ -160,6 +160,8 @@ def _fly_missing(
             name = None
             if flight is not None and result.time_s >= DURATION_MIN:
                 name = _write_log(out, result, flight, trial_set.vehicle, console)
+            if name is None:  # a log of an earlier collection may have this name
+                _log_path(out, result.trial).unlink(missing_ok=True)
             rows[result.trial] = {"file": name, **result._asdict()}
             journal.append(result)
             update(len(rows), result.ended_by)
@@ -173,10 +175,16 @@ def _row(out: Path, result: TrialResult) -> Row | None:
     """Return the row of a flight in the journal; None if its log is missing, to fly it again."""
     name = None
     if result.time_s >= DURATION_MIN:
-        name = log_name(result.track, result.difficulty, result.seed)
-        if not (out / name).is_file():
+        path = _log_path(out, result.trial)
+        if not path.is_file():
             return None
+        name = path.name
     return {"file": name, **result._asdict()}
+
+
+def _log_path(out: Path, trial: TrialSpec) -> Path:
+    """Return the path of a trial's log."""
+    return out / log_name(*trial)
 
 
 def _write_log(
@@ -186,19 +194,19 @@ def _write_log(
 
     It is None, with a warning, if the log is refused.
     """
-    name = log_name(result.track, result.difficulty, result.seed)
+    path = _log_path(out, result.trial)
     logged = flight._replace(**apply_log_faults(vehicle.effects, flight._asdict()))
     try:
-        write_flight(out / name, log_from_flight(logged, name))
+        write_flight(path, log_from_flight(logged, path.name))
     except FlightLogError as error:
         console.note(f"warning: no log of this flight: {error}")
         return None
-    return name
+    return path.name
 
 
 def _refuse_other_logs(out: Path, trial_set: TrialSet) -> None:
     """Refuse a folder with logs of other commands: a diagnosis would mix them with these."""
-    names = {log_name(t.track, t.difficulty, t.seed) for t in trial_set.trials}
+    names = {log_name(*trial) for trial in trial_set.trials}
     if others := [log.name for log in logs_in(out) if log.name not in names]:
         raise ValueError(
             f"{out} holds other flight logs ({others[0]} and so on), which suite diagnose would "

@@ -133,8 +133,8 @@ def _refuse_changed(
 
     All arguments are by input: path or name, SHA-256 now, and SHA-256 in the evaluation.
     """
-    for item, digest in digests.items():
-        if judged.get(item, digest) != digest:
+    for item in dict.fromkeys([*digests, *judged]):  # perfect sensors have no digest
+        if digests.get(item) != judged.get(item):
             label = f"{item} {sources[item]}" if item in sources else item
             raise ValueError(
                 f"{label}: has changed since these trials were judged, so the flights would "

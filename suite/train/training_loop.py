@@ -143,12 +143,14 @@ def train_in_folder(
             f"{folder} holds this training, finished: nothing is trained; to train its policy "
             f"further, give another --out with --init-from {folder / 'policy'}"
         )
+        if not (folder / "policy").exists():  # it was moved: the state has the same weights
+            _save(run, _last_phase(phases, done), state)
     # The outcome, from the last tenth of the curve.
     rows = curve.read(folder)
-    if not rows:
+    if not rows or rows[-1]["iteration"] + 1 < total:
         raise ValueError(
-            f"{folder} holds a finished training without its curve, metrics.jsonl: put that back, "
-            f"use {folder / 'policy'} as it is, or give another --out"
+            f"{folder} holds a finished training without the end of its curve, metrics.jsonl: put "
+            f"that back, use {folder / 'policy'} as it is, or give another --out"
         )
     last = rows[-max(1, len(rows) // 10) :]
     means = {key: float(np.mean([row[key] for row in last])) for key in last[0]}
@@ -166,7 +168,7 @@ def _iterate(
         WorldsAhead() as ahead,
     ):
         # Something to save if the run is interrupted before the first iteration ends.
-        recorder.last = (next(phase for phase in phases if first <= phase.end), state)
+        recorder.last = (_last_phase(phases, first), state)
         if _is_missing(watch, run.folder, first, total):
             recorder.measure_if_due(state)
         for phase in phases:
@@ -178,6 +180,11 @@ def _iterate(
                 state = _iterate_phase(phase, state, recorder, show, ahead)
             beginning = phase.end
     return state
+
+
+def _last_phase(phases: Sequence[RunPhase], done: int) -> RunPhase:
+    """Return the phase of the last of `done` iterations."""
+    return next(phase for phase in phases if done <= phase.end)
 
 
 def _iterate_phase(

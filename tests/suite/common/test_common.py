@@ -128,7 +128,11 @@ def test_a_cut_last_line_of_a_curve_is_left_out_and_another_damage_is_refused(tm
     path = tmp_path / curve.CURVE
     path.write_text(path.read_text() + '{"iterat')
     assert curve.read(tmp_path) == rows
-    path.write_text(path.read_text().replace('"iteration": 1}', "garbage"))
+    text = path.read_text()
+    path.write_text(text.replace('"iteration": 1}', '"loss": 1}'))
+    with pytest.raises(ValueError, match=r"metrics\.jsonl: line 2 is damaged"):
+        curve.read(tmp_path)
+    path.write_text(text.replace('"iteration": 1}', "garbage"))
     with pytest.raises(ValueError, match=r"metrics\.jsonl: line 2 is damaged"):
         curve.read(tmp_path)
 

@@ -169,9 +169,12 @@ def test_a_flight_whose_log_is_refused_does_not_stop_the_others(
         return log
 
     monkeypatch.setattr("suite.judging.collect.log_from_flight", broken)
+    log = tmp_path / "zigzag-0-7.parquet"
+    log.write_text("of an earlier collection, whose list was moved away")
     assert run(TWO, "--policy", pilots["pursuit"], "--out", tmp_path) == 0
     flights = json.loads((tmp_path / "flights.json").read_text())["flights"]
     assert [row["file"] for row in flights] == [None, "zigzag-0-8.parquet"]
+    assert not log.exists(), "a diagnosis of the folder would use it"
     said = capfd.readouterr()
     assert "zigzag-0-7.parquet: column rate_x, row 5: 300" in said.err
     assert "1 without a log, 0 of them under 1 s" in said.out

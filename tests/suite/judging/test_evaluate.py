@@ -183,7 +183,7 @@ def test_trials_that_are_not_asked_for_again_are_kept_and_said(pilots, tmp_path,
 ONE = "--track zigzag --trials 1 --policy"
 
 
-def test_view_flies_the_chosen_trials_again(pilots, tmp_path, capfd):
+def test_view_flies_the_chosen_trials_again(pilots, tmp_path, monkeypatch, capfd):
     out, seen = tmp_path / "out", tmp_path / "seen"
     assert evaluate(out, "--track ellipse --trials 2 --seed 2 --policy", pilots["diver"]) == 0
     again = ("view --out", seen, out)
@@ -196,6 +196,10 @@ def test_view_flies_the_chosen_trials_again(pilots, tmp_path, capfd):
     # A finished evaluation keeps trials of an earlier command in a journal.
     (out / "journal-0.jsonl").write_text("{}\n")
     assert run(*again, *"--count 1".split()) == 0
+    assert "was judged as" not in capfd.readouterr().err
+    cut_short(monkeypatch, seconds=0.1)  # as a machine on which the trial ends otherwise
+    assert run(*again, *"--count 1".split()) == 0
+    assert "ellipse-0-2 was judged as collision after" in capfd.readouterr().err
 
 
 @pytest.mark.slow
@@ -233,6 +237,7 @@ def test_a_run_whose_files_have_changed_is_not_flown_again(
     files = {"policy": Path(pilots["diver"])}
     files["vehicle"] = Path(shutil.copy(root / "eval/vehicles/racer5.toml", tmp_path))
     files["track"] = shutil.copytree(root / "tracks/examples", tmp_path / "tracks") / "yard.toml"
+    files["sensors"] = Path(shutil.copy(root / "eval/sensors/presets/vio.toml", tmp_path))
     flown = [text for name, file in files.items() for text in (f"--{name}", file)]
     out, again = tmp_path / "out", ("view --out", tmp_path / "seen", tmp_path / "out")
     assert evaluate(out, "--trials 1 --time-limit-s 0.5", *flown) == 0
@@ -252,6 +257,8 @@ def test_a_run_whose_files_have_changed_is_not_flown_again(
         assert f"{what} {files[what]}: has changed since these trials were judged" in said
         assert "restore the judged version" in said
         files[what].write_text(old)
+    files["sensors"].write_text('name = "vio"\n')  # without any model
+    assert f"sensors {files['sensors']}: has changed" in refused(capsys, *again)
 
 
 def test_a_run_is_held_to_its_policy(pilots, tmp_path, capsys):

@@ -75,9 +75,14 @@ def test_the_outcome_is_of_the_last_tenth_and_the_policy_is_measured_on_the_way(
     train(tmp_path, counting(20), seen=seen)
     assert len(seen) == 6, "a finished run is neither trained nor measured again"
     assert "finished: nothing is trained" in capfd.readouterr().err
-    (tmp_path / "metrics.jsonl").unlink()
-    with pytest.raises(ValueError, match=r"without its curve, metrics\.jsonl: put that back, use"):
-        train(tmp_path, counting(20))
+    (tmp_path / "policy").rename(tmp_path / "moved")
+    train(tmp_path, counting(20))
+    assert load_policy_checkpoint(tmp_path / "policy").spec == SPEC
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines(keepends=True)
+    for kept in (lines[:19], []):  # means over its last rows would not be of the end
+        (tmp_path / "metrics.jsonl").write_text("".join(kept))
+        with pytest.raises(ValueError, match=r"without the end of its curve, metrics\.jsonl: put"):
+            train(tmp_path, counting(20))
 
 
 def test_a_stopped_run_goes_on_with_its_curve_and_its_measurements(tmp_path):
