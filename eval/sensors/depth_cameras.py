@@ -16,6 +16,9 @@ NEAREST_M = 1e-3
 """Smallest depth that is inverted [m]."""
 EDGE = 1.25
 """Ratio of neighbouring depths above which there is an edge."""
+EMPTY = 1.0 - 1e-5
+"""Share of the range from which a depth counts as nothing within the range. It is a little below 1,
+because `image_motion` rounds a depth at the range."""
 
 
 class Stereo(NamedTuple):
@@ -62,7 +65,7 @@ def stereo_sense(values: Stereo, memory: Array, seen: View, moment: Moment) -> t
     missed = thin & (chance[..., 2, :, :] < over_image(values.thin_holes))
     matched_m = xp.where(smeared, nearer, xp.where(missed, further, depth_m))
     measured_m = in_disparity(values, memory, matched_m, grain[..., 0, :, :], moment.camera)
-    no_depth = hole | (matched_m < over_image(values.near)) | (matched_m >= range_m)
+    no_depth = hole | (matched_m < over_image(values.near)) | (matched_m >= EMPTY * range_m)
     measured_m = xp.where(no_depth, range_m, measured_m)
     return seen._replace(depth_m=measured_m), memory
 
@@ -104,7 +107,7 @@ STEREO = Sensor(
     stage="depth",
     summary="Depth by stereo: noise and steps of disparity, holes, smearing, limits of the range",
     equation="d = f b / z + n + o, in steps; z = f b / d; the range where d < least or z < near, "
-    "and in holes",
+    "in holes, and where nothing is within it",
     source="Grunnet-Jepsen et al., tuning guide of RealSense D400: 0.08 pixel RMS, steps of 1/32, "
     "D435 at 848 x 480: f = 424, b = 0.05 m, nearest 0.17 m; shares at edges are our estimate",
     values=Stereo,
@@ -171,7 +174,7 @@ def tof_sense(
     wrapped = chance[..., 2, :, :] < over_image(values.wrapped)
     wrapped_m = measured_m - half_wave_m * xp.floor(measured_m / half_wave_m)
     measured_m = xp.where(wrapped, wrapped_m, measured_m)
-    measured_m = xp.where((depth_m >= range_m) & ~mixed, range_m, measured_m)
+    measured_m = xp.where((depth_m >= EMPTY * range_m) & ~mixed, range_m, measured_m)
     return seen._replace(depth_m=measured_m.clip(NEAREST_M, range_m)), memory
 
 

@@ -13,45 +13,12 @@ from eval import sensors
 from eval.effects.interface import as_arrays
 from eval.sensors import SENSORS, view_models
 from eval.sensors.gate_map import GATES
-from eval.sensors.interface import Draws, Inertial, Moment, blank_draws, markov_step
+from eval.sensors.interface import Draws, Inertial, Moment, markov_step
 from eval.sensors.sensors_file import load_sensors, sensor_set
 from policies.observation import View
-from tracks.geometry.camera import Camera
+from tests.support.sensor_views import ALONG, CAMERA, DT_S, draws_of, seen_through, view
 
-CAMERA = Camera(pitch_deg=0.0, fov_deg=(90.0, 90.0), width=8, height=6)
-DT_S = 0.1
 SENSING = [name for name, sensor in SENSORS.items() if sensor.sense]
-LEVEL, ALONG = np.eye(3)[None], np.array([[1.0, 0.0, 0.0]])
-
-
-def view(pos=(0.0, 0.0, 0.0), rot=LEVEL, gate=(4.0, 0.0, 0.0), depth=4.0, number=0):
-    depth_m = np.broadcast_to(depth, (1, 6, 8)).astype(float)
-    places = (np.array([place], float) for place in (gate, (8.0, 2.0, 0.0)))
-    vel_w = np.array([[2.0, 0.0, 0.0]])
-    return View(
-        np.array([pos], float), rot, vel_w, *places, ALONG, ALONG, depth_m, np.array([number])
-    )
-
-
-def draws_of(needs, **numbers):
-    """Return draws of zeros (of chances: ones, by which nothing happens) but for `numbers`."""
-    blank = blank_draws(needs, 1, CAMERA)
-    blank.uniform[:], blank.chance[:] = 1.0, 1.0
-    for name, value in numbers.items():
-        getattr(blank, name)[:] = value
-    return blank
-
-
-def seen_through(name, values, views, trial=None, **numbers):
-    """Return what a model shows of views one after the other, with the same draws for each."""
-    models, sensor = view_models(sensor_set({name: values}).models), SENSORS[name]
-    first, each = draws_of(sensor.trial, **(trial or {})), draws_of(sensor.observation, **numbers)
-    memory = sensors.start(models, views[0], {name: first}, DT_S, CAMERA)
-    shown = []
-    for one in views:
-        seen, memory = sensors.sense(models, memory, one, {name: each}, DT_S, CAMERA)
-        shown.append(seen)
-    return shown
 
 
 def test_a_map_is_turned_and_stretched_about_the_start_and_shifted():
@@ -221,36 +188,6 @@ def test_the_wrong_gate_is_the_second():
     assert np.array_equal(shown.gate_w, view().second_w)
     shown = seen_through("wrong_gate", {"share": 0.5}, [view()], uniform=1.0)[0]
     assert np.array_equal(shown.gate_w, view().gate_w)
-
-
-STEREO = {"focal": 400.0, "baseline": 0.05}
-RANGES, EDGES = np.array([1.0, 2.0, 4.0, 8.0] * 2), np.array([6.0, 6, 6, 3, 6, 6, 2, 2])
-STEPS = np.array([6.0, 6.0, 3.0, 3.0, 6.0, 6.0, 10.0, 10.0])
-WRAP = 299_792_458.0 / 75e6 * (STEPS == 6.0)
-"""Half a wavelength of 37.5 MHz, nearly 4 m."""
-DEPTHS = [
-    ("stereo", STEREO | {"noise": 0.1, "offset": 0.2}, {"grain": 2.0}, RANGES,
-     20.0 / (20.0 / RANGES + 0.4)),
-    # Disparities of 20, 10, 5 and 2.5 become 21, 9, 6 and 3, and what is too near is a hole.
-    ("stereo", STEREO | {"step": 3.0, "near": 1.5}, {}, RANGES, [10.0, 20 / 9, 20 / 6, 20 / 3] * 2),
-    ("stereo", STEREO | {"noise": 0.1, "least": 4.0}, {}, RANGES, [1.0, 2.0, 4.0, 10.0] * 2),
-    ("stereo", STEREO | {"noise": 0.1}, {"grain": 1.0}, STEPS + 4.0 * (STEPS == 6.0),
-     [10.0, 10, 20 / (20 / 3 + 0.1), 20 / (20 / 3 + 0.1), 10, 10, 10, 10]),
-    ("stereo", STEREO | {"edge_holes": 1.0}, {"chance": 0.5}, EDGES, [6, 6, 10, 3, 10, 10, 2, 2]),
-    ("stereo", STEREO | {"thin_holes": 1.0}, {"chance": 0.5}, EDGES, [6, 6, 6, 6, 6, 6, 2, 2]),
-    ("stereo", STEREO | {"smear": 1.0}, {"chance": 0.5}, EDGES, [6, 6, 3, 3, 3, 2, 2, 2]),
-    ("tof", {"noise": 0.01, "bias": 0.02}, {"grain": 1.0}, STEPS, np.fmin(1.03 * STEPS, 10.0)),
-    ("tof", {"mixing": 1.0}, {"chance": 0.25}, STEPS, [6, 5.25, 3, 3, 5.25, 6, 9, 10]),
-    ("tof", {"wrapped": 1.0, "modulation": 37.5e6}, {"chance": 0.5}, STEPS, STEPS - WRAP),
-]  # fmt: skip
-"""Model, its values, draws, true depths [m] of a row of pixels and what is shown of them."""
-
-
-@pytest.mark.parametrize(("name", "values", "draws", "depth", "wanted"), DEPTHS)
-def test_depths_by_hand(name, values, draws, depth, wanted):
-    trial = {"normal": {"stereo": 1.0, "tof": -1.0}[name]}
-    (shown,) = seen_through(name, values, [view(depth=depth)], trial, **draws)
-    assert shown.depth_m[0, 3] == pytest.approx(np.array(wanted, float))
 
 
 def test_blind_and_lost_images():
