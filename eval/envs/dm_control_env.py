@@ -112,7 +112,8 @@ def load(
     check_type("track", track, (Track, NoneType), "a Track or None")
     check_type("vehicle", vehicle, (Vehicle, NoneType), "a Vehicle or None")
     check_type("spec", spec, (PolicySpec, NoneType), "a PolicySpec or None")
-    rules = check_rules(Rules() if rules is None else rules)
+    rules = Rules() if rules is None else rules
+    check_rules(rules)
     vehicle = vehicle or load_vehicle("reference")
     if track is not None:
         warn_of(course_notes(track.family, track, vehicle))

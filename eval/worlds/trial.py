@@ -117,16 +117,14 @@ class Rules:
     """A trial with a force [N] or torque [N m] on the body beyond this has diverged."""
 
 
-def check_rules(rules: object) -> Rules:
-    """Return `rules`.
+def check_rules(rules: Rules) -> None:
+    """Refuse rules of another type, or with a number outside its range.
 
     Raises:
-        ValueError: for another type, or a number outside its range.
+        ValueError: naming the field, its value and what is allowed.
     """
     check_type("rules", rules, (Rules,), "an eval.worlds.trial.Rules")
     check_ranges(rules, "rules.")
-    assert isinstance(rules, Rules)
-    return rules
 
 
 class Course(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import tyro
 
@@ -60,15 +60,16 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """Fly the chosen trials again and write the files."""
     recording = config.out / "trials.rrd"
     check_place(recording)
-    evaluation, trials, digests, label, judged = _choose_trials(config, console)
+    chosen = _choose_trials(config, console)
     from eval.view.picture import write_picture
     from eval.view.recording import write_recording
     from suite.judging.replay import fly_again
     from suite.judging.trials import refuse_equal_names
 
-    refuse_equal_names({trial.track for trial in trials})
-    console.note(f"flying {len(trials)} trial{'s' * (len(trials) != 1)} of {label} again")
-    rollouts, drone = fly_again(evaluation, trials, judged=digests)
+    refuse_equal_names({trial.track for trial in chosen.trials})
+    count = len(chosen.trials)
+    console.note(f"flying {count} trial{'s' * (count != 1)} of {chosen.label} again")
+    rollouts, drone = fly_again(chosen.evaluation, chosen.trials, judged=chosen.digests)
     write_recording(recording, rollouts, drone)
     written = [recording]
     for rollout in rollouts:
@@ -79,7 +80,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             f"{_name(rollout)}: {result.gates_passed} gates, {result.ended_by}{collision} after "
             f"{result.time_s:.1f} s"
         )
-        before = judged.get(result.trial, result)
+        before = chosen.judged.get(result.trial, result)
         if (before.ended_by, before.time_s) != (result.ended_by, result.time_s):
             console.note(
                 f"warning: {_name(rollout)} was judged as {before.ended_by} after "
@@ -111,13 +112,22 @@ def _name(rollout: Rollout) -> str:
     return f"{Path(result.track).stem}-{result.difficulty}-{result.seed}"
 
 
-def _choose_trials(
-    config: Config, console: Console
-) -> tuple[Evaluation, list[TrialSpec], dict[str, str] | None, str, dict[TrialSpec, TrialResult]]:
-    """Return the evaluation of one policy, the trials, the inputs' SHA-256, the label and results.
+class _Chosen(NamedTuple):
+    """The trials to fly again."""
 
-    The SHA-256 is None, and there are no results, if RUN is a policy: nothing was judged.
-    """
+    evaluation: Evaluation
+    """Its only policy flies them."""
+    label: str
+    """Name of the policy."""
+    trials: list[TrialSpec]
+    digests: dict[str, str] | None
+    """SHA-256 of the inputs of the evaluation; None if RUN is a policy."""
+    judged: dict[TrialSpec, TrialResult]
+    """Results of the evaluation; empty if RUN is a policy."""
+
+
+def _choose_trials(config: Config, console: Console) -> _Chosen:
+    """Return the trials that the options choose."""
     from policies.shipped import locate, names
     from suite.judging.flying import default_policy, manners
     from suite.judging.replay import first_trials, read_digests, read_evaluation
@@ -146,7 +156,8 @@ def _choose_trials(
             trust=config.trust,
             speed=() if config.speed is None else (config.speed,),
         )
-        return evaluation, first_trials(evaluation)[: config.count], None, config.run, {}
+        trials = first_trials(evaluation)[: config.count]
+        return _Chosen(evaluation, config.run, trials, None, {})
     from eval.judging.results import read_trials
 
     reason = f"{folder} is a run, whose trials are flown again unchanged"
@@ -176,5 +187,5 @@ def _choose_trials(
         speed=() if manner.speed is None else (manner.speed,),
     )
     judged = {result.trial: result for result in results if result.policy == label}
-    trials = list(judged)[: config.count]
-    return evaluation, trials, read_digests(folder, number), label, judged
+    trials, digests = list(judged)[: config.count], read_digests(folder, number)
+    return _Chosen(evaluation, label, trials, digests, judged)

@@ -69,7 +69,6 @@ class Companion:
         self._limits = limits or Limits()
         self.action_kind = policy.spec.action.kind
         """The policy's kind of action, `acceleration` or `ctbr`."""
-
         self._gates = track.scene.gates
         points = np.vstack([self._gates.center_w, np.reshape(track.start_pos_w, (1, 3))])
         self._box = allowed_box(points, self._limits)
