@@ -125,7 +125,7 @@ class _Variograms(NamedTuple):
 def fit_colour(flights: Sequence[Series]) -> Coloured | None:
     """Fit size, autocorrelation and drift; None if the flights have less than two stretches."""
     step_s = max(flight.step_s for flight in flights)
-    lag_s = np.linspace(step_s, max(SHORT_S, step_s), SHORT_LAGS)
+    lag_s = _in_rows(np.linspace(step_s, max(SHORT_S, step_s), SHORT_LAGS), flights)
     variograms = _variograms(flights, lag_s, about_mean=True)
     if variograms is None:
         return None
@@ -227,7 +227,7 @@ def _drift(flights: Sequence[Series]) -> Interval:
     longest = LONGEST * min(flight.duration_s for flight in flights)
     if longest < 2.0 * LONG_S:
         return ZERO
-    lag_s = np.geomspace(LONG_S, longest, LONG_LAGS)
+    lag_s = _in_rows(np.geomspace(LONG_S, longest, LONG_LAGS), flights)
     variograms = _variograms(flights, lag_s)
     if variograms is None:
         return ZERO
@@ -245,6 +245,12 @@ def _drift(flights: Sequence[Series]) -> Interval:
     power, half = max(float(theta[1]), 0.0), float(half)
     high = max(power + half, power * np.exp(half / power) if half < power else 0.0)
     return Interval(*(float(v) for v in np.sqrt([power, max(power - half, 0.0), high])))
+
+
+def _in_rows(lag_s: np.ndarray, flights: Sequence[Series]) -> np.ndarray:
+    """Return `lag_s` (L,) [s] as whole rows of the slowest flight: no other lags are measured."""
+    step_s = max(flight.step_s for flight in flights)
+    return step_s * np.rint(lag_s / step_s)
 
 
 def _variograms(

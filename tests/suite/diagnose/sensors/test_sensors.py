@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from eval import sensors
 from eval.logs.flight_log import FlightLog, write_flight
@@ -196,6 +197,16 @@ def test_a_drift_and_the_noise_around_it_have_their_true_sizes(monkeypatch):
     fitted = found.noise.value, found.lasts_s.value, found.drift.value
     # At the shortest lag of the drift's fit, 2 s, exp(-10) of the noise is still correlated.
     assert fitted == pytest.approx((SD, LASTS_S, DRIFT), rel=1e-3)
+
+
+def test_the_correlation_time_of_slow_logs_has_no_bias():
+    step_s, lasts_s = 0.05, 0.1
+    decay, found = np.exp(-step_s / lasts_s), []
+    for seed in range(12):
+        drawn = np.random.default_rng(seed).standard_normal((3, 1200))
+        noise = lfilter([np.sqrt(1.0 - decay**2)], [1.0, -decay], drawn, axis=1)
+        found.append(fit_colour([Series(one, 0.0 * one, step_s) for one in noise]).lasts_s.value)
+    assert np.median(found) == pytest.approx(lasts_s, rel=0.05)
 
 
 def test_one_row_after_the_last_whole_stretch_is_left_out():
