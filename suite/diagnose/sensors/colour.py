@@ -123,7 +123,12 @@ class _Variograms(NamedTuple):
 
 
 def fit_colour(flights: Sequence[Series]) -> Coloured | None:
-    """Fit size, autocorrelation and drift; None if the flights have less than two stretches."""
+    """Fit size, autocorrelation and drift; None if the flights have less than two stretches.
+
+    Every flight has at least one error that is not missing.
+    """
+    if not flights:
+        return None
     step_s = max(flight.step_s for flight in flights)
     lag_s = _in_rows(np.linspace(step_s, max(SHORT_S, step_s), SHORT_LAGS), flights)
     variograms = _variograms(flights, lag_s, about_mean=True)
@@ -304,7 +309,6 @@ def _half_widths(slope: np.ndarray, residual: np.ndarray, flight: np.ndarray) ->
 
 def _bias(flights: Sequence[Series], variance: float, colour: Colour) -> Interval:
     """Return the standard deviation, over flights, of the mean error, without that by noise."""
-    flights = [flight for flight in flights if np.isfinite(flight.value).any()]
     means, count = np.array([np.nanmean(flight.value) for flight in flights]), len(flights)
     noise = variance * np.mean([colour.mean_variance(f.duration_s) for f in flights])
     power = float((means**2).mean())

@@ -125,6 +125,15 @@ def test_a_drift_and_a_tilt_by_neglected_drag_are_found_where_they_are():
     assert drag.high - drag.low < 0.05
 
 
+def test_a_flight_without_a_part_of_the_estimate_does_not_count_for_it():
+    whole, long = flights()[0], flights()[1]
+    half = {name: v for name, v in long.extra.items() if not name.startswith("est_vel")}
+    one, two = (fit_sensors(logs) for logs in ([whole], [whole, replace(long, extra=half)]))
+    assert one.systematic.delay_s.value == pytest.approx(two.systematic.delay_s.value, abs=0.005)
+    for axis in ("velocity_x", "velocity_y", "velocity_z"):
+        assert two.axes[axis].noise.value == pytest.approx(one.axes[axis].noise.value, rel=0.1)
+
+
 def test_a_wandering_clock_is_found_by_the_gyro_and_leaves_no_errors():
     log = flights()[0]
     assert not clock_of(log).shift_s.any()
