@@ -132,7 +132,8 @@ def test_an_effect_of_a_separate_test_leaves_no_unknown(monkeypatch, wind):
         def remaining(self, found, gaps, seed):
             return Remaining(True, 1.0, "the air's temperature")
 
-    lag = actuators.TestedEffect("motor_lag", EFFECTS["motor_lag"].values(0.05), {}, 0.9, 1e-4, "commands")
+    values = EFFECTS["motor_lag"].values(0.05)
+    lag = actuators.TestedEffect("motor_lag", values, {}, 0.9, 1e-4, "commands")
     given = replace(sources(wind, kind=LeftSource), tested=(lag,))
     monkeypatch.setitem(SOURCES, "air", lambda _: given)
     found = diagnosis_json(diagnose([], PLAIN, by="air"))
