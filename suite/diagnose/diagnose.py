@@ -113,10 +113,10 @@ def _diagnose(given: DiagnosisInput, by: Sequence[str], seed: int) -> Diagnosis:
         warnings.append(f"nearest in the catalogue, but most of the gap remains: {labels}")
         unique = tuple(without_names(one, seed) if one in wrong else one for one in unique)
         tested = tested_in(unique, flights)
-        if any(one.names for one in unique):
-            verdict = verdict._replace(label="partly")
-        else:
+        if not any(one.names for one in unique):
             verdict = verdict_on(unique, bool(tested), limits)
+    if verdict.label == "unknown" and (tested or any(one.names for one in unique)):
+        verdict = verdict._replace(label="partly")
     warnings += [
         f"implausible: {words}, over three times the usual size"
         for finding in unique

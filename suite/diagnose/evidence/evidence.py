@@ -21,8 +21,6 @@ from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
 from suite.diagnose.estimate.permutation import CandidateScore, permutation_test
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
-LEAST_ERROR = 1e-9
-"""Lower limit of a squared error in a denominator, in units of the noise variance."""
 LEAST_STEP = 0.1
 """Steps of a fit are halved down to this share."""
 
@@ -137,16 +135,15 @@ class Evidence(ABC):
         fold[order] = np.arange(len(order)) % self.limits.folds
         return fold
 
-    def explained_share(
+    def accepts(
         self, before: Block, after: Evaluation, candidate: Candidate, gains: np.ndarray
-    ) -> float | None:
-        """Return the share of the squared error that a candidate explains; None if rejected.
+    ) -> bool:
+        """Return whether a fitted candidate may be named, as far as this evidence shows.
 
         `before` is the block without the candidate. `gains` (G,) are the falls of the squared error
         of each group of stretches (see `validation_groups`), fitted to the other groups.
         """
-        chi2 = (after.block.residual**2).sum()
-        return 1.0 - float(chi2 / max((before.residual**2).sum(), LEAST_ERROR))
+        return True
 
     def preference(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
         """Return the sort key of candidates that fit about equally well; the smallest wins."""

@@ -102,13 +102,11 @@ class RolloutEvidence(Evidence):
         whitening = make_whitening(linear, noise, self.limits)
         return replace(self, noise=noise, whitening=whitening, misfit_is_noise=True)
 
-    def explained_share(
+    def accepts(
         self, before: Block, after: Evaluation, candidate: Candidate, gains: np.ndarray
-    ) -> float | None:
-        """Return the share of the error that a candidate explains; see `Evidence`."""
-        if self.misfit_is_noise and not flights_agree(gains):
-            return None
-        return super().explained_share(before, after, candidate, gains)
+    ) -> bool:
+        """Return whether a candidate may be named; see `Evidence`."""
+        return not self.misfit_is_noise or flights_agree(gains)
 
     def slow_errors(self, block: Block) -> tuple[np.ndarray, np.ndarray]:
         """Return the energy (W, 12) of slow errors of the state, and that by noise alone."""

@@ -120,29 +120,28 @@ class ViewEvidence(Evidence):
             return block.flight
         return super().folds(block)
 
-    def explained_share(
+    def accepts(
         self, before: Block, after: Evaluation, candidate: Candidate, gains: np.ndarray
-    ) -> float | None:
-        """Return the share of the error that a candidate explains; see `Evidence`.
+    ) -> bool:
+        """Return whether a candidate may be named; see `Evidence`.
 
-        None at a physical bound, if flights disagree, if fast changes do, or for a small share.
+        Not at a physical bound, if flights or fast changes disagree, or if it explains little.
         """
         theta, fitted = after.at.theta, after.block
         assert isinstance(before, ViewBlock) and isinstance(fitted, ViewBlock)
         if at_bound(self.space, theta, candidate) or not flights_agree(gains):
-            return None
+            return False
         # Both errors are weighted by the noise estimated with the candidate: in an estimate without
         # it, a slow effect would count as noise.
         noise = weights_of(fitted.data, self.limits)
         chi2_after, chi2_before = (
             float((whitened(block.data, noise)[0] ** 2).sum()) for block in (fitted, before)
         )
-        share = 1.0 - chi2_after / chi2_before
+        explains = 1.0 - chi2_after / chi2_before >= self.limits.least_view_share
         indices = list(candidate.indices)
         columns = [fitted.along.index(index) for index in indices]
         change = (theta - self.space.array("start"))[indices]
-        consistent = fast_changes_agree(fitted.data, columns, change, self.limits)
-        return share if share >= self.limits.least_view_share and consistent else None
+        return explains and fast_changes_agree(fitted.data, columns, change, self.limits)
 
     def preference(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
         """Return a sort key: plausible values first, then single effects, then the catalogue."""

@@ -26,7 +26,7 @@ from suite.diagnose.estimate.block import Block, Estimate, NormalEquations, with
 from suite.diagnose.estimate.gauss_newton import chi2_fall
 from suite.diagnose.estimate.parameters import Candidate, at_bound, usual_first
 from suite.diagnose.estimate.permutation import CandidateScore, corrected_p_values
-from suite.diagnose.evidence.evidence import Evaluation, Evidence, flights_agree
+from suite.diagnose.evidence.evidence import Evaluation, flights_agree
 from suite.diagnose.evidence.view_means import (
     ViewData,
     Weights,
@@ -218,13 +218,11 @@ class ChangeEvidence(ViewEvidence):
         least = self.limits.near_share * max((score.gain for score in scores), default=0.0)
         return sorted((s for s in scores if s.gain >= least), key=lambda s: -s.gain)
 
-    def explained_share(
+    def accepts(
         self, before: Block, after: Evaluation, candidate: Candidate, gains: np.ndarray
-    ) -> float | None:
-        """Return the share of the error that a candidate explains; see `Evidence`."""
-        if at_bound(self.space, after.at.theta, candidate) or not flights_agree(gains):
-            return None
-        return Evidence.explained_share(self, before, after, candidate, gains)
+    ) -> bool:
+        """Return whether a candidate may be named; see `Evidence`."""
+        return not at_bound(self.space, after.at.theta, candidate) and flights_agree(gains)
 
     def preference(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
         """Return a sort key: plausible candidates, then few parameters, then the catalogue."""
@@ -297,8 +295,9 @@ def search_motion_change(
     acting = view_candidates(among, evidence.linearise(Estimate(start)))
     tests = views * sum(len(one.indices) for one in acting)
     equations = [equations_by_flight(one, weights.scatter) for one in sets]
-    # Names with the parameters (P,) of the later flights and of the reference flights.
-    changes = list[tuple[NamedEffect, np.ndarray, np.ndarray]]()
+    # Names, the shares of the error that they explain, and the parameters (P,) of the later flights
+    # and of the reference flights.
+    changes = list[tuple[NamedEffect, float, np.ndarray, np.ndarray]]()
     for candidate in acting:
         indices = list(candidate.indices)
         earlier, later = (one.along_numbers(indices) for one in equations)
@@ -324,15 +323,16 @@ def search_motion_change(
             continue
         if flights_agree(gains) and share >= limits.least_view_share:
             by_flight = tuple(gains.tolist())
-            name = NamedEffect(candidate, p_value, sum(by_flight), gains=by_flight, share=share)
-            changes.append((name, possible, theta_before))
+            name = NamedEffect(candidate, p_value, sum(by_flight), gains=by_flight)
+            changes.append((name, share, possible, theta_before))
     if not changes:
         return None
     # Of the candidates that explain about as much as the best, the most usual one is named.
-    least = (1.0 - limits.rival_share) * max(name.share for name, *_ in changes)
-    close = [one for one in changes if one[0].share >= least]
-    close.sort(key=lambda one: usual_first(space, one[1], one[0].candidate))
-    name, at, theta_before = close[0][0], Estimate(close[0][1]), close[0][2]
+    least = (1.0 - limits.rival_share) * max(share for _, share, *_ in changes)
+    close = [one for one in changes if one[1] >= least]
+    close.sort(key=lambda one: usual_first(space, one[2], one[0].candidate))
+    name, _, theta, theta_before = close[0]
+    at = Estimate(theta)
     rivals = tuple(dict.fromkeys(other.candidate.name for other, *_ in close[1:]))
     block = evidence.linearise(at, sorted(name.candidate.indices))
     last = Evaluation(evidence, at, block)

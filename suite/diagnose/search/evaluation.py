@@ -29,8 +29,6 @@ class NamedEffect:
     """Rise of chi-square plus number of parameters with another candidate instead, by its label."""
     gains: tuple[float, ...] = ()
     """Fall of each flight's squared error, with the parameters fitted to the other flights."""
-    share: float = 0.0
-    """Share of the squared error that the effect explains."""
 
 
 def fitted_by(named: Sequence[NamedEffect]) -> list[int]:

@@ -149,13 +149,10 @@ def _best_candidate(
     for candidate in shortlist:
         fitted = fit_with(current, others, candidate)
         gains = errors_before - cross_validated_chi2(fitted, [*others, *candidate.indices])
-        share = evidence.explained_share(current.block, fitted, candidate, gains)
-        chi2 = float((fitted.block.residual**2).sum())
-        if share is not None:
-            name = NamedEffect(
-                candidate, scores[candidate].p_value, scores[candidate].gain,
-                gains=tuple(gains.tolist()), share=share,
-            )  # fmt: skip
+        chi2, score = float((fitted.block.residual**2).sum()), scores[candidate]
+        if evidence.accepts(current.block, fitted, candidate, gains):
+            by_flight = tuple(gains.tolist())
+            name = NamedEffect(candidate, score.p_value, score.gain, gains=by_flight)
             trials.append(_Trial(chi2 + len(candidate.indices), name, fitted.at))
     costs = {trial.name.candidate: trial.cost for trial in trials}
     trials = [trial for trial in trials if needs_all_parts(costs, trial.name.candidate, limits)]

@@ -123,9 +123,14 @@ class _Variograms(NamedTuple):
 
 
 def fit_colour(flights: Sequence[Series]) -> Coloured | None:
-    """Fit size, autocorrelation and drift; None if the flights have less than two stretches."""
+    """Fit size, autocorrelation and drift; None if the flights have less than two stretches.
+
+    Every flight has at least one error that is not missing.
+    """
+    if not flights:
+        return None
     step_s = max(flight.step_s for flight in flights)
-    lag_s = np.linspace(step_s, max(SHORT_S, step_s), SHORT_LAGS)
+    lag_s = _in_rows(np.linspace(step_s, max(SHORT_S, step_s), SHORT_LAGS), flights)
     variograms = _variograms(flights, lag_s, about_mean=True)
     if variograms is None:
         return None
@@ -227,7 +232,7 @@ def _drift(flights: Sequence[Series]) -> Interval:
     longest = LONGEST * min(flight.duration_s for flight in flights)
     if longest < 2.0 * LONG_S:
         return ZERO
-    lag_s = np.geomspace(LONG_S, longest, LONG_LAGS)
+    lag_s = _in_rows(np.geomspace(LONG_S, longest, LONG_LAGS), flights)
     variograms = _variograms(flights, lag_s)
     if variograms is None:
         return ZERO
@@ -245,6 +250,12 @@ def _drift(flights: Sequence[Series]) -> Interval:
     power, half = max(float(theta[1]), 0.0), float(half)
     high = max(power + half, power * np.exp(half / power) if half < power else 0.0)
     return Interval(*(float(v) for v in np.sqrt([power, max(power - half, 0.0), high])))
+
+
+def _in_rows(lag_s: np.ndarray, flights: Sequence[Series]) -> np.ndarray:
+    """Return `lag_s` (L,) [s] as whole rows of the slowest flight: no other lags are measured."""
+    step_s = max(flight.step_s for flight in flights)
+    return step_s * np.rint(lag_s / step_s)
 
 
 def _variograms(
@@ -298,7 +309,6 @@ def _half_widths(slope: np.ndarray, residual: np.ndarray, flight: np.ndarray) ->
 
 def _bias(flights: Sequence[Series], variance: float, colour: Colour) -> Interval:
     """Return the standard deviation, over flights, of the mean error, without that by noise."""
-    flights = [flight for flight in flights if np.isfinite(flight.value).any()]
     means, count = np.array([np.nanmean(flight.value) for flight in flights]), len(flights)
     noise = variance * np.mean([colour.mean_variance(f.duration_s) for f in flights])
     power = float((means**2).mean())

@@ -99,7 +99,7 @@ def held_out(logs: Sequence[FlightLog]) -> dict[str, HeldOut]:
         flights = [errors_of(log, late_s) for log in logs[1 - half :: 2]]
         for channel, axis in enumerate(AXES):
             series = _series(flights, fitted.systematic, channel)
-            if axis not in fitted.axes or not any(np.isfinite(s.value).any() for s in series):
+            if axis not in fitted.axes or not series:
                 continue
             compared = _compare(fitted.axes[axis], series)
             if axis not in worst or compared.largest > worst[axis].largest:
@@ -134,12 +134,13 @@ def _autocorrelation(series: Sequence[Series], lag_s: np.ndarray) -> np.ndarray:
 
 
 def _series(flights: Sequence[Errors], systematic: Systematic, channel: int) -> list[Series]:
-    """Return the errors of one channel in each flight, for the fit of their noise."""
+    """Return the errors of one channel in each flight that has any, to fit their noise."""
     series, can_drift = [], AXES[channel].startswith("position")
     for flight in flights:
         speed = np.linalg.norm(flight.vel_b, axis=1)
         values = systematic.removed(flight)[:, channel]
-        series.append(Series(values, speed if can_drift else 0.0 * speed, flight.step_s))
+        if np.isfinite(values).any():
+            series.append(Series(values, speed if can_drift else 0.0 * speed, flight.step_s))
     return series
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from eval import sensors
 from eval.logs.flight_log import FlightLog, write_flight
@@ -124,6 +125,15 @@ def test_a_drift_and_a_tilt_by_neglected_drag_are_found_where_they_are():
     assert drag.high - drag.low < 0.05
 
 
+def test_a_flight_without_a_part_of_the_estimate_does_not_count_for_it():
+    whole, long = flights()[0], flights()[1]
+    half = {name: v for name, v in long.extra.items() if not name.startswith("est_vel")}
+    one, two = (fit_sensors(logs) for logs in ([whole], [whole, replace(long, extra=half)]))
+    assert one.systematic.delay_s.value == pytest.approx(two.systematic.delay_s.value, abs=0.005)
+    for axis in ("velocity_x", "velocity_y", "velocity_z"):
+        assert two.axes[axis].noise.value == pytest.approx(one.axes[axis].noise.value, rel=0.1)
+
+
 def test_a_wandering_clock_is_found_by_the_gyro_and_leaves_no_errors():
     log = flights()[0]
     assert not clock_of(log).shift_s.any()
@@ -196,6 +206,16 @@ def test_a_drift_and_the_noise_around_it_have_their_true_sizes(monkeypatch):
     fitted = found.noise.value, found.lasts_s.value, found.drift.value
     # At the shortest lag of the drift's fit, 2 s, exp(-10) of the noise is still correlated.
     assert fitted == pytest.approx((SD, LASTS_S, DRIFT), rel=1e-3)
+
+
+def test_the_correlation_time_of_slow_logs_has_no_bias():
+    step_s, lasts_s = 0.05, 0.1
+    decay, found = np.exp(-step_s / lasts_s), []
+    for seed in range(12):
+        drawn = np.random.default_rng(seed).standard_normal((3, 1200))
+        noise = lfilter([np.sqrt(1.0 - decay**2)], [1.0, -decay], drawn, axis=1)
+        found.append(fit_colour([Series(one, 0.0 * one, step_s) for one in noise]).lasts_s.value)
+    assert np.median(found) == pytest.approx(lasts_s, rel=0.05)
 
 
 def test_one_row_after_the_last_whole_stretch_is_left_out():

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from eval.effects import EFFECTS
 from suite.common.report import html
 from suite.diagnose.diagnose import SOURCES, diagnose
 from suite.diagnose.estimate.block import Block, Estimate, without_nuisance
@@ -15,6 +16,7 @@ from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.sources.source import Remaining, Source, SourceSet
 from suite.diagnose.thresholds import THRESHOLDS
+from suite.diagnose.verdict import actuators
 from suite.diagnose.verdict.gap import Channel, EffectSize, Gap, remaining_share
 from tests.support.vehicles import PLAIN
 from tracks.common.files import plain
@@ -120,6 +122,23 @@ def test_what_a_name_explains_is_computed_without_names_that_are_too_small(monke
     assert [named.candidate.label for named in finding.names] == ["constant_wind"]
     # Nothing else remains, so without the wind the gap is as it was before.
     assert finding.without["constant_wind"].rms == pytest.approx(finding.before.rms, rel=1e-6)
+
+
+@pytest.mark.parametrize("wind", [0.0, 0.8])
+def test_an_effect_of_a_separate_test_leaves_no_unknown(monkeypatch, wind):
+    class LeftSource(ThermometerSource):
+        """The same, where most of the error always remains."""
+
+        def remaining(self, found, gaps, seed):
+            return Remaining(True, 1.0, "the air's temperature")
+
+    values = EFFECTS["motor_lag"].values(0.05)
+    lag = actuators.TestedEffect("motor_lag", values, {}, 0.9, 1e-4, "commands")
+    given = replace(sources(wind, kind=LeftSource), tested=(lag,))
+    monkeypatch.setitem(SOURCES, "air", lambda _: given)
+    found = diagnosis_json(diagnose([], PLAIN, by="air"))
+    assert [effect["name"] for effect in found["effects"]] == ["motor_lag"]
+    assert found["verdict"] == "partly"
 
 
 @pytest.mark.parametrize(("size", "label"), [(0.8, "named"), (0.0, "no_gap")])
