@@ -141,7 +141,11 @@ def intervals95(
 
     # By curvature.
     inverse = inverted(hessian)
-    half_width = noise_share * Z95 * np.sqrt(np.diag(inverse))
+    variance = np.diag(inverse)
+    if leave_out:  # a fit follows a stretch that alone informs on a parameter: no spread shows this
+        rest = inverted(hessian - equations.hessian)
+        variance = np.maximum(variance, np.einsum("nii->ni", rest).max(axis=0))
+    half_width = noise_share * Z95 * np.sqrt(variance)
     # By stretches.
     freedom = max(count - 1 if leave_out else count - size, 1 if leave_out else 2)
     if leave_out:

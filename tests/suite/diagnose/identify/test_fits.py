@@ -98,6 +98,21 @@ def test_intervals_of_few_blocks_are_as_much_wider_as_students_t():
     assert 1.6 < ratio < 3.0
 
 
+@pytest.mark.parametrize("noise", [None, np.array([0.1])])
+def test_what_one_block_alone_shows_is_not_identified(noise):
+    """The fit follows that block, so that its residual, and with it the spread, is zero."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        block = np.arange(70) // 14
+        x = rng.normal(size=70) * (block == 0)
+        y = 2.0 * x + 0.1 * rng.normal(size=70)
+
+        def residuals(numbers, x=x, y=y, block=block):
+            return [Rows((y - numbers["slope"] * x)[:, None], block, NONE)]
+
+        assert fit(residuals, [SLOPE], noise=noise).not_identified == ("slope",)
+
+
 def test_missing_values_are_left_out_and_a_fit_without_rows_is_refused():
     with pytest.raises(NoWholeWindow):
         fit(flights([2.0], count=0), [SLOPE])
