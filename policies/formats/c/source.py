@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -134,6 +135,8 @@ def _values(
     camera, depth = spec.camera, spec.depth
     first, second, third = work_sizes(spec)
     numerator, denominator = tanh_polynomials()
+    checkpoint_sha256 = checkpoint.config["weights"]["sha256"]
+    export_sha256 = hashlib.sha256((checkpoint_sha256 + label).encode()).hexdigest()
     return {
         "NAME": name.replace("*/", "* /"),
         "VERSION": VERSION,
@@ -156,7 +159,9 @@ def _values(
         "DEPTH_NEAR": float_text(depth.near),
         "DEPTH_FAR": float_text(camera.range_m),
         "DEPTH_OFFSET": float_text(depth.offset),
-        "SHA256": checkpoint.config["weights"]["sha256"],
+        "SHA256": checkpoint_sha256,
+        # Equal in policy.h and policy.c, which do not compile with those of another export.
+        "EXPORT": f"0x{export_sha256[:8]}",
         "JSON": _c_string(label),
         "MACS": multiply_adds(spec),
         "WEIGHT_BYTES": constant_bytes(checkpoint, layers),
@@ -176,8 +181,8 @@ def _values(
 def _observation(spec: PolicySpec) -> str:
     """Return the comment's lines on the parts of the state, with indices and units."""
     rows = [(3, *row) for row in _OBSERVATION]
-    last, unit = "the last action as it was flown (SI units, limited)", "as the action"
-    rows.append((spec.action.size, last, unit))
+    last = "the last flown action (SI units, limited), at first that of hover"
+    rows.append((spec.action.size, last, "as the action"))
     rows += [(EXTRAS[key], *_EXTRA[key]) for key in EXTRAS if getattr(spec, key)]
     lines, index = [], 0
     for count, meaning, unit in rows:

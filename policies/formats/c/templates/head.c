@@ -3,6 +3,13 @@
 
 #include "policy.h"
 
+#if POLICY_EXPORT != $EXPORT
+#error "policy.h and policy.c are of two exports: copy both files of one export"
+#endif
+#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
+#error "-ffast-math removes the checks for NaN: leave it out, or add -fno-finite-math-only"
+#endif
+
 enum {
     HEIGHT = POLICY_IMAGE_HEIGHT,
     WIDTH = POLICY_IMAGE_WIDTH,

@@ -43,6 +43,7 @@ $OBSERVATION
 /* SHA-256 of the checkpoint's weights.safetensors and of the contract; metadata for the suite. */
 #define POLICY_CHECKPOINT_SHA256 "$SHA256"
 #define POLICY_CONTRACT_SHA256 "$CONTRACT"
+#define POLICY_EXPORT $EXPORT /* policy.c has the same number */
 #define POLICY_JSON \
 $JSON
 

@@ -87,6 +87,21 @@ def test_it_compiles_strictly_and_runs_under_the_sanitizers(exports, name, kind)
     assert "12 steps, 0 numbers wrong" in done.stdout
 
 
+def test_it_does_not_compile_without_its_checks_for_nan_or_with_another_header(exports, tmp_path):
+    def said(folder, *flags):
+        command = [*(find_compiler() or ()), "-std=c99", *flags, "-c", str(folder / "policy.c")]
+        made = subprocess.run([*command, "-o", str(tmp_path / "o")], capture_output=True, text=True)
+        return made.stderr
+
+    folder = shutil.copytree(exports["odd"].folder, tmp_path / "copy")
+    assert "removes the checks for NaN" in said(folder, "-ffast-math")
+    assert said(folder) == said(folder, "-ffast-math", "-fno-finite-math-only") == ""
+    shutil.copy(exports["odd8"].folder / "policy.h", folder)
+    assert "are of two exports" in said(folder)
+    with pytest.raises(PolicyError, match="are of two exports"):
+        load_c(folder, trust=True)
+
+
 def test_its_tanh_is_tanh_however_large_its_argument(exports, tmp_path):
     folder, program = exports["odd"].folder, tmp_path / "tanh"
     code = """
