@@ -22,10 +22,6 @@ if TYPE_CHECKING:
 
     from policies.formats.c.forward import Observed
 
-MODULE_OPSET = 17
-"""ONNX opset (version of the operators) of a module's graph; the runtimes of companion computers
-support one as old as this."""
-
 
 def export_policy(
     name_or_folder: str | Path,
@@ -104,6 +100,7 @@ def export_module(
 
     from policies.block_policy import random_block
     from policies.formats.onnx_file import load_onnx
+    from policies.formats.onnx_graph import OPSET
 
     spec = trained_under
     if not isinstance(spec, PolicySpec):
@@ -114,14 +111,14 @@ def export_module(
     example = tuple(torch.zeros(2, *size) for size in sizes)
     outputs = ["action", "hidden_next"][: 1 + bool(memory)]
     buffer: Any = io.BytesIO()  # torch accepts it, but its annotation omits it
-    training = module.training
+    modes = {part: part.training for part in module.modules()}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the deprecation of this exporter
             torch.onnx.export(
                 module.eval(), example, buffer, input_names=list(names), output_names=outputs,
                 dynamic_axes={name: {0: "batch"} for name in (*names, *outputs)},
-                opset_version=MODULE_OPSET, dynamo=False,
+                opset_version=OPSET, dynamo=False,
             )  # fmt: skip
     except Exception as error:
         text = (str(error).strip() or type(error).__name__).splitlines()[0]
@@ -130,7 +127,9 @@ def export_module(
             f"{', '.join(names)} and return {' and '.join(outputs)}"
         ) from error
     finally:
-        module.train(training)
+        # Not by module.train(), since parts may be frozen in evaluation mode during a training.
+        for part, mode in modes.items():
+            part.training = mode
     proto = onnx.load_model_from_string(buffer.getvalue())
     onnx.helper.set_model_props(proto, {contract.KEY: policy_contract.text})
     with replacing_file(path) as temporary:

@@ -218,9 +218,10 @@ class Module(torch.nn.Module):
 def test_a_module_flies_in_evaluation_mode_with_the_contract_it_was_exported_with(tmp_path):
     spec = PolicySpec(rate_hz=50.0, action=ActionSpec(scale=(20.0,)))
     module = Module(norm=True).train()
+    module.norm.eval()
     policy = load_policy(export_module(module, tmp_path / "it.onnx", contract_of(spec)))
     assert policy.spec == spec and isinstance(policy, BlockPolicy) and not policy.notes
-    assert module.training
+    assert module.training and not module.norm.training, "a frozen part stays frozen"
     action = spec.action.to_si(action_of(policy, np.ones((1, 12))))
     np.testing.assert_allclose(action, 20.0, rtol=1e-4)  # the norm divides by sqrt(1 + 1e-5)
 
