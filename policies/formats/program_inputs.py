@@ -41,7 +41,7 @@ def check_inputs(
 ) -> tuple[int, tuple[int, ...]]:
     """Return the number of rows of a block, and the shape of a row's hidden state, of a program.
 
-    Shapes are by name, in order; a size that is not an int is free.
+    Shapes are by name; a size that is not an int is free.
 
     Raises:
         PolicyError: where names, ranks or sizes are not those of an observation.
@@ -86,8 +86,7 @@ def described_policy(loaded: ModelProcess, path: Path, metadata: PolicyMetadata)
         PolicyError: where inputs or outputs are not those of a policy or of its contract.
     """
     shapes = {port.name: port.shape for port in loaded.inputs}
-    order = sorted(shapes, key=(*INPUTS, *shapes).index)
-    block, hidden_shape = check_inputs({n: shapes[n] for n in order}, metadata.spec, str(path))
+    block, hidden_shape = check_inputs(shapes, metadata.spec, str(path))
     return program_policy(loaded, path, metadata, hidden_shape, block)
 
 

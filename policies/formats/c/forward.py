@@ -37,7 +37,7 @@ def step(
     state: np.ndarray,
     image: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the action (3,) [m/s^2, body axes] and the new hidden state for one observation.
+    """Return the action (spec.action.size,) in SI units and the new hidden state of one step.
 
     Args:
         small: weights and biases of the small layers, from `arrays.small_arrays`.

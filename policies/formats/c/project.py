@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from policies.formats.c.arrays import DTYPES, float_text
+from policies.formats.c.arrays import float_text
 from policies.formats.c.forward import Observed
 from policies.formats.c.quantised import Quantised, quantise
 from policies.formats.c.quantised import actions as quantised_actions
@@ -22,7 +22,7 @@ from policies.formats.spec_json import embed
 from policies.native import native_policy
 from policies.policy import Policy
 from policies.spec import PolicyError, PolicySpec
-from tracks.common.names import printable, unknown_name
+from tracks.common.names import printable
 
 VECTORS = 12
 """Number of successive steps in vectors.h, in which the policy keeps its memory."""
@@ -52,11 +52,8 @@ def c_project(
     flights.
 
     Raises:
-        ValueError: for an unknown type.
         PolicyError: where int8 has no observations.
     """
-    if dtype not in DTYPES:
-        raise unknown_name("type", dtype, DTYPES)
     params, spec = checkpoint.params, checkpoint.spec
     layers = None
     if dtype == "int8":
