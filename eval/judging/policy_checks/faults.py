@@ -20,13 +20,7 @@ from eval.judging.policy_checks.in_flight import (
     UNIT_FIX,
     scale_advice,
 )
-from eval.judging.policy_checks.responses import (
-    NEAR_M,
-    Responses,
-    last_action,
-    level_states,
-    responses,
-)
+from eval.judging.policy_checks.responses import Responses, last_action, level_states, responses
 from eval.judging.policy_checks.rows import check_rows
 from eval.logs.faults.vehicle import narrow_view
 from policies.observation import encode_depth
@@ -213,8 +207,8 @@ def unused_inputs(policy: Policy) -> list[Note]:
     state, other = level_states(spec, np.zeros((2, 2))), level_states(spec, np.ones((2, 2)))
     moved = state.copy()
     moved[:, last_action(spec)] += 1.0
-    depths_m = np.full((2, 2, *spec.image_shape), NEAR_M)
-    depths_m[0] = spec.camera.range_m
+    depths_m = np.full((2, 2, *spec.image_shape), spec.camera.range_m)
+    depths_m[1] = spec.depth.near
     far, near = encode_depth(spec.depth, depths_m, spec.camera.range_m).astype(np.float32)
     fresh = np.ones(2, bool)
     usual, hidden = policy.act(policy.start(2), state, far, fresh)

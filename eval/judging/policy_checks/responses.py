@@ -18,7 +18,8 @@ axis, the next gate's centre."""
 ASIDE_M, AHEAD_M, SPEED, STEPS = 2.0, 6.0, 3.0, 10
 """Distances of the test gate to the side and ahead [m], forward speed [m/s], number of steps."""
 DRIFT, NEAR_M = 2.0, 2.0
-"""Velocity to a side [m/s]; distance of an object that fills half of an image [m]."""
+"""Velocity to a side [m/s]; distance of an object that fills half of an image [m], or half of the
+camera's range if that is less."""
 SIDES = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 """Directions left, right, up and down; columns are left and up."""
 
@@ -72,7 +73,7 @@ def responses(policy: Policy) -> Responses:
     height, width = (size // 2 for size in depth_m.shape[1:])
     halves = np.s_[:, :width], np.s_[:, width:], np.s_[:height], np.s_[height:]
     for row, half in enumerate(halves, start=8):
-        depth_m[row][half] = NEAR_M
+        depth_m[row][half] = min(NEAR_M, spec.camera.range_m / 2)
     image = encode_depth(spec.depth, depth_m, spec.camera.range_m).astype(np.float32)
     action, output = run(policy, state, image.reshape(len(state), *spec.image_shape))
     opposite, gates = action[:14:2] - action[1:14:2], [0, 1, 2, 3, 14]

@@ -9,6 +9,7 @@ import pytest
 
 from eval.effects.interface import GRAVITY
 from eval.judging.policy_checks.faults import notes_of, probable_faults, unused_inputs
+from eval.judging.policy_checks.responses import responses
 from eval.judging.policy_checks.rows import check_rows
 from policies.block_policy import BlockPolicy
 from policies.policy import checked_act, load_policy
@@ -149,7 +150,9 @@ def test_a_mistake_of_thrust_and_rates_is_named(fault, text, mistake):
 
 def test_inputs_without_effect_are_named():
     race = shipped("race")
-    assert unused_inputs(race) == []
+    near_sighted = replace(race.spec, camera=replace(race.spec.camera, range_m=1.5))
+    assert unused_inputs(race) == unused_inputs(replace(race, spec=near_sighted)) == []
+    assert responses(replace(race, spec=near_sighted)).near.any()
     (note,) = unused_inputs(changed(race, LAST_ACTION, np.zeros_like, np.zeros_like))
     assert "does not depend on its image or last action" in note.evidence
     (note,) = unused_inputs(Pursuit())
