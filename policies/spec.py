@@ -160,9 +160,11 @@ def check_spec(spec: PolicySpec, where: str = "spec.") -> None:
         )
     action = spec.action
     if action.kind not in ACTIONS:
-        raise unknown_name("kind of action", action.kind, ACTIONS)
+        error = unknown_name("kind of action", action.kind, ACTIONS)
+        raise ValueError(f"{where}action.kind: {error}")
     if action.motors not in ("thrust", "speed"):
-        raise unknown_name("share of a motor", action.motors, ("thrust", "speed"))
+        error = unknown_name("share of a motor", action.motors, ("thrust", "speed"))
+        raise ValueError(f"{where}action.motors: {error}")
     for key in ("scale", "offset"):
         numbers = getattr(action, key)
         if len(numbers) not in (1, action.size):

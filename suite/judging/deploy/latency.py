@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from policies.formats.c.c_file import CPolicy
+from policies.formats.c.project import random_observations
 from policies.formats.policy_file import PolicyCheckpoint
-from policies.spec import PolicySpec
 
 Step = Callable[[], Any]
 """Makes one step on fixed inputs, and keeps the policy's memory; may return (1, size) actions."""
@@ -54,7 +54,7 @@ def time_in_turn(steps: Mapping[str, Step], rounds: int = 20) -> dict[str, Timin
 
 def c_step(policy: CPolicy) -> Step:
     """Return a step of a policy in C, whose functions are called as on a flight controller."""
-    state, image = _inputs(policy.spec)
+    state, image, _ = random_observations(policy.spec, 1)
     memory, action = policy.start(1), np.zeros((1, policy.spec.action.size), np.float32)
     arrays = (memory, state, image, action)
     library = ctypes.CDLL(str(policy.library))
@@ -82,7 +82,7 @@ def onnx_steps(checkpoint: PolicyCheckpoint) -> tuple[Step, Step]:
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     providers = ["CPUExecutionProvider"]
     session = onnxruntime.InferenceSession(onnx_file(checkpoint, {}), options, providers=providers)
-    state, image = _inputs(checkpoint.spec)
+    state, image, _ = random_observations(checkpoint.spec, 1)
     hidden = np.zeros((1, checkpoint.spec.hidden_size), np.float32)
     action = np.zeros((1, checkpoint.spec.action.size), np.float32)
     feed: dict[str, Any] = {"state": state, "image": image, "hidden": hidden}
@@ -106,7 +106,7 @@ def torch_step(checkpoint: PolicyCheckpoint) -> Step:
     from policies.formats.torch_twin import torch_twin
 
     twin = torch_twin(checkpoint.params, checkpoint.spec)
-    state, image = map(torch.from_numpy, _inputs(checkpoint.spec))
+    state, image = map(torch.from_numpy, random_observations(checkpoint.spec, 1)[:2])
     memory = [torch.zeros(1, checkpoint.spec.hidden_size)]
 
     def step() -> Any:
@@ -115,11 +115,3 @@ def torch_step(checkpoint: PolicyCheckpoint) -> Step:
         return action
 
     return step
-
-
-def _inputs(spec: PolicySpec) -> tuple[np.ndarray, np.ndarray]:
-    """Return random inputs of a policy: a state vector (1, state_size), an image (1, H, W)."""
-    rng = np.random.default_rng(0)
-    state = rng.normal(size=(1, spec.state_size)).astype(np.float32)
-    size = (1, spec.camera.height, spec.camera.width)
-    return state, rng.uniform(-0.3, 9.4, size).astype(np.float32)

@@ -308,6 +308,8 @@ def test_a_file_that_says_nothing_has_the_default_spec(text):
         ('{"schema": 2}', "update the suite"),
         ('{"spec": {"rate_hz": -1}}', "spec: rate_hz is -1"),
         ('{"spec": {"rate": 1}}', "key 'rate' at the top is unknown"),
+        ('{"spec": {"action": {"kind": "motor"}}}', "spec: action.kind: .*mean 'motors'"),
+        ('{"spec": {"action": {"motors": "x"}}}', "spec: action.motors: .*thrust, speed"),
         ('{"rate_hz": 15.0}', "unknown key 'rate_hz'.*Known: .*spec"),
         ('{"Spec": {"rate_hz": 15.0}}', "unknown key 'Spec'. Did you mean 'spec'"),
     ],
