@@ -41,6 +41,12 @@ def load_onnx(path: Path) -> BlockPolicy:
                 f"{path}: {value.name!r} is {value.kind}, expected tensor(float); export it as "
                 "float32, such as by model.float() in PyTorch"
             )
+    outputs = [value.name for value in loaded.outputs]
+    if "action" in outputs[1:]:
+        raise PolicyError(
+            f"{path}: outputs are {', '.join(outputs)}; the action must be the first, then the new "
+            "hidden; export it with the outputs in this order"
+        )
     return described_policy(loaded, path, metadata)
 
 

@@ -151,6 +151,10 @@ def test_inputs_and_outputs_that_do_not_fit_are_refused(tmp_path):
         ([state, double], r"'image' is tensor\(double\), .* export it as float32"),
     ):
         refused(save_onnx(tmp_path, onnx_model(inputs=inputs)), said)
+    proto = onnx_model(inputs=[state, image, port("hidden", "n", 3)])
+    proto.graph.node.add(op_type="Identity", input=["hidden"], output=["hidden_next"])
+    proto.graph.output.insert(0, port("hidden_next", "n", 3))
+    refused(save_onnx(tmp_path, proto), "hidden_next, action; the action must be the first")
 
 
 def test_a_model_that_breaks_the_standard_is_refused(tmp_path):

@@ -48,6 +48,14 @@ def test_the_command_writes_c_and_a_card_that_says_how_near_it_is(folder, tmp_pa
         assert said in text
 
 
+def test_a_card_of_an_earlier_export_does_not_stay(folder, tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    command = f"export --format c --out {tmp_path} --policy"
+    assert run(command, folder) == 0 and (tmp_path / exporting.CARD).exists()
+    monkeypatch.setenv("CC", "gcc '")
+    assert run(command, folder) == 2 and not (tmp_path / exporting.CARD).exists()
+
+
 @needs_cc
 def test_int8_is_scaled_by_flights(folder, tmp_path, monkeypatch, capsys):
     observed = random_observations(load_policy_checkpoint(folder).spec, 30, seed=3)
