@@ -17,7 +17,7 @@ from suite.experiments.bench.compare import Comparison, Figure
 from tracks.common.grid import Grid, table
 
 
-def run(policy: str = "", rounds: int = 20) -> Comparison:
+def run(policy: str = "") -> Comparison:
     """Time blocks of 100 steps of every engine (C export, ONNX Runtime, torch) in turn.
 
     Raises:
@@ -43,7 +43,7 @@ def run(policy: str = "", rounds: int = 20) -> Comparison:
             run_step, bound_step = onnx_steps(checkpoint)
             steps |= {"ONNX Runtime": run_step, "ONNX Runtime, memory bound": bound_step}
             steps["torch"] = torch_step(checkpoint)
-            times = time_in_turn(steps, rounds)
+            times = time_in_turn(steps)
     finally:
         torch.set_num_threads(threads)
     multiply_add_count = multiply_adds(checkpoint.spec)
