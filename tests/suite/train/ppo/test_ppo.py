@@ -221,18 +221,34 @@ def flown(worlds):
     return actor, records
 
 
+def means_of(actor, records, hidden):
+    """Return the policy's actions (T, B, 3) without exploration on the observations of a rollout."""
+    embeddings = jax.jit(network.encode)(actor.params, records.image.reshape(-1, 20, 20))
+    sequences = Sequences(
+        state=records.state, action_b=records.action_b, log_prob=records.log_prob,
+        done=records.done, advantage=records.log_prob, start=jnp.asarray(hidden)[None],
+    )  # fmt: skip
+    return means(actor.params, embeddings.reshape(6, 4, -1), sequences)
+
+
+def test_exploration_is_not_the_image_noise_of_a_world():
+    """A policy that sees the noise of its own action could learn to correct it."""
+    worlds = boxes_worlds(CONFIG.shared)
+    actor, records = flown(worlds)
+    noise = (records.action_b - means_of(actor, records, worlds.hidden)) * np.exp(1.0)
+    for key, explored in zip(jax.random.split(jax.random.key(2), 6), noise, strict=True):
+        grains = jax.vmap(lambda k: jax.random.normal(k, (20, 20)))(world_keys(key, worlds))
+        pixels = np.asarray(grains).reshape(4, -1)[:, : explored.size]
+        assert (np.abs(pixels - explored.ravel()).max(1) > 0.1).all()
+
+
 def test_the_learner_meets_the_actions_density_that_the_rollout_recorded():
     """Through delays, collisions and recurrent states of the start: a ratio of one everywhere."""
     worlds = crashing(boxes_worlds(CONFIG.shared))
     hidden = np.random.default_rng(0).normal(size=worlds.hidden.shape).astype(np.float32)
     actor, records = flown(worlds._replace(hidden=hidden))
     assert bool(records.done[:, 0].any()) and not bool(records.done[-1, 0])
-    embeddings = jax.jit(network.encode)(actor.params, records.image.reshape(-1, 20, 20))
-    sequences = Sequences(
-        state=records.state, action_b=records.action_b, log_prob=records.log_prob,
-        done=records.done, advantage=records.log_prob, start=jnp.asarray(hidden)[None],
-    )  # fmt: skip
-    mean = jax.jit(action_means)(actor.params, embeddings.reshape(6, 4, -1), sequences)
+    mean = means_of(actor, records, hidden)
     found = log_probability(mean, actor.log_deviation, records.action_b)
     np.testing.assert_allclose(found, records.log_prob, atol=1e-3)
 
