@@ -187,14 +187,17 @@ def test_a_stopped_run_resumes_exactly_and_leaves_a_policy(tmp_path, monkeypatch
         run.train_ppo(replace(CONFIG, discount=0.5), whole, Console())
 
 
-def test_minibatches_and_strides_that_do_not_divide_are_refused(tmp_path):
-    for wrong in (3, 0):
-        with pytest.raises(ValueError, match=r"minibatches is \d, allowed are divisors .*\(4\)"):
-            make_update(replace(CONFIG, minibatches=wrong))
-    config = replace(CONFIG, episode=replace(CONFIG.episode, image_stride=4))
-    with pytest.raises(ValueError, match=r"image_stride is 4, allowed are divisors .*\(6\)"):
-        run.train_ppo(config, tmp_path / "run", Console())
-    assert not list(tmp_path.iterdir())
+def test_invalid_settings_are_refused_before_anything_is_written(tmp_path):
+    stride = replace(CONFIG, episode=replace(CONFIG.episode, image_stride=4))
+    for config, words in (
+        (replace(CONFIG, minibatches=3), r"minibatches is 3, allowed are divisors .*\(4\)"),
+        (replace(CONFIG, minibatches=0), "minibatches is 0, allowed is 1 to 10000"),
+        (replace(CONFIG, discount=1.5), "discount is 1.5, allowed is 0 to 1"),
+        (stride, r"image_stride is 4, allowed are divisors .*\(6\)"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            run.train_ppo(config, tmp_path / "run", Console())
+        assert not list(tmp_path.iterdir())
 
 
 def test_the_density_is_a_normal_one():
