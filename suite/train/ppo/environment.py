@@ -43,7 +43,7 @@ class Episode(NamedTuple):
     """(B, image_delay, height, width) images that wait for their delay, oldest first."""
     observed: jax.Array
     """(B, state_delay, state_size) state vectors that wait for their delay, oldest first."""
-    sensed: Any = ()
+    sensed: Any
     """Memory of the sensor models."""
 
 
