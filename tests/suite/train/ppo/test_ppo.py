@@ -317,6 +317,12 @@ def test_an_episode_that_ends_starts_another_and_says_why(worlds):
     assert ended[2]["truncated"][2]
 
 
+def test_an_accelerator_rounds_no_product_of_its_rotations(worlds):
+    state = jax.eval_shape(reset, KEYS, worlds)[1]
+    program = step.lower(KEYS, state, jnp.zeros((3, 3)), worlds).as_text()
+    assert "precision = [HIGHEST" in program and "precision = [DEFAULT" not in program
+
+
 def test_an_action_of_another_shape_is_refused_and_one_that_is_not_finite_ends(worlds):
     _, state = reset(KEYS, worlds)
     action = jnp.zeros((3, 3)).at[1, 2].set(jnp.nan)
