@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -117,7 +118,7 @@ def settings(config: Config) -> list[training.Setting]:
 
     def setting(kind: str, weight: float, **changes: float) -> training.Setting:
         """Return the setting of a kind, with `changes` of the weights of the loss in the recipe."""
-        weights = {"progress": weight, "progress_norm": 0.0, **changes}
+        weights: dict[str, Any] = {"progress": weight, "progress_norm": 0.0, **changes}
         recipe = replace(base, loss=replace(base.loss, **weights))
         return training.Setting(f"{kind} {weight:g}", KINDS[kind], recipe)
 

@@ -225,7 +225,7 @@ def flown(worlds):
 
 
 def means_of(actor, records, hidden):
-    """Return the policy's actions (T, B, 3) without exploration on the observations of a rollout."""
+    """Return the policy's actions (T, B, 3) without exploration on what a rollout observed."""
     embeddings = jax.jit(network.encode)(actor.params, records.image.reshape(-1, 20, 20))
     sequences = Sequences(
         state=records.state, action_b=records.action_b, log_prob=records.log_prob,
