@@ -1,4 +1,4 @@
-"""Convert a JAX pytree (parameters, optimiser state, random key) to arrays by name, and back.
+"""Convert a JAX pytree (parameters, optimiser state) to arrays by name, and back.
 
 Also convert the policy network's weights to the layouts of torch and ONNX, in which rows are
 outputs and channels come first.
@@ -17,9 +17,9 @@ from policies.spec import PolicyError, PolicySpec
 
 
 def tree_to_arrays(tree: Any) -> dict[str, np.ndarray]:
-    """Return the leaves of `tree` by their path; random keys are replaced by their data."""
+    """Return the leaves of `tree` by their path."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path): np.asarray(_data(leaf)) for path, leaf in leaves}
+    return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
 
 
 def tree_from_arrays(template: Any, arrays: Mapping[str, np.ndarray], where: str) -> Any:
@@ -40,25 +40,14 @@ def tree_from_arrays(template: Any, arrays: Mapping[str, np.ndarray], where: str
         )
     restored = []
     for name, (_, leaf) in zip(names, leaves, strict=True):
-        value, expected = arrays[name], np.asarray(_data(leaf))
+        value, expected = arrays[name], np.asarray(leaf)
         if value.shape != expected.shape or value.dtype != expected.dtype:
             raise PolicyError(
                 f"{where}: {name!r} is {value.dtype} {value.shape}, expected {expected.dtype} "
                 f"{expected.shape}; resume with the configuration that the run was started with"
             )
-        array = jnp.asarray(value)
-        if _is_key(leaf):
-            array = jax.random.wrap_key_data(array, impl=jax.random.key_impl(leaf))
-        restored.append(array)
+        restored.append(jnp.asarray(value))
     return jax.tree_util.tree_unflatten(structure, restored)
-
-
-def _is_key(leaf: Any) -> bool:
-    return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def _data(leaf: Any) -> Any:
-    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
 
 def rows_are_outputs(weight: np.ndarray) -> np.ndarray:

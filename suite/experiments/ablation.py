@@ -6,7 +6,8 @@ Each setting is trained from several seeds, and flies tracks that no training us
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from suite.experiments.pages.document import PageContents
 from suite.experiments.study import options, training
 from suite.experiments.study.cache import Workspace
 from suite.experiments.study.training import Summary
-from suite.train.overrides import check_owned, in_every_phase
+from suite.train.overrides import check_owned
 from tracks.common.grid import Grid, table
 
 PROGRESS = (0.4, 0.8, 1.6, 3.2)
@@ -117,8 +118,8 @@ def settings(config: Config) -> list[training.Setting]:
 
     def setting(kind: str, weight: float, **changes: float) -> training.Setting:
         """Return the setting of a kind, with `changes` of the weights of the loss in the recipe."""
-        weights = {"progress": weight, "progress_norm": 0.0, **changes}
-        recipe = in_every_phase(base, "loss", **weights)
+        weights: dict[str, Any] = {"progress": weight, "progress_norm": 0.0, **changes}
+        recipe = replace(base, loss=replace(base.loss, **weights))
         return training.Setting(f"{kind} {weight:g}", KINDS[kind], recipe)
 
     weights = sorted({float(f"{weight:g}") for weight in (*PROGRESS, base.loss.progress)})

@@ -7,7 +7,7 @@ the training they are measured on tracks that no training uses.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -19,7 +19,7 @@ from suite.experiments.pages.document import PageContents
 from suite.experiments.study import options, training
 from suite.experiments.study.cache import Workspace
 from suite.experiments.study.training import Summary
-from suite.train.overrides import check_owned, in_every_phase
+from suite.train.overrides import check_owned
 from suite.train.ppo.config import ppo_like
 from tracks.common.grid import Grid, table
 from tracks.input.ranges import Iterations, Range, Trials
@@ -111,9 +111,10 @@ def schemes(config: Config) -> list[training.Setting]:
     owned = {f"loss.{name}": "it is compared" for name in compared}
     check_owned(config.set, {"loss.progress": "give --progress", **owned})
     base = options.four_gate_recipe(config)
-    ours = in_every_phase(base, "loss", progress=config.progress, progress_norm=0.0, projection=0.0)
+    loss = replace(base.loss, progress=config.progress, progress_norm=0.0, projection=0.0)
+    ours = replace(base, loss=loss)
     field_substitute = {"projection": PROJECTION, "projection_decay": PROJECTION_DECAY}
-    without_field = in_every_phase(ours, "loss", field_gain=0.0, **field_substitute)
+    without_field = replace(base, loss=replace(loss, field_gain=0.0, **field_substitute))
     ppo = ppo_like(ours, config.ppo_iterations or ours.optimizer.iterations)
     known = [
         training.Setting("ppo", "PPO", ppo),

@@ -58,7 +58,7 @@ class PointMassConfig:
 class QuadrotorConfig:
     """The differentiable quadrotor of a vehicle file and its randomisation, drawn for each world.
 
-    Delay, noise and field of view of the images are set in `PointMassConfig`.
+    Delays, noise and field of view of the observation are set in `PointMassConfig`.
     """
 
     vehicle: Vehicle
@@ -157,7 +157,8 @@ class LossConfig:
     """Strength of the field u_A [1/m]: the gradient that it adds at the centre of a 1 m gate for a
     velocity across the gate's axis, in one step and one world, before averaging. 0: no field."""
     gradient_decay: Annotated[float, Range(0.0, 1000.0)] = 0.916
-    """alpha, the decay rate of the gradients of position and velocity, back in time [1/s]."""
+    """alpha, the decay rate of gradients back in time [1/s]: those of position and velocity, and of
+    attitude and rates of quadrotors."""
     crash_depth_m: Annotated[float, Range(0.0, math.inf)] = 0.0
     """Depth in a solid beyond which a world no longer counts in the loss of a rollout [m]:
     gradients inside a solid do not help to fly."""
@@ -256,7 +257,7 @@ class TrainConfig:
     spec: PolicySpec = field(default_factory=lambda: PolicySpec(rate_hz=15.0))
     """Rate, camera and encodings of the policy."""
     physics: PointMassConfig = field(default_factory=PointMassConfig)
-    """The point mass and its randomisation, and delay and noise of the images."""
+    """The point mass and its randomisation, and delays and noise of the observation."""
     quadrotor: QuadrotorConfig | None = None
     """The quadrotor through which the policy is trained; None: the point mass of `physics`."""
     sensors: SensorsConfig | None = None

@@ -22,7 +22,8 @@ from suite.train.step import Step, norm
 from tracks.geometry.field import CURRENT, attractive_field, magnetic_field
 
 BARRIER_HEIGHT, BARRIER_SLOPE = 2.0, -32.0
-"""beta_1 (dimensionless) and beta_2 [1/m] of L_clearance, as the paper prints them."""
+"""beta_1 (dimensionless) and beta_2 [1/m] of L_clearance. The paper does not print them: its table
+of the reward has lambda_2 = -lambda_C beta_1, and beta_2 is that of Zhang et al. 2025."""
 FIELD_DECAY = 0.3
 """lambda_A of the field u_A, as the paper prints it: a larger one makes u_A fall more slowly with
 the distance."""
@@ -113,9 +114,9 @@ def projection(config: LossConfig, step: Step) -> jax.Array:
 def guidance(_: LossConfig, step: Step) -> jax.Array:
     """Return a term of value 0 whose gradient with respect to the position is minus the field u_A.
 
-    u_A points along the magnetic field of a current around the gate's opening, and is 0 for a
-    velocity in that direction. Its size is 1 at the centre of a 1 m gate. At the gate's edges it
-    would be unbounded, so it is limited to MAX_PULL.
+    u_A points along the magnetic field of a current around the gate's opening. Near the gate it is
+    about 0 for a velocity in that direction. For a velocity across the field, its size is 1 at the
+    centre of a 1 m gate. At the gate's edges it would be unbounded, so it is limited to MAX_PULL.
     """
     fixed_pos, fixed_vel = jax.lax.stop_gradient(step.pos_w), jax.lax.stop_gradient(step.vel_w)
     gate = step.gate

@@ -13,7 +13,7 @@ import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import TypeVar, get_args, get_type_hints
 
 from suite.train.config import Phase, TrainConfig, check
 from tracks.common.names import unknown_name
@@ -31,14 +31,18 @@ POINT_MASS_ONLY = (
     "action_delay",
 )
 """Settings of `physics` that only the point mass uses."""
-NEEDS = {
-    "loss.projection_decay": "loss.projection",
-    "loss.speed_range": "spec.speed_input",
-    "episode.race_share": "spec.speed_input",
-    "episode.stop_from": "episode.rest_share",
-    "spec.speed": "spec.speed_input",
+WITHOUT_EFFECT = {
+    "loss.projection_decay": ("loss.projection", 0.0),
+    "loss.speed_range": ("spec.speed_input", False),
+    "episode.race_share": ("spec.speed_input", False),
+    "episode.stop_from": ("episode.rest_share", 0.0),
+    "episode.start_speed": ("episode.rest_share", 1.0),
+    "episode.missed_share": ("episode.rest_share", 1.0),
+    "episode.density": ("episode.bare_share", 1.0),
+    "sensors.magnitude": ("sensors.perfect_share", 1.0),
+    "spec.speed": ("spec.speed_input", False),
 }
-"""Setting -> the setting without which it has no effect (while that is 0 or False)."""
+"""Setting -> another setting, and the value of that with which the first one has no effect."""
 ABSENT = {
     "quadrotor": "quadrotor; take a recipe that trains through quadrotors (suite train: or add "
     "--model quad and --vehicle)",
@@ -69,15 +73,15 @@ def _path(change: str) -> str:
 
 def _check_effective(phases: Sequence[object], path: str, change: str) -> None:
     """Refuse a setting that has no effect in any of the `phases` because of another one."""
-    for name, need in NEEDS.items():
-        part, _, field = need.partition(".")
-        if is_within(path, name):
-            values = [getattr(getattr(phase, part, None), field, None) for phase in phases]
-            if all(value is not None and not value for value in values):
-                raise ValueError(
-                    f"--set {change}: {path} has no effect while {need} is {values[0]!r}; set that "
-                    "as well, or leave this out"
-                )
+    for name, (other, value) in WITHOUT_EFFECT.items():
+        part, _, field = other.partition(".")
+        if is_within(path, name) and all(
+            getattr(getattr(phase, part, None), field, None) == value for phase in phases
+        ):
+            raise ValueError(
+                f"--set {change}: {path} has no effect while {other} is {value!r}; set that as "
+                "well, or leave this out"
+            )
 
 
 def is_within(path: str, part: str) -> bool:
@@ -332,12 +336,6 @@ def at_rate(config: TrainConfig, rate_hz: float) -> TrainConfig:
             steps=stride * max(1, round(ratio * episode.steps / stride)),
         ),
     )
-
-
-def in_every_phase(config: TrainConfig, part: str, **values: Any) -> TrainConfig:
-    """Return `config` with these `values` in all phases, of settings in a part such as "loss"."""
-    config = _without_phase_changes(config, {f"{part}.{name}" for name in values})
-    return replace(config, **{part: replace(getattr(config, part), **values)})
 
 
 def without_quadrotor(config: TrainConfig) -> TrainConfig:

@@ -59,7 +59,7 @@ class RolloutCarry(NamedTuple):
     """(B, 32) recurrent state of the Delta Action network."""
     alive: jax.Array
     """(B,) 1 while the world counts in the loss: until it crashes, stops or finishes, then 0."""
-    sensed: Any = ()
+    sensed: Any
     """Memory of the sensor models."""
 
 
@@ -213,7 +213,7 @@ class Observer(NamedTuple):
     """(worlds, state at the start) -> memory of the sensor models; () without models."""
     observe: Callable[..., tuple[Observation, Any]]
     """(worlds, state, target, last_action_b, keys (B,), memory) -> (observation, new memory).
-    `target` is the number of passed gates; without sensor models `memory` may be left out."""
+    `target` is the number of passed gates."""
 
 
 def make_observer(config: TrainConfig) -> Observer:
@@ -244,7 +244,7 @@ def make_observer(config: TrainConfig) -> Observer:
         target: jax.Array,
         last_action_b: jax.Array,
         keys: jax.Array,
-        memory: Any = (),
+        memory: Any,
     ) -> tuple[Observation, Any]:
         view = true_view(worlds, state, target)
         if models is not None:

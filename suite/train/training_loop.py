@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from policies.formats.checkpoint import load_arrays, read_config, save_arrays
@@ -368,8 +367,7 @@ def _resume(run: Run, fresh: Any) -> Any:
             f"would round differently from here on. Set NPROC={before} in the environment to "
             "resume with the same bits, or give another --out"
         )
-    arrays = load_arrays(saved, kind="training").arrays
-    state = jax.tree.map(jnp.asarray, tree_from_arrays(fresh, arrays, str(saved)))
+    state = tree_from_arrays(fresh, load_arrays(saved, kind="training").arrays, str(saved))
     # A measurement after the last finished iteration stays.
     curve.cut(folder, int(state.iteration))
     curve.cut(folder, int(state.iteration) + 1, curve.WATCHED)

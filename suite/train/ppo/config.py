@@ -30,14 +30,14 @@ class PpoConfig:
     spec: PolicySpec = field(default_factory=lambda: PolicySpec(rate_hz=15.0))
     """Rate, camera and encodings of the policy."""
     physics: PointMassConfig = field(default_factory=PointMassConfig)
-    """The point mass and its randomisation, and delay and noise of the images."""
+    """The point mass and its randomisation, and delays and noise of the observation."""
     quadrotor: QuadrotorConfig | None = None
     """The quadrotor through which the policy is trained; None: the point mass of `physics`."""
     loss: LossConfig = field(default_factory=LossConfig)
     """Of these settings only the safety radius r_q is used, by the reward."""
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
-    """Worlds (simulated scenes and drones) and number of steps. `stop_from` and `finish` are not
-    used: the critic learns the value of later steps, and a world is reset at the end of an
+    """Worlds (simulated scenes and drones) and number of steps. `shards`, `stop_from` and `finish`
+    are not used: the critic learns the value of later steps, and a world is reset at the end of an
     episode."""
     seed: Seed = 0
     """Seed of the parameters, the tracks, the randomisation and the exploration."""

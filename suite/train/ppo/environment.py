@@ -43,7 +43,7 @@ class Episode(NamedTuple):
     """(B, image_delay, height, width) images that wait for their delay, oldest first."""
     observed: jax.Array
     """(B, state_delay, state_size) state vectors that wait for their delay, oldest first."""
-    sensed: Any = ()
+    sensed: Any
     """Memory of the sensor models."""
 
 
@@ -108,7 +108,20 @@ def make_race(config: TrainConfig) -> Race:
         episode = episode._replace(state=after, target=target + passed, action_b=action_b)
         return episode, PeriodResult(terms, clearance < BODY_RADIUS_M, passed)
 
-    return Race(start, observe, fly)
+    return Race(*map(_unrounded, (start, observe, fly)))
+
+
+def _unrounded(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `function` with full float32 products, as in the trainer (see `suite.train.shards`).
+
+    Commands set this for their process, but another learner's program does not.
+    """
+
+    def call(*args: Any) -> Any:
+        with jax.default_matmul_precision("highest"):
+            return function(*args)
+
+    return call
 
 
 class RaceState(NamedTuple):

@@ -79,7 +79,8 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]
             before, hidden = carry
             observation, episode = race.observe(worlds, before, keys)
             mean, hidden = network.step(params, hidden, observation.state, observation.image)
-            noise = jax.random.normal(jax.random.fold_in(key, 1), mean.shape)
+            # The worlds' keys use the numbers 0 to B - 1, so B gives one that no world has.
+            noise = jax.random.normal(jax.random.fold_in(key, len(mean)), mean.shape)
             action = mean + jnp.exp(log_deviation) * noise
             after, result = race.fly(worlds, episode, action, keys)
             record = Record(

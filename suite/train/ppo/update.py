@@ -32,6 +32,7 @@ from suite.train.ppo.rollout import Record, make_rollout
 from suite.train.training_loop import Outcome, Run, RunPhase, Watch, flight_note, train_in_folder
 from suite.train.worlds import Worlds, sample_worlds
 from tracks.common.files import plain
+from tracks.input.ranges import check_ranges
 
 STEPS_PER_CORE_S = 8000.0
 """Environment steps a second of a processor core, in a rollout or a learning pass; a rough value
@@ -148,15 +149,8 @@ def make_update(
     """Return update(state, worlds) -> (state', the curve's row), which makes one iteration of PPO.
 
     It is compiled on the first call.
-
-    Raises:
-        ValueError: if `minibatches` does not divide `episode.batch`.
     """
     batch, steps = config.episode.batch, config.episode.steps
-    if config.minibatches < 1 or batch % config.minibatches:
-        raise ValueError(
-            f"minibatches is {config.minibatches}, allowed are divisors of episode.batch ({batch})"
-        )
     rollout = make_rollout(config.shared)
     actor_optimizer, critic_optimizer = make_optimizers(config)
     seed = jax.random.key(np.uint32(config.seed))
@@ -250,12 +244,17 @@ def train_ppo(
         ValueError: for invalid settings, and if the folder has another run.
         WorkFailed: if a number of the curve is not finite.
     """
-    shared = config.shared
+    check_ranges(config)
+    shared, batch = config.shared, config.episode.batch
     check(shared)
+    if batch % config.minibatches:
+        raise ValueError(
+            f"minibatches is {config.minibatches}, allowed are divisors of episode.batch ({batch})"
+        )
     phase = RunPhase(
         end=config.iterations,
         spec=config.spec,
-        frames=config.episode.batch * config.episode.steps,
+        frames=batch * config.episode.steps,
         worlds=functools.partial(sample_worlds, shared),
         make_update=lambda: make_update(config),
         note=functools.partial(flight_note, "reward"),

@@ -46,7 +46,7 @@ def test_training_casts_one_ray_a_pixel_whatever_the_camera_casts_in_flight(monk
 
     monkeypatch.setattr(rollout, "depth_image", spy)
     state = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
-    now = state, worlds.target, state.pos_w, jax.random.split(KEY, 4)
+    now = state, worlds.target, state.pos_w, jax.random.split(KEY, 4), ()
     jax.eval_shape(partial(rollout.make_observer(config).observe, worlds), *now)
     assert cast == [(camera.height * camera.width, 3)]
 

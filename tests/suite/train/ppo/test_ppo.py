@@ -187,14 +187,17 @@ def test_a_stopped_run_resumes_exactly_and_leaves_a_policy(tmp_path, monkeypatch
         run.train_ppo(replace(CONFIG, discount=0.5), whole, Console())
 
 
-def test_minibatches_and_strides_that_do_not_divide_are_refused(tmp_path):
-    for wrong in (3, 0):
-        with pytest.raises(ValueError, match=r"minibatches is \d, allowed are divisors .*\(4\)"):
-            make_update(replace(CONFIG, minibatches=wrong))
-    config = replace(CONFIG, episode=replace(CONFIG.episode, image_stride=4))
-    with pytest.raises(ValueError, match=r"image_stride is 4, allowed are divisors .*\(6\)"):
-        run.train_ppo(config, tmp_path / "run", Console())
-    assert not list(tmp_path.iterdir())
+def test_invalid_settings_are_refused_before_anything_is_written(tmp_path):
+    stride = replace(CONFIG, episode=replace(CONFIG.episode, image_stride=4))
+    for config, words in (
+        (replace(CONFIG, minibatches=3), r"minibatches is 3, allowed are divisors .*\(4\)"),
+        (replace(CONFIG, minibatches=0), "minibatches is 0, allowed is 1 to 10000"),
+        (replace(CONFIG, discount=1.5), "discount is 1.5, allowed is 0 to 1"),
+        (stride, r"image_stride is 4, allowed are divisors .*\(6\)"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            run.train_ppo(config, tmp_path / "run", Console())
+        assert not list(tmp_path.iterdir())
 
 
 def test_the_density_is_a_normal_one():
@@ -221,18 +224,34 @@ def flown(worlds):
     return actor, records
 
 
+def means_of(actor, records, hidden):
+    """Return the policy's actions (T, B, 3) without exploration on what a rollout observed."""
+    embeddings = jax.jit(network.encode)(actor.params, records.image.reshape(-1, 20, 20))
+    sequences = Sequences(
+        state=records.state, action_b=records.action_b, log_prob=records.log_prob,
+        done=records.done, advantage=records.log_prob, start=jnp.asarray(hidden)[None],
+    )  # fmt: skip
+    return means(actor.params, embeddings.reshape(6, 4, -1), sequences)
+
+
+def test_exploration_is_not_the_image_noise_of_a_world():
+    """A policy that sees the noise of its own action could learn to correct it."""
+    worlds = boxes_worlds(CONFIG.shared)
+    actor, records = flown(worlds)
+    noise = (records.action_b - means_of(actor, records, worlds.hidden)) * np.exp(1.0)
+    for key, explored in zip(jax.random.split(jax.random.key(2), 6), noise, strict=True):
+        grains = jax.vmap(lambda k: jax.random.normal(k, (20, 20)))(world_keys(key, worlds))
+        pixels = np.asarray(grains).reshape(4, -1)[:, : explored.size]
+        assert (np.abs(pixels - explored.ravel()).max(1) > 0.1).all()
+
+
 def test_the_learner_meets_the_actions_density_that_the_rollout_recorded():
     """Through delays, collisions and recurrent states of the start: a ratio of one everywhere."""
     worlds = crashing(boxes_worlds(CONFIG.shared))
     hidden = np.random.default_rng(0).normal(size=worlds.hidden.shape).astype(np.float32)
     actor, records = flown(worlds._replace(hidden=hidden))
     assert bool(records.done[:, 0].any()) and not bool(records.done[-1, 0])
-    embeddings = jax.jit(network.encode)(actor.params, records.image.reshape(-1, 20, 20))
-    sequences = Sequences(
-        state=records.state, action_b=records.action_b, log_prob=records.log_prob,
-        done=records.done, advantage=records.log_prob, start=jnp.asarray(hidden)[None],
-    )  # fmt: skip
-    mean = jax.jit(action_means)(actor.params, embeddings.reshape(6, 4, -1), sequences)
+    mean = means_of(actor, records, hidden)
     found = log_probability(mean, actor.log_deviation, records.action_b)
     np.testing.assert_allclose(found, records.log_prob, atol=1e-3)
 
@@ -296,6 +315,12 @@ def test_an_episode_that_ends_starts_another_and_says_why(worlds):
             assert (reward[:2] < -0.25).all() and np.abs(state.episode.state.pos_w[0]).max() < 90
     assert ended[0]["collided"][0] and ended[0]["tipped"][1] and not ended[0]["truncated"].any()
     assert ended[2]["truncated"][2]
+
+
+def test_an_accelerator_rounds_no_product_of_its_rotations(worlds):
+    state = jax.eval_shape(reset, KEYS, worlds)[1]
+    program = step.lower(KEYS, state, jnp.zeros((3, 3)), worlds).as_text()
+    assert "precision = [HIGHEST" in program and "precision = [DEFAULT" not in program
 
 
 def test_an_action_of_another_shape_is_refused_and_one_that_is_not_finite_ends(worlds):
