@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from eval.judging.statistics import wilson
 from eval.logs.flight_log import read_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.blind import make as make_module
 from suite.blind.build import build
 from suite.blind.make import make_set, open_answers
 from suite.blind.run import run_set
-from suite.blind.score import _gap_ratios, report, score_case, score_set, shares
+from suite.blind.score import COVERED, _gap_ratios, report, score_case, score_set, shares
 from suite.common.console import Console
 from tests.support.blind import NULL
 from tests.support.commands import answer, refused
@@ -179,6 +180,17 @@ def test_intervals_count_by_component_and_leave_out_what_cannot_be_seen():
     for number, covered in ((3, True), (2, False)):
         found["parameters"]["index"] = {"value": number}
         assert score(truth, found).covered == (covered,)
+
+
+def test_the_share_of_intervals_has_an_interval_over_cases():
+    """The components of one diagnosis depend on each other."""
+    truth = hidden("com_offset", offset=[0.001, 0.002])
+    right = effect("com_offset", offset=[[0.0, 0.01], [0.0, 0.01]])
+    wrong = effect("com_offset", offset=[[0.0, 0.01], [0.003, 0.004]])
+    found = [score_case("c", truth, said(one), 1.0) for one in (right, right, wrong, wrong)]
+    (share,) = (s for s in shares(found) if s.what == COVERED)
+    assert (share.count, share.of) == (6, 8)
+    assert (share.low, share.high) == wilson(3, 4)[1:]
 
 
 def counts(verdicts):
