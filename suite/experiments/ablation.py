@@ -68,8 +68,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     facts = {
         "recipe": options.recipe_fact(config),
         "a training": f"{config.iterations} gradient steps of {recipe.episode.batch} worlds x "
-        f"{recipe.episode.steps} steps, {steps:,} in all; {median_time} (median), "
-        f"{workspace.at_once} at a time",
+        f"{recipe.episode.steps} steps, {steps:,} in all; {median_time} (median)",
         **training.facts(config, runs),
     }
     parts = {
@@ -95,6 +94,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
             "seed": run.seed,
             "seconds": run.seconds,
             "commit": run.commit,
+            "machine": run.machine,
             "measured": run.points[-1] if run.points else None,
             "diverged": run.diverged,
         }

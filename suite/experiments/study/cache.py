@@ -42,11 +42,6 @@ class Workspace:
     """Number of processes, or a cluster. None: trainings run one after the other, and flights in as
     many processes as help."""
 
-    @property
-    def at_once(self) -> str:
-        """Number of trainings at once, or the address of the cluster."""
-        return str(self.workers or 1)
-
 
 def digest(value: Any) -> str:
     """Return a digest (16 hex digits) of `value`, which JSON must be able to hold."""

@@ -288,7 +288,7 @@ def test_the_comparison_of_schemes_from_one_command(tmp_path, small_scenes):
 
 
 def trained(key, seed, *points, diverged=""):
-    return TrainingResult(key, seed, 60.0, 5.0, "c", diverged, list(points))
+    return TrainingResult(key, seed, 60.0, 5.0, "c", "m", diverged, list(points))
 
 
 def judged(key, *cross, rate=1.0, v_max=5.0):
