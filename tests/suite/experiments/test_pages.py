@@ -18,7 +18,7 @@ from suite.common.report import Picture
 from suite.experiments import EXPERIMENTS, published
 from suite.experiments.pages.document import BEGIN, END, PageContents, check_page, write_document
 from suite.experiments.pages.paper import goals
-from suite.experiments.study.cache import FLIES, Workspace, code_digest, page_code
+from suite.experiments.study.cache import Workspace, page_code
 from suite.judging.content import policy_digest
 from suite.loop.compare import difference_cell
 from tests.support import commands
@@ -220,9 +220,10 @@ def test_the_counts_of_blind_cases_are_the_sums_of_their_sets():
         sums = [f"{a} of {b}" if b else "" for a, b in pairs.values()]
         count, trials = (int(number) for number in sum(pairs.values()))
         interval = wilson(count, trials)
+        ends = f" ({percent(interval.low)}-{percent(interval.high)} %)"
         # The last row counts intervals, which are not independent.
-        ends = f" ({percent(interval.low)}-{percent(interval.high)} %)" if cells != totals[-1] else ""
-        assert cells == [*sums, f"{count} of {trials}{ends}"]
+        counted = f"{count} of {trials}{'' if cells == totals[-1] else ends}"
+        assert cells == [*sums, counted]
     false, no_gap, single, *_ = totals
     named, wrong = single[3].split(" (")[0], false[3].split(" (")[0]
     assert f"| {named} cases; {wrong}, three" in readme("blind")
@@ -239,7 +240,7 @@ def write_page(folder, name, flown, code):
 
 
 def test_a_page_is_older_than_another_policy_or_other_code(tmp_path, capsys):
-    code, current = code_digest(*FLIES), policy_digest(shipped.DEFAULT)
+    code, current = page_code("table2"), policy_digest(shipped.DEFAULT)
     write_page(tmp_path, "table2", (shipped.DEFAULT, current), code)
     write_page(tmp_path, "simulators", (shipped.DEFAULT, "0" * 16), code)
     # A checkpoint in a folder with the name of a shipped policy is another policy.
