@@ -142,6 +142,7 @@ def bars_chart(
     """
     figure = Figure(figsize=(10.4, 5.2), layout="constrained")
     panels = figure.subplots(1, 3, sharey=True)
+    paper_label: str | None = "the paper"
     for axes, name in zip(panels, ("success_cross", "collision_free", "v_max"), strict=True):
         scale = METRICS[name].scale
         for y, (key, numbers) in enumerate(rows.items()):
@@ -152,8 +153,8 @@ def bars_chart(
             axes.plot([least, most], [y, y], "o-", ms=4, lw=1.2, color=colour, label=label)
             if key in printed:
                 paper_value = scale * getattr(printed[key], name)
-                label = "the paper" if y == 0 else None
-                axes.plot(paper_value, y, "D", ms=7, mfc="none", mec="black", label=label)
+                axes.plot(paper_value, y, "D", ms=7, mfc="none", mec="black", label=paper_label)
+                paper_label = None  # once in the legend
         titled(axes, METRICS[name].title)
         if scale == 100:
             axes.set_xlim(-3, 103)

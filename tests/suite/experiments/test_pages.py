@@ -16,9 +16,11 @@ from suite.commands import reproduce as command
 from suite.common.console import Console
 from suite.common.report import Picture
 from suite.experiments import EXPERIMENTS, published
+from suite.experiments.pages import charts
 from suite.experiments.pages.document import BEGIN, END, PageContents, check_page, write_document
-from suite.experiments.pages.paper import goals
+from suite.experiments.pages.paper import ablation, goals
 from suite.experiments.study.cache import Workspace, page_code
+from suite.experiments.study.training import Spread
 from suite.judging.content import policy_digest
 from suite.loop.compare import difference_cell
 from tests.support import commands
@@ -77,6 +79,17 @@ def test_differences_are_coloured_by_what_they_tell():
     assert difference_cell(Interval(0.1, 0.02, 0.2)) == Cell("+10 [+2, +20]", "good")
     assert difference_cell(Interval(-0.1, -0.2, -0.02)).tone == "bad"
     assert difference_cell(Interval(-0.001, -0.1, 0.1)) == Cell("+0 [-10, +10]", "")
+
+
+def test_the_chart_of_the_ablation_explains_its_diamonds_whichever_rows_the_paper_has(monkeypatch):
+    monkeypatch.setattr(charts, "png", lambda figure: figure)
+    numbers = {name: Spread(0.5, 0.4, 0.6) for name in ("success_cross", "collision_free", "v_max")}
+    rows, kinds = {"field 0.8": numbers, "progress 0.8": numbers}, {"field": "f", "progress": "p"}
+    assert [key in ablation()[1] for key in rows] == [False, True]
+    figure = charts.bars_chart(rows, ablation()[1], kinds, "3 seeds")
+    (legend,) = figure.legends
+    texts = [text.get_text() for text in legend.get_texts()]
+    assert texts == ["mean, least and most of 3 seeds", "the paper"]
 
 
 def test_goals_by_hand():
