@@ -262,6 +262,8 @@ def test_shipped_policies_fly_the_ablations_tracks_in_the_dynamics_of_their_trai
     assert numbers["rows"][0]["intervals"]["success_cross"] == wilson(5, 10)._asdict()
     assert reproduce(tmp_path, "four_gates", "--policy", "race-papr") == 2
     assert "Did you mean 'race-paper'?" in capsys.readouterr().err
+    assert reproduce(tmp_path, "four_gates", "--seed", "0") == 2
+    assert "measured on worlds of its training" in capsys.readouterr().err
 
 
 @pytest.mark.slow
