@@ -19,9 +19,9 @@ from eval.effects import EFFECTS
 from eval.judging.statistics import wilson_by_group
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.blind.cases import MULTIPLES, ROTORPY
-from suite.blind.make import load_manifest, open_answers, simulator_of
+from suite.blind.make import RESULTS, load_manifest, open_answers, simulator_of
 from suite.blind.rotorpy_flight import hub_damping, is_hub_damping
-from suite.blind.run import FAILED, RESULTS, TIMED
+from suite.blind.run import FAILED, TIMED
 from suite.diagnose.estimate.parameters import effects_in
 from tracks.common.files import write_json, write_text
 from tracks.common.grid import markdown, table

@@ -53,6 +53,15 @@ def test_a_set_goes_on_where_it_stopped(small_set, monkeypatch):
         make_set(small_set, 5, None, Console())
 
 
+def test_a_case_that_is_made_again_loses_its_diagnosis(small_set):
+    """Its flights may be others, if the code has changed; the set accepts them."""
+    for name in ("case_001", "case_002"):
+        write_json(small_set / "results" / name / "seconds.json", {"seconds": 1.0})
+    (small_set / "answers" / "case_002.json").unlink()
+    make_set(small_set, 5, None, Console())
+    assert [path.name for path in (small_set / "results").iterdir()] == ["case_001"]
+
+
 def test_without_its_simulator_nothing_is_begun(tmp_path, monkeypatch, capsys):
     """A folder that says whose set it is would be refused for another's."""
     monkeypatch.setitem(sys.modules, "torchdiffeq", None)
