@@ -29,7 +29,8 @@ def _percent_axis(axes: Axes, low: float, vertical: bool = True) -> None:
 def level_chart(cells: Sequence[Tally]) -> bytes:
     """Return a chart of the success rate (above) and v_max (below) by level, a column per track.
 
-    Diamonds are the values of the paper, moved a little to the right.
+    Diamonds are the values of the paper, moved a little to the right. The axis shows all rates, but
+    not the whole intervals of the paper, which are long.
     """
     figure = Figure(figsize=(10.4, 5.4), layout="constrained")
     rows = figure.subplots(2, len(JUDGED), sharex=True, sharey="row")
@@ -39,7 +40,7 @@ def level_chart(cells: Sequence[Tally]) -> bytes:
         upper, lower = rows[:, number]
         paper = [c for c in sim_to_sim().cells if (c.method, c.track) == ("with_delta", track)]
         paper_levels = np.array([c.level for c in paper]) + 0.25
-        label = f"the paper, {paper[0].trials} trials per level"
+        label = f"the paper, {paper[0].trials} trials per level (bars may be cut at the axis)"
         paper_rates = [wilson(c.won, c.trials) for c in paper]
         dots(upper, paper_levels, paper_rates, 100, label=label, fmt="D", lw=1.2, **hollow)
         lower.plot(paper_levels, [c.v_max for c in paper], "D", **hollow)
