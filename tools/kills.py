@@ -51,6 +51,8 @@ IGNORED_KEYS = ("seconds", "steps_per_s", "cold", "git_commit", "out", "collecti
 """Keys of JSON files that differ between equal runs: times and folders."""
 WITHIN_S = 5.0
 """Longest time from a signal to the end of the command [s]."""
+LONGEST_S = 1800.0
+"""Time after which a command has failed: it is killed then [s]."""
 
 
 def start(command: str, out: Path) -> subprocess.Popen[bytes]:
@@ -82,11 +84,15 @@ def finish(command: str, out: Path) -> float:
     """Run a command to its end and return its duration [s].
 
     Raises:
-        SystemExit: if the command fails.
+        SystemExit: if the command fails, or does not end within `LONGEST_S`.
     """
     start_s = time.monotonic()
     process = start(command, out)
-    _, output = process.communicate()
+    try:
+        _, output = process.communicate(timeout=LONGEST_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        raise SystemExit(f"{command} did not end within {LONGEST_S:g} s") from None
     if process.returncode:
         raise SystemExit(f"{command} ended with {process.returncode}: {output.decode()[-500:]}")
     return time.monotonic() - start_s
@@ -108,7 +114,8 @@ def start_and_signal(number: signal.Signals, after_s: float) -> tuple[int, float
     """Start a training, and send it a signal after the time `after_s` [s].
 
     Returns:
-        The exit code of the training, and the time from the signal to its end [s].
+        The exit code of the training, and the time from the signal to its end [s]. A training that
+        does not end is killed.
     """
     with tempfile.TemporaryDirectory() as folder:
         training = subprocess.Popen(
@@ -122,7 +129,12 @@ def start_and_signal(number: signal.Signals, after_s: float) -> tuple[int, float
         time.sleep(after_s)
         sent_s = time.monotonic()
         training.send_signal(number)
-        return training.wait(), time.monotonic() - sent_s
+        try:
+            code = training.wait(4 * WITHIN_S)
+        except subprocess.TimeoutExpired:
+            training.kill()
+            code = training.wait()
+        return code, time.monotonic() - sent_s
 
 
 def send_signals(count: int, rng: random.Random) -> int:

@@ -20,7 +20,7 @@ import tyro
 from eval.effects import EFFECTS
 from eval.flights.follow import FlightFailed
 from eval.flights.trajectory import ordinary_flights
-from eval.judging.statistics import wilson
+from eval.judging.statistics import wilson, wilson_by_group
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import Motion, Wrench
 from eval.vehicles.vehicle import Vehicle, with_effects
@@ -144,10 +144,11 @@ def main(count: tyro.conf.Positional[int], seed: tyro.conf.Positional[int] = 0) 
 
     cases = [[seed, number] for number in range(count)]
     run_pieces(first_valid_draw, cases, usable_cores(), keep, pinned=True)
-    covered = [inside for intervals, _, _ in outcomes.values() for inside in intervals]
+    by_case = [intervals for intervals, _, _ in outcomes.values()]
+    covered = [inside for intervals in by_case for inside in intervals]
     total, false = len(outcomes), sum(bool(names) for _, names, _ in outcomes.values())
     print(f"intervals of a named drag that contain it: {sum(covered)} of {len(covered)}", end=" ")
-    print(f"({wilson(sum(covered), max(len(covered), 1))})" if covered else "")
+    print(f"({wilson_by_group(by_case)})" if covered else "")
     print(f"cases with a false name: {false} of {total} ({wilson(false, max(total, 1))})")
     return 0 if sum(covered) >= 0.85 * len(covered) and false <= 0.1 * total else 1
 

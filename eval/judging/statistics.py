@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import comb, sqrt
 from statistics import NormalDist
 from typing import NamedTuple
@@ -63,6 +63,21 @@ def wilson(successes: float, trials: int) -> Interval:
     low = 0.0 if successes == 0 else middle - half
     high = 1.0 if successes == trials else middle + half
     return Interval(rate, low, high)
+
+
+def wilson_by_group(groups: Sequence[Sequence[bool]]) -> Interval:
+    """Return the share of true values in all groups, with a Wilson interval over groups.
+
+    The values of a group may depend on each other, as the components of one estimate do. So the
+    interval is that of as many trials as there are groups with a value. It is too wide where the
+    values of a group are independent.
+
+    Raises:
+        ValueError: if there is no value.
+    """
+    values = [value for group in groups for value in group]
+    count = sum(bool(group) for group in groups)
+    return wilson(count * (sum(values) / max(len(values), 1)), count)
 
 
 def bootstrap(

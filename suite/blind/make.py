@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -29,6 +30,8 @@ from tracks.input.reading import read_json
 
 SCHEMA = 1
 """Version of the files of a set."""
+RESULTS = "results"
+"""Name of the folder with the diagnoses of a set."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,8 @@ def make_set(
             if isinstance(built, str):
                 failed[name] = built
                 return
+            # A diagnosis of other flights with this name does not belong to this case.
+            shutil.rmtree(out / RESULTS / name, ignore_errors=True)
             # The answer is written first, so that every existing case has one.
             write_json(out / "answers" / f"{name}.json", {**stamp(SCHEMA, seed), **built.answer})
             with replacing_folder(out / "cases" / name) as temporary:

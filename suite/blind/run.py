@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from suite.blind.make import load_manifest
+from suite.blind.make import RESULTS, load_manifest
 from suite.common.console import Console
 from suite.common.errors import INTERRUPTED, WorkFailed
 from suite.common.running.remote import Job
@@ -18,8 +18,6 @@ from tracks.common.work import Workers
 
 Diagnose = Callable[[Sequence[Path], Path, Path], None]
 """Function (flight logs, vehicle file, output folder) that writes `diagnosis.json`."""
-RESULTS = "results"
-"""Name of the folder of the results of a set."""
 TIMED, FAILED = "seconds.json", "error.json"
 """Names of two files. A case has the first one, the time of the diagnosis, or the second one, the
 reason why the diagnosis failed."""

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from eval.effects import EFFECTS
-from eval.judging.statistics import wilson
+from eval.judging.statistics import wilson_by_group
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.blind.cases import MULTIPLES, ROTORPY
-from suite.blind.make import load_manifest, open_answers, simulator_of
+from suite.blind.make import RESULTS, load_manifest, open_answers, simulator_of
 from suite.blind.rotorpy_flight import hub_damping, is_hub_damping
-from suite.blind.run import FAILED, RESULTS, TIMED
+from suite.blind.run import FAILED, TIMED
 from suite.diagnose.estimate.parameters import effects_in
 from tracks.common.files import write_json, write_text
 from tracks.common.grid import markdown, table
@@ -31,6 +31,8 @@ SCHEMA = 1
 """Version of table.json."""
 GAP_LIMIT = 1.1
 """Goal for the gap with the named effects, divided by the noise floor: at most this."""
+COVERED = "95 % intervals that contain the true value"
+"""Description of the row that counts intervals; the other rows count cases."""
 
 
 @dataclass(frozen=True)
@@ -70,13 +72,16 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Share:
-    """A row of the table: `count` of `of` cases, with a 95 % Wilson interval of this share."""
+    """A row of the table: `count` of `of` cases, with a 95 % Wilson interval of this share.
+
+    The row `COVERED` counts intervals of the diagnoses; its Wilson interval is over cases.
+    """
 
     what: str
-    """Description of the counted cases."""
+    """Description of what is counted."""
     count: int
     of: int
-    """Number of cases that could have been counted, such as all nulls."""
+    """Largest possible count, such as the number of nulls."""
     low: float
     high: float
     wanted: str
@@ -203,8 +208,7 @@ def shares(verdicts: Sequence[Verdict]) -> list[Share]:
         ("inseparable: the right set", "95 %", [v.exact for v in of("blurred")]),
         ("the same with separating flights", "95 %", [v.exact for v in of("separated")]),
         ("cases with a false extra name", "", [v.extra > 0 for v in completed if v.hidden]),
-        ("95 % intervals that contain the true value", "93-97 %",
-         [x for v in verdicts for x in v.covered]),
+        (COVERED, "93-97 %", [x for v in verdicts for x in v.covered]),
         (f"gap after within {GAP_LIMIT} of the noise floor, where named", "all",
          [ratio <= GAP_LIMIT for ratio in ratios if ratio is not None]),
         ("diagnosis failed", "none", [v.verdict == "failed" for v in verdicts]),
@@ -212,7 +216,9 @@ def shares(verdicts: Sequence[Verdict]) -> list[Share]:
     rows = []
     for what, wanted, flags in lines:
         if flags:
-            share = wilson(sum(flags), len(flags))
+            # The intervals of one diagnosis are not independent of each other.
+            groups = [v.covered for v in verdicts] if what == COVERED else [[x] for x in flags]
+            share = wilson_by_group(groups)
             rows.append(Share(what, sum(flags), len(flags), share.low, share.high, wanted))
     return rows
 

@@ -7,7 +7,7 @@ starts, it prints an estimate of the time and the memory of the remaining work.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,13 @@ import psutil
 from suite.common.console import Console, duration, size
 from suite.common.provenance import write_run_record
 from tracks.common.files import plain, write_json
-from tracks.common.provenance import differences, first_changes
+from tracks.common.provenance import differences, first_changes, git_commit, stamp
 from tracks.input.reading import read_json
 
 MARK = "stage.json"
 """Name of the file in a stage's folder that marks the stage as finished; written last."""
+SCHEMA = 1
+"""Version of that file."""
 
 
 def claim(out: Path, config: Any, seed: int) -> None:
@@ -110,6 +112,12 @@ def is_done(folder: Path) -> bool:
     return (folder / MARK).is_file()
 
 
+def stage_commits(out: Path, names: Iterable[str]) -> list[str]:
+    """Return the commits of the code that did the finished stages `names` in `out`, each once."""
+    marks = (read_json(out / name / MARK) for name in names)
+    return sorted({mark.get("git_commit") or "unknown" for mark in marks})
+
+
 def _run_stage(stage: Stage, folder: Path, number: str, console: Console) -> float:
     """Do a stage unless it is finished, and return the time that it took [s].
 
@@ -118,7 +126,10 @@ def _run_stage(stage: Stage, folder: Path, number: str, console: Console) -> flo
     if is_done(folder):
         console.note(f"{number} {stage.title}: done before, in {folder}")
         try:
-            return float(read_json(folder / MARK)["seconds"])
+            mark = read_json(folder / MARK)
+            if mark.get("git_commit") != git_commit():
+                console.note(f"warning: by the code of commit {mark.get('git_commit')}")
+            return float(mark["seconds"])
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
                 f"{folder / MARK}: not the mark of a finished stage ({error}); remove the file to "
@@ -129,7 +140,8 @@ def _run_stage(stage: Stage, folder: Path, number: str, console: Console) -> flo
     stage.work(folder)
     seconds = time.monotonic() - started
     # Written last, when all other files are on the disk.
-    write_json(folder / MARK, {"stage": stage.title, "seconds": seconds})
+    mark = {**stamp(SCHEMA, None), "stage": stage.title, "seconds": seconds}
+    write_json(folder / MARK, mark)
     console.note(f"{number} took {duration(seconds)}")
     return seconds
 

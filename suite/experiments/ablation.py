@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from eval.judging.statistics import Interval, wilson
 from suite.common.console import Console, duration
 from suite.common.report import Picture
 from suite.experiments.pages import paper
@@ -70,13 +69,12 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     facts = {
         "recipe": options.recipe_fact(config),
         "a training": f"{config.iterations} gradient steps of {recipe.episode.batch} worlds x "
-        f"{recipe.episode.steps} steps, {steps:,} in all; {median_time} (median), "
-        f"{workspace.at_once} at a time",
+        f"{recipe.episode.steps} steps, {steps:,} in all; {median_time} (median)",
         **training.facts(config, runs),
     }
     parts = {
         "The paper's table, and ours": [
-            _comparison_grid(rows, config.trials),
+            _comparison_grid(rows),
             Picture(chart, "Success cross, collision-free rate and v_max by setting"),
         ],
     }
@@ -88,7 +86,6 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
             "seeds": row.seeds,
             "diverged": row.diverged,
             "over": {name: row.at[-1][name] for name in SPREADS if row.at},
-            "pooled": {name: pooled(row, name, config.trials) for name in RATES if row.at},
         }
         for row in rows
     ]
@@ -98,6 +95,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
             "seed": run.seed,
             "seconds": run.seconds,
             "commit": run.commit,
+            "machine": run.machine,
             "measured": run.points[-1] if run.points else None,
             "diverged": run.diverged,
         }
@@ -138,28 +136,19 @@ def weight(row: Summary) -> float:
     return row.recipe.loss.progress or row.recipe.loss.progress_norm
 
 
-def pooled(row: Summary, name: str, trials: int) -> Interval:
-    """Return the Wilson interval of a rate (one of `RATES`) over all training seeds together.
-
-    Each seed has the given number of trials.
-    """
-    return wilson(sum(round(trials * x) for x in row.values(name)), trials * len(row.trainings))
-
-
-def _comparison_grid(rows: Sequence[Summary], trials: int) -> Grid:
+def _comparison_grid(rows: Sequence[Summary]) -> Grid:
     """Return a table of our results and those that the paper prints, a row per setting."""
     source, paper_rows = paper.ablation()
-    headers = ["setting", "lambda_p", "success cross [%]", "pooled [%]", "paper [%]",
-               "collision-free rate [%]", "pooled [%]", "paper [%]",
+    headers = ["setting", "lambda_p", "success cross [%]", "paper [%]",
+               "collision-free rate [%]", "paper [%]",
                "v_max [m/s]", "largest [m/s]", "paper [m/s]", "gates", "diverged"]  # fmt: skip
     lines = []
     for row in rows:
         printed = paper_rows.get(row.key)
         line = [row.label, f"{weight(row):g}"]
         for name in RATES:
-            _, low, high = pooled(row, name, trials) if row.at else (0, 0, 0)
-            line += [row.text(name), f"[{100 * low:.0f}, {100 * high:.0f}]" if row.at else "-"]
-            line += [f"{100 * getattr(printed, name):.0f}" if printed else "-"]
+            paper_rate = f"{100 * getattr(printed, name):.0f}" if printed else "-"
+            line += [row.text(name), paper_rate]
         line += [row.text("v_max"), f"{max(row.values('v_max_most')):.1f}" if row.at else "-"]
         line += [f"{printed.v_max:.1f}" if printed else "-"]
         lines.append([*line, row.text("gates"), f"{row.diverged} of {row.seeds}"])

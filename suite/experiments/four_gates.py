@@ -45,7 +45,11 @@ class Config:
 
 
 def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
-    """Return the contents of the page; every policy is flown again."""
+    """Return the contents of the page; every policy is flown again.
+
+    Raises:
+        ValueError: for an unknown policy, and for the seed of a policy's training.
+    """
     from policies.formats.policy_file import load_policy_checkpoint
     from suite.experiments.study.validation import make_validation
     from suite.train.run import start_params
@@ -53,6 +57,11 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     recipes = {name: flown_recipe(name) for name in config.policy or shipped.names()}
     measured = {}
     for name, recipe in recipes.items():
+        if recipe.seed == config.seed:
+            raise ValueError(
+                f"--seed {config.seed} is that of the training of {name}, which would be measured "
+                "on worlds of its training; give another"
+            )
         params = start_params(load_policy_checkpoint(shipped.locate(name)), recipe.spec)
         measure = make_validation(recipe, config.trials, config.seed, config.seconds)
         measured[name] = measure(params)

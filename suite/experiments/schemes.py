@@ -74,7 +74,6 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
         "recipe": f"{options.recipe_fact(config)}, lambda_p={config.progress:g}",
         "an iteration": f"{episode.batch} worlds x {episode.steps} steps",
         **training.facts(config, runs),
-        "trainings at once": workspace.at_once,
     }
     measured = [row for row in rows if row.at]
     tables = [_end_grid(measured), _time_grid(measured, compile_s)]
@@ -95,7 +94,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
         }
         for row in rows
     ]
-    fields = ("seed", "points", "compile_s", "commit", "diverged")
+    fields = ("seed", "points", "compile_s", "commit", "machine", "diverged")
     trainings = [{"scheme": run.setting, **{f: getattr(run, f) for f in fields}} for run in runs]
     return PageContents(facts, parts, {"rows": numbers, "runs": trainings})
 

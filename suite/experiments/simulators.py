@@ -148,7 +148,7 @@ def _success_grid(results: Sequence[ConditionResult]) -> Grid:
     It has a row per policy and simulator.
     """
     headers = ["policy", "simulator", "success", "minus mujoco", "p", "same ending"]
-    headers += ["lap time difference [s]", "mean speed difference [m/s]"]
+    headers += ["absolute lap time difference [s]", "absolute mean speed difference [m/s]"]
     rows: list[Any] = []
     for name in results[0].results:
         for entry in results:

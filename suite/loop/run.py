@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from eval.judging.results import read_trials
 from suite.common.charts import dots, legend, png, titled
 from suite.common.console import Console, duration
-from suite.common.report import Details, Links, Picture, Report, Section, html
-from suite.common.stages import claim, run_stages
+from suite.common.report import Details, Links, Part, Picture, Report, Section, html
+from suite.common.stages import claim, run_stages, stage_commits
 from suite.judging.trials import parse_tracks
 from suite.loop import delta_action, hidden_effect
 from suite.loop.compare import CAVEAT, PolicyResult, cell_grid, overall_grid, policy_results
@@ -24,7 +24,7 @@ from suite.loop.config import LoopConfig, loop_by_content
 from suite.loop.variants import COLOURS, Findings
 from suite.loop.work import LoopRun, plan
 from tracks.common.files import plain, to_json, write_json, write_text
-from tracks.common.grid import Grid, markdown, rich_table, table
+from tracks.common.grid import markdown, rich_table, table
 from tracks.common.provenance import VERSION, git_commit, stamp
 from tracks.common.work import Workers
 
@@ -70,13 +70,17 @@ def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any
     ]
     chart = Picture(success_chart(policies, loop.labels), "Bars: 95 % intervals over trials.")
     findings = loop.summarise(config, out, policies)
+    caveat, commits = CAVEAT, stage_commits(out, seconds)
+    if len(commits) > 1:
+        listed = ", ".join(commits)
+        caveat += f" The stages were done by {len(commits)} versions of the code: {listed}."
     # Write table.md, loop.json and report.html.
     header = stamp(1, config.seed)
     comment = "; ".join(f"{key}: {value}" for key, value in header.items())
     texts = [
         findings.verdict,
         *map(markdown, grids),
-        CAVEAT,
+        caveat,
         *findings.errors,
         f"<!-- {comment} -->\n",
     ]
@@ -88,16 +92,18 @@ def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any
         **findings.numbers,
         "seeds": seeds(run),
         "stage_seconds": {name: round(value, 1) for name, value in seconds.items()},
+        "stage_commits": commits,
         "config": config,
         "files": {name: name for name in FILES},
     }
     write_json(out / "loop.json", answer)
-    write_text(out / "report.html", html(_report(run, findings, [chart, *grids], seconds)))
+    results_parts = [chart, *grids, caveat]
+    write_text(out / "report.html", html(_report(run, findings, results_parts, seconds)))
     # Print the same tables, the verdict and where the files are.
     for grid in grids:
         console.show(rich_table(grid))
     errors = [] if loop.hidden else [text.strip("\n") for text in findings.errors]
-    console.say("\n\n".join([CAVEAT, *errors, findings.verdict]) + "\n")
+    console.say("\n\n".join([caveat, *errors, findings.verdict]) + "\n")
     console.say(f"table:     {out / 'table.md'}")
     console.say(f"report:    {out / 'report.html'}")
     if loop.hidden:
@@ -121,12 +127,13 @@ def seeds(run: LoopRun) -> dict[str, Any]:
 def _report(
     run: LoopRun,
     findings: Findings,
-    results: Sequence[Grid | Picture],
+    results: Sequence[Part],
     seconds: Mapping[str, float],
 ) -> Report:
     """Return the report: chart and tables of the policies, findings, pictures of flights, files.
 
-    The chart and the tables are `results`; `seconds` are the times of the stages [s].
+    `results` are the chart, the tables and a note on them; `seconds` are the times of the stages
+    [s].
     """
     loop, config, out = run.loop, run.config, run.out
     vehicle = ", with the hidden vehicle" if loop.hidden else ""
@@ -161,7 +168,7 @@ def _report(
             "version": f"{VERSION}, {(git_commit() or 'no commit')[:10]}",
         },
         sections=[
-            Section("On the same seeds", [loop.reading, *results, CAVEAT]),
+            Section("On the same seeds", [loop.reading, *results]),
             *findings.sections,
             *flights,
             Section("Files and configuration", files),

@@ -14,6 +14,8 @@ from eval.vehicles.vehicle import MotorMap, Vehicle
 Signals = dict[str, np.ndarray]
 """Signal -> (T, C) values at T times in C components, in SI units and the suite's frames; `time` is
 (T,) [s]."""
+COMMANDS = ("cmd_rate", "throttle", "cmd_thrust")
+"""Signals that are commands of the policy."""
 LINEAR, SQUARE = 0.62, 1.78
 """Coefficients of the firmware's curve: body rate = LINEAR stick + SQUARE stick^2, where rate and
 stick are relative to typical large values (the 98 % quantile of the rate)."""
@@ -41,20 +43,13 @@ def linear_stick_map(signals: Signals, _: Vehicle) -> Signals:
     return {**signals, "cmd_rate": np.sign(command) * stick * largest}
 
 
-def log_commands_early(signals: Signals, _: Vehicle) -> Signals:
-    """Log commands 150 ms before they act."""
-    count = round(0.15 / float(np.median(np.diff(signals["time"]))))
-    early = {n: np.roll(signals[n], -count, axis=0) for n in ("cmd_rate", "throttle", "cmd_thrust")}
-    return {**signals, **early}
-
-
 def hold_commands(signals: Signals, _: Vehicle) -> Signals:
     """Update commands at two thirds of the policy's rate: 20 instead of 30 Hz."""
     step = float(np.median(np.diff(signals["time"])))
     # Time of the last update before each row, and the row at that time.
     update_s = np.floor(signals["time"] * 20.0 + 1e-6) / 20.0
     index = np.clip(np.round((update_s - signals["time"][0]) / step).astype(int), 0, None)
-    return {**signals, **{n: signals[n][index] for n in ("cmd_rate", "throttle", "cmd_thrust")}}
+    return {**signals, **{n: signals[n][index] for n in COMMANDS if n in signals}}
 
 
 def hold_rotor_speeds(signals: Signals, _: Vehicle) -> Signals:
@@ -123,8 +118,9 @@ def drop_barometer(signals: Signals, _: Vehicle) -> Signals:
     step = float(np.median(np.diff(signals["time"])))
     count = round(2.0 / step)
     ground = {n: np.repeat(v[:1], count, axis=0) for n, v in signals.items() if n != "time"}
-    for name in ("motor", "throttle", "cmd_thrust", "vel", "rate", "cmd_rate"):
-        ground[name] = 0.0 * ground[name]
+    for name in ("motor", "vel", "rate", *COMMANDS):
+        if name in ground:
+            ground[name] = 0.0 * ground[name]
     joined = {n: np.concatenate([v, signals[n]]) for n, v in ground.items()}
     joined["time"] = signals["time"][0] + step * np.arange(count + len(signals["time"]))
     joined["baro"][count:] -= 1.6

@@ -17,6 +17,7 @@ from eval.effects.interface import GRAVITY
 from eval.logs.faults.reading import parse_readings, read_rows
 from eval.vehicles.vehicle import Vehicle
 from suite.experiments.injected.changes import (
+    COMMANDS,
     Signals,
     add_throttle_bias,
     arms_in_mm,
@@ -27,7 +28,6 @@ from suite.experiments.injected.changes import (
     hold_rotor_speeds,
     jitter_stamps,
     linear_stick_map,
-    log_commands_early,
     map_of,
     other_curve,
     remove_gravity,
@@ -224,7 +224,7 @@ KINDS: dict[str, Kind] = {
     ),
     "commands act 150 ms later": Kind(
         ("command_delay",),
-        change=log_commands_early,
+        change=partial(shift, late_s=-0.15, names=COMMANDS),
         needs=("cmd_rate", "rate", "throttle"),
     ),
     "loop at two thirds of its rate (20 of 30 Hz)": Kind(

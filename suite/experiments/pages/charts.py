@@ -29,7 +29,8 @@ def _percent_axis(axes: Axes, low: float, vertical: bool = True) -> None:
 def level_chart(cells: Sequence[Tally]) -> bytes:
     """Return a chart of the success rate (above) and v_max (below) by level, a column per track.
 
-    Diamonds are the values of the paper, moved a little to the right.
+    Diamonds are the values of the paper, moved a little to the right. The axis shows all rates, but
+    not the whole intervals of the paper, which are long.
     """
     figure = Figure(figsize=(10.4, 5.4), layout="constrained")
     rows = figure.subplots(2, len(JUDGED), sharex=True, sharey="row")
@@ -39,7 +40,7 @@ def level_chart(cells: Sequence[Tally]) -> bytes:
         upper, lower = rows[:, number]
         paper = [c for c in sim_to_sim().cells if (c.method, c.track) == ("with_delta", track)]
         paper_levels = np.array([c.level for c in paper]) + 0.25
-        label = f"the paper, {paper[0].trials} trials per level"
+        label = f"the paper, {paper[0].trials} trials per level (bars may be cut at the axis)"
         paper_rates = [wilson(c.won, c.trials) for c in paper]
         dots(upper, paper_levels, paper_rates, 100, label=label, fmt="D", lw=1.2, **hollow)
         lower.plot(paper_levels, [c.v_max for c in paper], "D", **hollow)
@@ -142,6 +143,7 @@ def bars_chart(
     """
     figure = Figure(figsize=(10.4, 5.2), layout="constrained")
     panels = figure.subplots(1, 3, sharey=True)
+    paper_label: str | None = "the paper"
     for axes, name in zip(panels, ("success_cross", "collision_free", "v_max"), strict=True):
         scale = METRICS[name].scale
         for y, (key, numbers) in enumerate(rows.items()):
@@ -152,8 +154,8 @@ def bars_chart(
             axes.plot([least, most], [y, y], "o-", ms=4, lw=1.2, color=colour, label=label)
             if key in printed:
                 paper_value = scale * getattr(printed[key], name)
-                label = "the paper" if y == 0 else None
-                axes.plot(paper_value, y, "D", ms=7, mfc="none", mec="black", label=label)
+                axes.plot(paper_value, y, "D", ms=7, mfc="none", mec="black", label=paper_label)
+                paper_label = None  # once in the legend
         titled(axes, METRICS[name].title)
         if scale == 100:
             axes.set_xlim(-3, 103)

@@ -8,6 +8,8 @@ from __future__ import annotations
 import ast
 import functools
 import hashlib
+import tomllib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,9 +24,9 @@ NO_RESULT = ("view", "importers", "faults", "envs")
 FLIES = ("tracks", "policies", "eval")
 """Packages whose code can change a flight."""
 MEASURED = {
-    "ablation": ("suite/train",),
-    "schemes": ("suite/train",),
-    "four_gates": ("suite/train",),
+    "ablation": ("suite/train", "suite/experiments/study"),
+    "schemes": ("suite/train", "suite/experiments/study"),
+    "four_gates": ("suite/train", "suite/experiments/study"),
     "faults": ("suite/experiments/injected", "eval/importers", "eval/logs/faults"),
 }
 """Page -> folders with the code that it measures, besides `FLIES`."""
@@ -42,11 +44,6 @@ class Workspace:
     """Number of processes, or a cluster. None: trainings run one after the other, and flights in as
     many processes as help."""
 
-    @property
-    def at_once(self) -> str:
-        """Number of trainings at once, or the address of the cluster."""
-        return str(self.workers or 1)
-
 
 def digest(value: Any) -> str:
     """Return a digest (16 hex digits) of `value`, which JSON must be able to hold."""
@@ -61,18 +58,32 @@ def code_digest(*folders: str) -> str:
     "tracks" or "suite/train".
     """
     sha256 = hashlib.sha256()
-    for folder in folders:
-        for path in sorted((ROOT / folder).rglob("*.py")):
-            name = path.relative_to(ROOT)
-            if not set(path.relative_to(ROOT / folder).parts) & set(NO_RESULT):
-                tree = _tree_text(ast.parse(path.read_bytes()))
-                sha256.update(f"{name.as_posix()}\0{tree}\0".encode())
+    for path in _files(folders, "*.py"):
+        name = path.relative_to(ROOT)
+        tree = _tree_text(ast.parse(path.read_bytes()))
+        sha256.update(f"{name.as_posix()}\0{tree}\0".encode())
     return sha256.hexdigest()[:16]
 
 
 def page_code(page: str) -> str:
-    """Return the digest of the code that flies, and of that in `MEASURED`, for a page."""
-    return code_digest(*FLIES, *MEASURED.get(page, ()))
+    """Return the digest of the code that flies, and of that in `MEASURED`, for a page.
+
+    The shipped TOML files in these folders, such as vehicles and sensors, count as well.
+    """
+    folders = (*FLIES, *MEASURED.get(page, ()))
+    data = [
+        [path.relative_to(ROOT).as_posix(), tomllib.loads(path.read_text(encoding="utf-8"))]
+        for path in _files(folders, "*.toml")
+    ]
+    return digest([code_digest(*folders), data])
+
+
+def _files(folders: Sequence[str], pattern: str) -> Iterator[Path]:
+    """Yield the files in `folders`, but not those in folders of `NO_RESULT` within them."""
+    for folder in folders:
+        for path in sorted((ROOT / folder).rglob(pattern)):
+            if not set(path.relative_to(ROOT / folder).parts) & set(NO_RESULT):
+                yield path
 
 
 def _tree_text(node: Any) -> str:

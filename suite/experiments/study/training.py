@@ -63,6 +63,8 @@ class TrainingResult(NamedTuple):
     """Extra time of the gradient steps that compile [s]."""
     commit: str
     """Commit of the code that trained it; several commits if the training was resumed."""
+    machine: str
+    """Processor that trained it last, and the number of its cores that were used."""
     diverged: str
     """The error message if the training diverged, else ""."""
     points: list[dict[str, float]]
@@ -158,7 +160,8 @@ def _finished_training(job: Job, diverged: str, at_end: list[dict[str, float]]) 
 
     `at_end` has the measurement of the finished policy, or is empty if the folder has measurements.
     """
-    (key, config), policy = job.task, job.folder / "policy"
+    key, config = job.task
+    commit, machine = training_origin(job.folder)
     points, compile_s = read_measurements(job.folder, config.episode.batch * config.episode.steps)
     rows = curve.read(job.folder)
     return TrainingResult(
@@ -166,7 +169,8 @@ def _finished_training(job: Job, diverged: str, at_end: list[dict[str, float]]) 
         seed=config.seed,
         seconds=sum(row["seconds"] for row in rows if not row["cold"]),
         compile_s=compile_s,
-        commit=training_commit(policy),
+        commit=commit,
+        machine=machine,
         diverged=diverged,
         points=at_end or points,
     )
@@ -198,24 +202,27 @@ def read_measurements(folder: Path, frames: int) -> tuple[list[dict[str, float]]
     return points, compile_s
 
 
-def training_commit(policy: Path) -> str:
-    """Return the commit of the code that trained `policy` (RUN/policy), or "unknown".
+def training_origin(folder: Path) -> tuple[str, str]:
+    """Return the commit of the code that made the training in `folder`, and the machine.
 
     A training that was interrupted and resumed may have several commits; the text has all of them.
+    Both are "unknown" without a record.
     """
-    path = policy.parent / "run.json"
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        return ", ".join([*record.get("earlier_commits", []), record["git_commit"] or "unknown"])
+        record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        commits = [*record.get("earlier_commits", []), record["git_commit"] or "unknown"]
+        cores, processor = record["machine"]["cores"], record["machine"]["processor"]
+        return ", ".join(commits), f"{processor}, cores: {cores}"
     except (OSError, ValueError, KeyError):
-        return "unknown"
+        return "unknown", "unknown"
 
 
 def facts(config: Any, runs: Sequence[TrainingResult]) -> dict[str, str]:
-    """Return the facts of a page on trainings: seeds, commits, unseen worlds."""
+    """Return the facts of a page on trainings: seeds, commits, machines, unseen worlds."""
     return {
         "training seeds": " ".join(map(str, config.training_seeds)),
         "trained at commit": ", ".join(sorted({run.commit for run in runs})),
+        "each trained on": "; ".join(sorted({run.machine for run in runs})),
         "unseen worlds": f"{config.trials}, seed {config.seed}, {config.seconds:g} s each",
     }
 

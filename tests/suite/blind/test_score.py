@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from eval.judging.statistics import wilson
 from eval.logs.flight_log import read_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.blind import make as make_module
 from suite.blind.build import build
 from suite.blind.make import make_set, open_answers
 from suite.blind.run import run_set
-from suite.blind.score import _gap_ratios, report, score_case, score_set, shares
+from suite.blind.score import COVERED, _gap_ratios, report, score_case, score_set, shares
 from suite.common.console import Console
 from tests.support.blind import NULL
 from tests.support.commands import answer, refused
@@ -50,6 +51,15 @@ def test_a_set_goes_on_where_it_stopped(small_set, monkeypatch):
     (case / "vehicle.toml").write_text("")
     with pytest.raises(ValueError, match=r"vehicle\.toml: not the file that the manifest"):
         make_set(small_set, 5, None, Console())
+
+
+def test_a_case_that_is_made_again_loses_its_diagnosis(small_set):
+    """Its flights may be others, if the code has changed; the set accepts them."""
+    for name in ("case_001", "case_002"):
+        write_json(small_set / "results" / name / "seconds.json", {"seconds": 1.0})
+    (small_set / "answers" / "case_002.json").unlink()
+    make_set(small_set, 5, None, Console())
+    assert [path.name for path in (small_set / "results").iterdir()] == ["case_001"]
 
 
 def test_without_its_simulator_nothing_is_begun(tmp_path, monkeypatch, capsys):
@@ -179,6 +189,17 @@ def test_intervals_count_by_component_and_leave_out_what_cannot_be_seen():
     for number, covered in ((3, True), (2, False)):
         found["parameters"]["index"] = {"value": number}
         assert score(truth, found).covered == (covered,)
+
+
+def test_the_share_of_intervals_has_an_interval_over_cases():
+    """The components of one diagnosis depend on each other."""
+    truth = hidden("com_offset", offset=[0.001, 0.002])
+    right = effect("com_offset", offset=[[0.0, 0.01], [0.0, 0.01]])
+    wrong = effect("com_offset", offset=[[0.0, 0.01], [0.003, 0.004]])
+    found = [score_case("c", truth, said(one), 1.0) for one in (right, right, wrong, wrong)]
+    (share,) = (s for s in shares(found) if s.what == COVERED)
+    assert (share.count, share.of) == (6, 8)
+    assert (share.low, share.high) == wilson(3, 4)[1:]
 
 
 def counts(verdicts):

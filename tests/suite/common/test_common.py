@@ -36,11 +36,11 @@ from suite.common.stages import (
     run_stages,
 )
 from suite.common.work import do_jobs, read_workers_option
-from suite.experiments.study.training import training_commit
+from suite.experiments.study.training import training_origin
 from suite.judging.requests import Collection, Evaluation
 from suite.judging.trials import parse_levels, parse_tracks
 from tracks.common.grid import Cell, Grid
-from tracks.common.work import core_shares
+from tracks.common.work import core_shares, usable_cores
 from tracks.geometry.scene import Boxes, Counts, Gates, Rods, Scene, Spheres, pad
 
 GRID = Grid(
@@ -278,10 +278,11 @@ def test_a_run_that_goes_on_keeps_the_commits_that_made_it(tmp_path, monkeypatch
         )
         write_run_record(tmp_path, Estimate(1.0, 2.0), seed=3, resumed=True)
     assert json.loads((tmp_path / "run.json").read_text())["earlier_commits"] == ["aaa"]
-    assert training_commit(tmp_path / "policy") == "aaa, bbb"
+    commits, machine_text = training_origin(tmp_path)
+    assert commits == "aaa, bbb" and machine_text.endswith(f", cores: {usable_cores()}")
     write_run_record(tmp_path, Estimate(1.0, 2.0), seed=3)
-    assert training_commit(tmp_path / "policy") == "bbb", "another run in the same folder"
-    assert training_commit(tmp_path / "none" / "policy") == "unknown"
+    assert training_origin(tmp_path)[0] == "bbb", "another run in the same folder"
+    assert training_origin(tmp_path / "none") == ("unknown", "unknown")
 
 
 def test_a_folder_of_another_kind_of_run_is_refused(tmp_path):

@@ -56,6 +56,25 @@ def test_a_wrong_order_of_motors_holds_for_speeds_and_commands_and_the_printed_o
     assert "motor_order" not in {f.fault for f in findings}
 
 
+@pytest.mark.parametrize("name", KINDS)
+def test_a_fault_goes_into_every_log_with_the_signals_that_it_needs(name, judged):
+    """A real log has few signals; a signal that is missing must not end the page."""
+    kind, (_, log, _) = KINDS[name], judged
+    parts = flight_signals(log, PLAIN, np.random.default_rng(0))
+    while spare := [n for n in parts if n != "time" and kind.fits(set(parts) - {n})]:
+        del parts[spare[0]]
+    faulty = inject(kind, parts, PLAIN)
+    assert len({len(values) for values in faulty.values()}) == 1
+
+
+def test_commands_that_are_logged_early_are_cut_not_wrapped_around(judged):
+    _, log, _ = judged
+    parts = flight_signals(log, PLAIN, np.random.default_rng(0))
+    faulty = inject(KINDS["commands act 150 ms later"], parts, PLAIN)
+    np.testing.assert_array_equal(faulty["cmd_rate"], parts["cmd_rate"][15:])
+    np.testing.assert_array_equal(faulty["rate"], parts["rate"][:-15])
+
+
 def test_answers_are_kept_for_each_case_and_an_incomplete_last_line_is_dropped(
     tmp_path, monkeypatch
 ):

@@ -16,9 +16,11 @@ from suite.commands import reproduce as command
 from suite.common.console import Console
 from suite.common.report import Picture
 from suite.experiments import EXPERIMENTS, published
+from suite.experiments.pages import charts
 from suite.experiments.pages.document import BEGIN, END, PageContents, check_page, write_document
-from suite.experiments.pages.paper import goals
-from suite.experiments.study.cache import FLIES, Workspace, code_digest, page_code
+from suite.experiments.pages.paper import ablation, goals
+from suite.experiments.study.cache import Workspace, page_code
+from suite.experiments.study.training import Spread
 from suite.judging.content import policy_digest
 from suite.loop.compare import difference_cell
 from tests.support import commands
@@ -77,6 +79,17 @@ def test_differences_are_coloured_by_what_they_tell():
     assert difference_cell(Interval(0.1, 0.02, 0.2)) == Cell("+10 [+2, +20]", "good")
     assert difference_cell(Interval(-0.1, -0.2, -0.02)).tone == "bad"
     assert difference_cell(Interval(-0.001, -0.1, 0.1)) == Cell("+0 [-10, +10]", "")
+
+
+def test_the_chart_of_the_ablation_explains_its_diamonds_whichever_rows_the_paper_has(monkeypatch):
+    monkeypatch.setattr(charts, "png", lambda figure: figure)
+    numbers = {name: Spread(0.5, 0.4, 0.6) for name in ("success_cross", "collision_free", "v_max")}
+    rows, kinds = {"field 0.8": numbers, "progress 0.8": numbers}, {"field": "f", "progress": "p"}
+    assert [key in ablation()[1] for key in rows] == [False, True]
+    figure = charts.bars_chart(rows, ablation()[1], kinds, "3 seeds")
+    (legend,) = figure.legends
+    texts = [text.get_text() for text in legend.get_texts()]
+    assert texts == ["mean, least and most of 3 seeds", "the paper"]
 
 
 def test_goals_by_hand():
@@ -220,8 +233,10 @@ def test_the_counts_of_blind_cases_are_the_sums_of_their_sets():
         sums = [f"{a} of {b}" if b else "" for a, b in pairs.values()]
         count, trials = (int(number) for number in sum(pairs.values()))
         interval = wilson(count, trials)
-        ends = f"{percent(interval.low)}-{percent(interval.high)} %"
-        assert cells == [*sums, f"{count} of {trials} ({ends})"]
+        ends = f" ({percent(interval.low)}-{percent(interval.high)} %)"
+        # The last row counts intervals, which are not independent.
+        counted = f"{count} of {trials}{'' if cells == totals[-1] else ends}"
+        assert cells == [*sums, counted]
     false, no_gap, single, *_ = totals
     named, wrong = single[3].split(" (")[0], false[3].split(" (")[0]
     assert f"| {named} cases; {wrong}, three" in readme("blind")
@@ -238,7 +253,7 @@ def write_page(folder, name, flown, code):
 
 
 def test_a_page_is_older_than_another_policy_or_other_code(tmp_path, capsys):
-    code, current = code_digest(*FLIES), policy_digest(shipped.DEFAULT)
+    code, current = page_code("table2"), policy_digest(shipped.DEFAULT)
     write_page(tmp_path, "table2", (shipped.DEFAULT, current), code)
     write_page(tmp_path, "simulators", (shipped.DEFAULT, "0" * 16), code)
     # A checkpoint in a folder with the name of a shipped policy is another policy.

@@ -122,6 +122,20 @@ def test_a_finished_loop_is_only_told_again_and_another_one_refused(whole, monke
     assert not small.flown and not small.trained
 
 
+def test_stages_of_several_versions_of_the_code_are_reported(whole, tmp_path, monkeypatch, capfd):
+    """They are compared with each other, so a difference may be one of the code."""
+    out, mark = tmp_path / "copy", tmp_path / "copy" / "eval-before" / "stage.json"
+    shutil.copytree(whole[0], out)
+    assert "versions of the code" not in (out / "table.md").read_text()
+    mark.write_text(json.dumps({**json.loads(mark.read_text()), "git_commit": "!old"}))
+    Small(monkeypatch)
+    assert cli.main([*TRAIN, "--out", str(out)]) == 0
+    assert "warning: by the code of commit !old" in capfd.readouterr().err
+    for name in ("table.md", "report.html"):
+        assert "done by 2 versions of the code: !old, " in (out / name).read_text()
+    assert "!old" in json.loads((out / "loop.json").read_text())["stage_commits"]
+
+
 def test_a_loop_goes_on_where_its_folder_was_moved(whole, tmp_path, monkeypatch):
     """In the middle of judging, and of recording: what was flown counts."""
     given, small = whole[0] / "train" / "policy", Small(monkeypatch)

@@ -16,7 +16,7 @@ from suite.common import curve
 from suite.common.console import Silent
 from suite.common.provenance import added_digest
 from suite.experiments.study import cache, training, validation
-from suite.experiments.study.cache import Workspace, code_digest, digest
+from suite.experiments.study.cache import Workspace, code_digest, digest, page_code
 from suite.experiments.study.conditions import effect_conditions, sweep_conditions, sweeps
 from suite.experiments.study.training import Setting, UnseenWorlds, read_measurements
 from suite.train.recipes import named_recipe
@@ -77,6 +77,14 @@ def test_the_cache_is_named_by_all_code_that_flies(tmp_path, monkeypatch):
     assert code_digest.__wrapped__("eval/view") != parts, "a named folder counts"
     judge.rename(judge.with_name("jury.py"))
     assert len({first, second, now()}) == 3
+    # A page also depends on the shipped vehicles; comments in their files do not count.
+    monkeypatch.setattr(cache, "code_digest", code_digest.__wrapped__)
+    vehicle, pages = tmp_path / "eval" / "vehicles" / "reference.toml", []
+    vehicle.parent.mkdir()
+    for text in ("mass = 0.75", "mass = 0.75  # kg", "mass = 0.8"):
+        vehicle.write_text(text)
+        pages.append(page_code("table2"))
+    assert pages[0] == pages[1] != pages[2]
     assert digest({"a": 1}) != digest({"a": 2}) and len(digest(load_vehicle("reference"))) == 16
 
 
