@@ -343,6 +343,26 @@ def test_a_hexacopter_is_counted_by_its_outputs_where_it_logs_no_speeds(tmp_path
 
 
 @pytest.mark.parametrize(
+    ("header", "raw", "share"),
+    [
+        ((158, 2047), 1047.5, 0.5),  # DShot with 5.5 % of idle
+        ((158, 1647), 2047.0, 1.0),  # and a motor_output_limit of 80 %
+        (None, 1047.5, 0.5),
+        ((1070, 2000), 1500.0, 0.5),  # pulses, which begin at minthrottle
+        (None, 1500.0, 0.5),
+    ],
+)
+def test_motor_outputs_are_shares_of_their_protocols_range(header, raw, share):
+    """The vehicle file's [motors] and loops count commands from a motor's stop, not its idle."""
+    least = 158.0 if raw != 1500.0 else 1070.0
+    box = betaflight.Blackbox.__new__(betaflight.Blackbox)
+    box.name, box.findings, box.header = "log", [], {"motorOutput": header} if header else {}
+    box.columns = {f"motor[{k}]": np.array([least, raw]) for k in range(4)}
+    box.units = {name: (name, "") for name in box.columns}
+    np.testing.assert_allclose(betaflight._outputs(box)["pwm"][1], share, atol=1e-9)
+
+
+@pytest.mark.parametrize(
     ("numbers", "unit", "volts"),
     [
         ([16.13, 16.02], "", [16.13, 16.02]),

@@ -72,7 +72,7 @@ ONE = {
     "s": 1.0, "ms": 0.001, "us": 0.000001, "ns": 0.000000001,
     "m": 1.0, "cm": 0.01, "mm": 0.001, "m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001,
     "rad": 1.0, "deg": TURN / 360, "rad/s": 1.0, "deg/s": TURN / 360, "mrad/s": 0.001,
-    "m/s^2": 1.0, "m/s2": 1.0, "g": G, "rpm": TURN / 60, "Hz": TURN,
+    "m/s^2": 1.0, "m/s/s": 1.0, "g": G, "rpm": TURN / 60, "Hz": TURN,
     "1": 1.0, "%": 0.01, "65535": 1 / 65535, "N": 1.0, "N m": 1.0, "V": 1.0, "mV": 0.001,
 }  # fmt: skip
 """One of each unit in SI; `65535` is the full scale of a motor command."""
@@ -91,8 +91,11 @@ def test_every_unit_is_what_it_says():
 
 def test_a_column_is_in_the_unit_of_its_header(tmp_path):
     path = tmp_path / "log.csv"
-    path.write_text("loopIteration,time (us),vbatLatest (mV)\n0,0,16100\n1,500,16000\n")
+    names = "loopIteration,time (us),vbatLatest (mV),accSmooth[2] (m/s/s)"
+    path.write_text(f"{names}\n0,0,16100,9.8\n1,500,16000,9.7\n")
     box = betaflight.Blackbox(path)
+    acc = box.values(["accSmooth[2]"], betaflight._ACCELERATION)
+    np.testing.assert_allclose(acc[:, 0], [9.8, 9.7])
     np.testing.assert_allclose(box.values(["vbatLatest"], betaflight._VOLT)[:, 0], [16.1, 16.0])
     np.testing.assert_allclose(box.values(["time"], betaflight._TIME)[:, 0], [0.0, 5e-4])
 
