@@ -19,6 +19,7 @@ from eval.importers.options import ImportOptions
 from eval.importers.signals import MAD_TO_SD
 from eval.logs.faults.drive.motors import SHIPPED_ORDER
 from eval.logs.faults.finding import Finding
+from eval.quadrotor.loops import command_of_throttle
 from eval.vehicles.vehicle import Vehicle, motor_thrust
 
 FULL_THRUST_RANGE = (8.0, 200.0)
@@ -66,8 +67,8 @@ def thrust_command(
     vehicle = options.vehicle
     if options.full_thrust is None and vehicle and vehicle.motors:
         voltage = rows["voltage"][:, 0] if "voltage" in rows else None
-        thrust = 4.0 * motor_thrust(vehicle.motors, rows["throttle"], voltage)[:, 0] / vehicle.mass
-        rows["cmd_thrust"] = thrust[:, None]
+        command = command_of_throttle(vehicle.controller, rows["throttle"])
+        rows["cmd_thrust"] = 4.0 * motor_thrust(vehicle.motors, command, voltage) / vehicle.mass
         with_battery = "without a voltage" if voltage is None else "with the battery's voltage"
         text = f"normalised; by [motors] of vehicle {vehicle.name!r}, {with_battery}"
         return [Finding("note", "thrust", text)]

@@ -22,7 +22,8 @@ from eval.importers.options import ImportOptions
 from eval.importers.rows import rows_at
 from eval.importers.signals import Recording, Signal
 from eval.logs.faults.reading import TIMES
-from eval.vehicles.vehicle import MotorMap
+from eval.quadrotor.loops import KINDS, loop_of, start, update
+from eval.vehicles.vehicle import MotorMap, command_of_thrust
 from tests.support.vehicles import PLAIN
 
 ROOT_HALF = np.sqrt(0.5)
@@ -142,6 +143,29 @@ def test_a_throttle_goes_through_the_vehicles_motors_with_the_battery():
     findings = thrust_command(rows, ImportOptions(vehicle=vehicle))
     np.testing.assert_allclose(rows["cmd_thrust"], 4 * 0.159375 / vehicle.mass)
     assert "with the battery's voltage" in findings[0].evidence
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "throttle_of"),
+    [
+        ("betaflight", {"dshot_idle_value": 550.0}, lambda u: (u - 0.055) / 0.945),
+        ("px4", {"THR_MDL_FAC": 0.3}, lambda u: 0.3 * u**2 + 0.7 * u),
+        ("px4", {"THR_MDL_FAC": 0.0}, lambda u: u),
+        ("crazyflie", {}, lambda u: u),
+    ],
+)
+def test_a_firmwares_throttle_gives_the_thrust_of_its_motor_commands(kind, settings, throttle_of):
+    """The thrust that the simulated loop makes of the motor commands that it gives at rest."""
+    controller = replace(PLAIN.controller, kind=kind, settings=KINDS[kind].Settings(**settings))
+    vehicle = replace(PLAIN, controller=controller, motors=MotorMap((0.5, 7.0), 4.0))
+    force, loop = np.array([4.0, 9.0, 15.0]), loop_of(vehicle)
+    still, each = np.zeros((3, 3)), np.ones((3, 3))
+    _, thrust = update(loop, start(loop, (3,), np), force, still, still, 0.002, each)
+    np.testing.assert_allclose(thrust, np.repeat(force[:, None] / 4.0, 4, axis=1), rtol=1e-9)
+    command = command_of_thrust(vehicle.motors.thrust, thrust[:, :1])
+    rows = {"throttle": throttle_of(command)}
+    thrust_command(rows, ImportOptions(vehicle=vehicle))
+    np.testing.assert_allclose(rows["cmd_thrust"][:, 0], force / PLAIN.mass, rtol=1e-9)
 
 
 def motor_rows():
