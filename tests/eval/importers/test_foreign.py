@@ -306,6 +306,21 @@ def test_an_ardupilot_log_equals_the_flight(tmp_path, pose):
         np.testing.assert_allclose(log.rot_w, truth.rot, atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("motors", "sticks", "pulses"),
+    [
+        ((), {}, (1000.0, 2000.0)),
+        ((1100.0, 1900.0), {"RC3_MIN": 990.0}, (1100.0, 1900.0)),
+        ((0.0, 0.0), {"RC3_MIN": 1100.0, "RC3_MAX": 1940.0}, (1100.0, 1940.0)),  # Copter 3 and 4.0
+        ((0.0, 1900.0), {"RCMAP_THROTTLE": 2.0, "RC2_MAX": 1950.0}, (1000.0, 1950.0)),
+        ((1900.0, 1100.0), {"RC3_MIN": 2000.0}, (1000.0, 2000.0)),
+    ],
+)
+def test_pulses_of_ardupilot_are_of_the_motors_else_of_the_sticks_range(motors, sticks, pulses):
+    parameters = dict(zip(("MOT_PWM_MIN", "MOT_PWM_MAX"), motors, strict=False)) | sticks
+    assert ardupilot._pulse_range(parameters) == pulses
+
+
 def test_px4_and_crazyflie_without_a_position_are_read(tmp_path):
     ulog = made.write_ulog(tmp_path / "log.ulg", span=(0, 6))
     usd = made.write_usd(tmp_path / "log00", span=(0, 6), crc=False)
