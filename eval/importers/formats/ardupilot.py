@@ -9,7 +9,7 @@ ArduPilot's documentation of its log messages (Copter 4.x); the first one in the
 | quat | ATT (roll, pitch, yaw in deg) |
 | pos, vel | XKF1, NKF1 (PN PE PD in m, VN VE VD in m/s), of the lowest core |
 | cmd_rate | RATE (RDes PDes YDes in deg/s) |
-| throttle | CTUN (ThO, 0 to 1) |
+| thrust | CTUN (ThO, 0 to 1: MOT_THST_EXPO and the battery's voltage are accounted for) |
 | pwm | RCOU (pulses in us), the outputs that SERVOn_FUNCTION makes motors 1 to 4 |
 | motor | ESC (RPM by instance, in the order of these outputs), where all four report |
 | voltage | BAT (Volt) |
@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 
+from eval.importers.commands import SHARE
 from eval.importers.formats.betaflight import MOTOR_SIDE as BETAFLIGHT_X
 from eval.importers.formats.px4 import QUAD_X
 from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, from_euler
@@ -98,7 +99,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
     take("pos", ("XKF1", "NKF1"), "PN PE PD", HALF_TURN)
     take("vel", ("XKF1", "NKF1"), "VN VE VD", HALF_TURN)
     take("cmd_rate", ("RATE",), "RDes PDes YDes", DEG * HALF_TURN)
-    take("throttle", ("CTUN",), "ThO", 1.0)
+    take(SHARE, ("CTUN",), "ThO", 1.0)
     take("voltage", ("BAT",), "Volt", 1.0)
     if "quat" in parts:
         time_s, angles = parts["quat"]

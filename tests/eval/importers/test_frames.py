@@ -5,7 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eval.importers.commands import SHIPPED_ORDER, order_motors, rates_wanted, thrust_command
+from eval.importers.commands import (
+    SHARE,
+    SHIPPED_ORDER,
+    order_motors,
+    rates_wanted,
+    thrust_command,
+)
 from eval.importers.formats import betaflight
 from eval.importers.frames import (
     attitude,
@@ -143,6 +149,13 @@ def test_a_throttle_goes_through_the_vehicles_motors_with_the_battery():
     findings = thrust_command(rows, ImportOptions(vehicle=vehicle))
     np.testing.assert_allclose(rows["cmd_thrust"], 4 * 0.159375 / vehicle.mass)
     assert "with the battery's voltage" in findings[0].evidence
+
+
+def test_a_thrust_that_the_firmware_makes_linear_does_not_go_through_the_motors():
+    vehicle = replace(PLAIN, motors=MotorMap((0.2, 0.6), 4.0))
+    rows = {SHARE: np.full((3, 1), 0.5), "voltage": np.full((3, 1), 3.0)}
+    thrust_command(rows, ImportOptions(vehicle=vehicle))
+    np.testing.assert_allclose(rows["cmd_thrust"], 0.5 * vehicle.full_thrust)
 
 
 @pytest.mark.parametrize(
