@@ -55,10 +55,10 @@ def loop_of(vehicle: Vehicle) -> Loop | None:
 
 
 def command_of_throttle(controller: Controller, throttle: Array) -> Array:
-    """Return the motor commands (...) without rotation of a firmware's throttle (...), 0 to 1.
+    """Return the motor commands (...) that a firmware makes of a throttle (...) at rest.
 
-    Betaflight's throttle is 0 at the motors' idle, and that of PX4 is a thrust, linearised by
-    `THR_MDL_FAC`. Others are motor commands already.
+    Both are from 0 to 1. Betaflight's throttle is 0 at the motors' idle, and that of PX4 is a
+    thrust, which `THR_MDL_FAC` linearises. Others are motor commands already.
     """
     if controller.kind == "betaflight":
         idle = 1e-4 * controller.settings.dshot_idle_value

@@ -12,7 +12,7 @@ from eval.importers.commands import (
     rates_wanted,
     thrust_command,
 )
-from eval.importers.formats import betaflight
+from eval.importers.formats import ardupilot, betaflight
 from eval.importers.frames import (
     attitude,
     body_vector,
@@ -105,6 +105,41 @@ def test_a_column_is_in_the_unit_of_its_header(tmp_path):
     np.testing.assert_allclose(acc[:, 0], [9.8, 9.7])
     np.testing.assert_allclose(box.values(["vbatLatest"], betaflight._VOLT)[:, 0], [16.1, 16.0])
     np.testing.assert_allclose(box.values(["time"], betaflight._TIME)[:, 0], [0.0, 5e-4])
+
+
+@pytest.mark.parametrize(
+    ("header", "raw", "share"),
+    [
+        ((158, 2047), 1047.5, 0.5),  # DShot with 5.5 % of idle
+        ((158, 1647), 2047.0, 1.0),  # and a motor_output_limit of 80 %
+        (None, 1047.5, 0.5),
+        ((1070, 2000), 1500.0, 0.5),  # pulses, which begin at minthrottle
+        (None, 1500.0, 0.5),
+    ],
+)
+def test_motor_outputs_are_shares_of_their_protocols_range(header, raw, share):
+    """The vehicle file's [motors] and loops count commands from a motor's stop, not its idle."""
+    least = 158.0 if raw != 1500.0 else 1070.0
+    box = betaflight.Blackbox.__new__(betaflight.Blackbox)
+    box.name, box.findings, box.header = "log", [], {"motorOutput": header} if header else {}
+    box.columns = {f"motor[{k}]": np.array([least, raw]) for k in range(4)}
+    box.units = {name: (name, "") for name in box.columns}
+    np.testing.assert_allclose(betaflight._outputs(box)["pwm"][1], share, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("motors", "sticks", "pulses"),
+    [
+        ((), {}, (1000.0, 2000.0)),
+        ((1100.0, 1900.0), {"RC3_MIN": 990.0}, (1100.0, 1900.0)),
+        ((0.0, 0.0), {"RC3_MIN": 1100.0, "RC3_MAX": 1940.0}, (1100.0, 1940.0)),  # Copter 3 and 4.0
+        ((0.0, 1900.0), {"RCMAP_THROTTLE": 2.0, "RC2_MAX": 1950.0}, (1000.0, 1950.0)),
+        ((1900.0, 1100.0), {"RC3_MIN": 2000.0}, (1000.0, 2000.0)),
+    ],
+)
+def test_pulses_of_ardupilot_are_of_the_motors_else_of_the_sticks_range(motors, sticks, pulses):
+    parameters = dict(zip(("MOT_PWM_MIN", "MOT_PWM_MAX"), motors, strict=False)) | sticks
+    assert ardupilot._pulse_range(parameters) == pulses
 
 
 def thrust_rows(felt=None, count=200):
