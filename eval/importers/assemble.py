@@ -20,7 +20,7 @@ from eval.importers.cleaning import (
     without_lost,
     without_repeats,
 )
-from eval.importers.commands import order_motors, rates_wanted, thrust_command
+from eval.importers.commands import SHARE, order_motors, rates_wanted, thrust_command
 from eval.importers.mapping import KEPT
 from eval.importers.options import ImportOptions
 from eval.importers.rows import GAP_S, GAP_STEPS, row_times, rows_at, sampled_rows, slowest
@@ -202,7 +202,7 @@ def _unused_options(signals: Collection[str], format: str, options: ImportOption
         for name, steps in options.read
         if name not in ("time", *signals) and steps != "drop"
     ]
-    has_throttle = "throttle" in signals and "cmd_thrust" not in signals
+    has_throttle = not {"throttle", SHARE}.isdisjoint(signals) and "cmd_thrust" not in signals
     has_erpm = format == "betaflight" and "motor" in signals
     numbers = (
         ("--mass", options.mass, KEPT + "cmd_force" in signals, "thrust in N"),

@@ -46,7 +46,7 @@ HOLD_S = 0.3
 RISE_M = 0.05
 """Height above the ground from which the vehicle counts as flying [m]."""
 POWER = {
-    **{"throttle": 1, "cmd_thrust": 1, "kept:cmd_force": 1},
+    **{"throttle": 1, "cmd_thrust": 1, "kept:cmd_force": 1, "kept:thrust_share": 1},
     **{"pwm": 1, "motor": 2, "motor_cmd": 2},
 }
 """Signals that measure the motors' effort -> exponent with which each gives the thrust."""

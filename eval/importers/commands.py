@@ -15,12 +15,17 @@ from itertools import permutations
 import numpy as np
 
 from eval.importers.frames import conjugate, multiply, rotation_vector
+from eval.importers.mapping import KEPT
 from eval.importers.options import ImportOptions
 from eval.importers.signals import MAD_TO_SD
 from eval.logs.faults.drive.motors import SHIPPED_ORDER
 from eval.logs.faults.finding import Finding
+from eval.quadrotor.loops import command_of_throttle
 from eval.vehicles.vehicle import Vehicle, motor_thrust
 
+SHARE = f"{KEPT}thrust_share"
+"""Signal of a normalised thrust that the firmware makes linear; a `throttle` may be the command of
+the motors."""
 FULL_THRUST_RANGE = (8.0, 200.0)
 """Possible thrust per mass of a multirotor at full throttle [m/s^2]."""
 
@@ -55,19 +60,20 @@ def order_motors(
 def thrust_command(
     rows: dict[str, np.ndarray], options: ImportOptions, by_acc: bool = True
 ) -> list[Finding]:
-    """Replace `throttle` of `rows` (see `rows_at`) by `cmd_thrust` [m/s^2] in place, if known.
+    """Add `cmd_thrust` [m/s^2] from `throttle` or `SHARE` of `rows` (see `rows_at`) in place.
 
     Without `vehicle` and `full_thrust` in `options`, the thrust is fitted to the accelerometer,
     unless `by_acc` is false, since that is in doubt.
     """
-    if "cmd_thrust" in rows or "throttle" not in rows:
+    name = "throttle" if "throttle" in rows else SHARE
+    if "cmd_thrust" in rows or name not in rows:
         return []
-    throttle = rows["throttle"][:, 0]
+    throttle = rows[name][:, 0]
     vehicle = options.vehicle
-    if options.full_thrust is None and vehicle and vehicle.motors:
+    if name != SHARE and options.full_thrust is None and vehicle and vehicle.motors:
         voltage = rows["voltage"][:, 0] if "voltage" in rows else None
-        thrust = 4.0 * motor_thrust(vehicle.motors, rows["throttle"], voltage)[:, 0] / vehicle.mass
-        rows["cmd_thrust"] = thrust[:, None]
+        command = command_of_throttle(vehicle.controller, rows["throttle"])
+        rows["cmd_thrust"] = 4.0 * motor_thrust(vehicle.motors, command, voltage) / vehicle.mass
         with_battery = "without a voltage" if voltage is None else "with the battery's voltage"
         text = f"normalised; by [motors] of vehicle {vehicle.name!r}, {with_battery}"
         return [Finding("note", "thrust", text)]

@@ -29,7 +29,7 @@ SPARSE = ("pos", "quat", "vel", "rate", "acc")
 """Signals that stay empty between their samples where they are slower than the rows."""
 HELD = (
     *("cmd_thrust", "cmd_rate", "cmd_torque", "cmd_quat", "throttle", "motor_cmd", "pwm"),
-    "kept:cmd_force",
+    *("kept:cmd_force", "kept:thrust_share"),
 )
 """Signals that hold their value until the next sample."""
 MEASURED = ("kept:est_", "kept:acc_w_")

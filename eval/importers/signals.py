@@ -1,8 +1,8 @@
 """Containers for the signals of an imported file, each at its own rate, and their first cleaning.
 
 Signals have the flight log's units and frames. They are named as the groups of columns in
-`eval/logs/columns.py` (pos, quat, vel, rate, cmd_thrust, cmd_rate, motor, motor_cmd, acc,
-voltage). One more is `throttle`, the normalised collective thrust from 0 to 1.
+`eval/logs/columns.py`. Others are `throttle` (the normalised collective thrust from 0 to 1),
+`cmd_quat` (commanded attitudes), and columns that are kept unchanged (`kept:NAME`).
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ def write_raw(path, truth, fine=10, poles=12):
         truth.thrust / 30.0 * 1000.0,
         *(truth.acc / 9.81 * 4096.0).T,
         truth.voltage * 100.0,
-        *(158.0 + 1889.0 * truth.motor[:, [1, 0, 2, 3]] / 2100.0).T,
+        *(48.0 + 1999.0 * truth.motor[:, [1, 0, 2, 3]] / 2100.0).T,
         *erpm.T,
     ]
     head = {

@@ -9,7 +9,7 @@ ArduPilot's documentation of its log messages (Copter 4.x); the first one in the
 | quat | ATT (roll, pitch, yaw in deg) |
 | pos, vel | XKF1, NKF1 (PN PE PD in m, VN VE VD in m/s), of the lowest core |
 | cmd_rate | RATE (RDes PDes YDes in deg/s) |
-| throttle | CTUN (ThO, 0 to 1) |
+| thrust | CTUN (ThO, 0 to 1: MOT_THST_EXPO and the battery's voltage are accounted for) |
 | pwm | RCOU (pulses in us), the outputs that SERVOn_FUNCTION makes motors 1 to 4 |
 | motor | ESC (RPM by instance, in the order of these outputs), where all four report |
 | voltage | BAT (Volt) |
@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 
+from eval.importers.commands import SHARE
 from eval.importers.formats.betaflight import MOTOR_SIDE as BETAFLIGHT_X
 from eval.importers.formats.px4 import QUAD_X
 from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, from_euler
@@ -98,7 +99,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
     take("pos", ("XKF1", "NKF1"), "PN PE PD", HALF_TURN)
     take("vel", ("XKF1", "NKF1"), "VN VE VD", HALF_TURN)
     take("cmd_rate", ("RATE",), "RDes PDes YDes", DEG * HALF_TURN)
-    take("throttle", ("CTUN",), "ThO", 1.0)
+    take(SHARE, ("CTUN",), "ThO", 1.0)
     take("voltage", ("BAT",), "Volt", 1.0)
     if "quat" in parts:
         time_s, angles = parts["quat"]
@@ -106,9 +107,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
     outputs = _outputs(parameters)
     take("pwm", ("RCOU",), " ".join(f"C{k}" for k in outputs) if outputs else "-", 1.0)
     if "pwm" in parts:
-        low, high = (parameters.get(f"MOT_PWM_{end}") or default
-                     for end, default in (("MIN", 1000.0), ("MAX", 2000.0)))  # fmt: skip
-        low, high = (low, high) if high > low else (1000.0, 2000.0)
+        low, high = _pulse_range(parameters)
         time_s, pulse = parts["pwm"]
         parts["pwm"] = (time_s, np.clip((pulse - low) / (high - low), 0.0, 1.0))
         findings.append(Finding("note", "motors", f"pulses of {low:g} to {high:g} us are 0 to 1"))
@@ -223,6 +222,20 @@ def _outputs(parameters: Mapping[str, float]) -> list[int]:
     if not assigned:
         return [1, 2, 3, 4]
     return assigned if len(assigned) == 4 else []
+
+
+def _pulse_range(parameters: Mapping[str, float]) -> tuple[float, float]:
+    """Return the pulses of no and of full output [us].
+
+    Until Copter 4.0, MOT_PWM_MIN and MOT_PWM_MAX are 0 by default: the range is the throttle
+    stick's.
+    """
+    ends = (("MIN", 1000.0), ("MAX", 2000.0))
+    for prefix in ("MOT_PWM_", f"RC{parameters.get('RCMAP_THROTTLE', 3.0):.0f}_"):
+        low, high = (parameters.get(prefix + end, default) for end, default in ends)
+        if 0.0 < low < high:
+            return low, high
+    return 1000.0, 2000.0
 
 
 def _motors(esc: Rows, outputs: list[int], findings: list[Finding]) -> dict[str, Part]:

@@ -47,7 +47,7 @@ DSHOT, PULSES = (48.0, 2047.0), (1000.0, 2000.0)
 ABOUT = {"Firmware revision": "firmware", "Craft name": "craft", "Board information": "board"}
 """Entry of the log's header -> key in the flight log's metadata."""
 _ROTATION = {"": DEG, "deg/s": DEG, "rad/s": 1.0}
-_ACCELERATION = {"": GRAVITY / ACC_1G, "g": GRAVITY, "m/s2": 1.0}
+_ACCELERATION = {"": GRAVITY / ACC_1G, "g": GRAVITY, "m/s/s": 1.0}
 _TIME = {"": 1e-6, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 _VOLT = {"": 0.01, "V": 1.0, "mV": 1e-3}
 """Unit in a column's name -> factor to the suite's unit, for each quantity; "" is a column without
@@ -179,14 +179,17 @@ def _volts(voltage: np.ndarray, unit: str, fix: bool, findings: list[Finding]) -
 
 
 def _outputs(box: Blackbox) -> dict[str, np.ndarray]:
-    """Return motor commands from 0 to 1, scaled by the header's range, or else DShot's or PWM's."""
+    """Return motor commands from 0 to 1, the shares of the range of DShot or of pulses.
+
+    The header's `motorOutput` begins at the motors' idle and ends at the pilot's limit, so its
+    lower number shows the protocol only.
+    """
     names = [f"motor[{k}]" for k in range(4)]
     if not box.has(*names):
         return {}
     raw = box.values(names, {"": 1.0})
-    low, high = box.settings("motorOutput", PULSES if np.nanmin(raw) >= PULSES[0] else DSHOT)
-    if not high > low:
-        return {}
+    least, _ = box.settings("motorOutput", (float(np.nanmin(raw)), 0.0))
+    low, high = PULSES if least >= PULSES[0] else DSHOT
     names = [f"motor[{k}]" for k in range(8) if box.has(f"motor[{k}]")]
     if len(names) > 4 and not any(_ERPM.match(column) for column in box.columns):
         is_on = np.any(box.values(names, {"": 1.0}) > low, axis=0)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from eval.quadrotor.loops import betaflight, crazyflie, px4
 from eval.quadrotor.loops.filters import Request, layout_of
-from eval.vehicles.vehicle import MotorMap, Vehicle, command_of_thrust
+from eval.vehicles.vehicle import Controller, MotorMap, Vehicle, command_of_thrust
 from tracks.geometry.scene import Array
 
 NOMINAL = "p"
@@ -52,6 +52,20 @@ def loop_of(vehicle: Vehicle) -> Loop | None:
     gains = KINDS[controller.kind].gains(controller.settings, layout_of(vehicle.rotors))
     first, second = motors.thrust
     return Loop(gains, (np.asarray(first), np.asarray(second)))
+
+
+def command_of_throttle(controller: Controller, throttle: Array) -> Array:
+    """Return the motor commands (...) that a firmware makes of a throttle (...) at rest.
+
+    Both are from 0 to 1. Betaflight's throttle is 0 at the motors' idle, and that of PX4 is a
+    thrust, which `THR_MDL_FAC` linearises. Others are motor commands already.
+    """
+    if controller.kind == "betaflight":
+        idle = 1e-4 * controller.settings.dshot_idle_value
+        return idle + (1.0 - idle) * throttle
+    if controller.kind == "px4":
+        return px4.signal(controller.settings.THR_MDL_FAC, throttle)
+    return throttle
 
 
 def start(loop: Loop | None, shape: tuple[int, ...], xp: Any) -> Any:

@@ -29,7 +29,9 @@ FAST = float(np.deg2rad(400.0))
 YAW_ROOM = 0.15
 """Excess over full command that is allowed while yaw is added."""
 SMALL = 1e-6
-"""Torques and contributions below this count as zero."""
+"""Torques below this count as zero."""
+WEAK = 0.2
+"""Motors with a smaller contribution to an axis do not limit it."""
 LIMITS = {"THR_MDL_FAC": (0.0, 1.0)}
 """Allowed ranges of settings; the others must be 0 or more."""
 
@@ -221,9 +223,9 @@ def _fit_into_range(motor: Array, along: Array, top: float, only_more: bool = Fa
 
 
 def _shift_into_range(motor: Array, along: Array, top: float) -> Array:
-    """Return the factor (...,) on `along` that brings the motors into [0, top]."""
+    """Return the factor (...,) on `along` that brings the motors that it affects into [0, top]."""
     xp = motor.__array_namespace__()
-    affected = xp.abs(along) > SMALL
+    affected = xp.abs(along) >= WEAK
     slope = xp.where(affected, along, 1.0)
     below = xp.where(motor < 0.0, -motor / slope, 0.0)
     above = xp.where(motor > top, (top - motor) / slope, 0.0)

@@ -16,14 +16,10 @@ from zlib import crc32
 import numpy as np
 
 from eval.importers.formats.betaflight import DSHOT
-from eval.importers.frames import QUAT_HALF_TURN
+from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN
 from eval.importers.options import ImportOptions
 from suite.experiments.injected.changes import Signals
 from suite.experiments.injected.kinds import DEG, RPM
-
-FLIP = np.array([1.0, -1.0, -1.0])
-"""Factors of a half turn about x. It converts the suite's world axes to north-east-down (PX4), and
-its body axes to forward-right-down, or back."""
 
 
 class Written(NamedTuple):
@@ -43,15 +39,15 @@ def write_ulog(folder: Path, signals: Signals) -> Written:
     thrust = np.concatenate([np.zeros((len(stamp), 2)), -signals["throttle"]], axis=1)
     topics = {
         "vehicle_attitude": ([("float[4]", "q")], signals["quat"] * QUAT_HALF_TURN),
-        "vehicle_angular_velocity": ([("float[3]", "xyz")], signals["rate"] * FLIP),
-        "sensor_combined": ([("float[3]", "accelerometer_m_s2")], signals["acc"] * FLIP),
+        "vehicle_angular_velocity": ([("float[3]", "xyz")], signals["rate"] * HALF_TURN),
+        "sensor_combined": ([("float[3]", "accelerometer_m_s2")], signals["acc"] * HALF_TURN),
         "vehicle_local_position": (
             [("float", name) for name in ("x", "y", "z", "vx", "vy", "vz")],
-            np.concatenate([signals["pos"] * FLIP, signals["vel"] * FLIP], axis=1),
+            np.concatenate([signals["pos"] * HALF_TURN, signals["vel"] * HALF_TURN], axis=1),
         ),
         "vehicle_rates_setpoint": (
             [*(("float", name) for name in ("roll", "pitch", "yaw")), ("float[3]", "thrust_body")],
-            np.concatenate([signals["cmd_rate"] * FLIP, thrust], axis=1),
+            np.concatenate([signals["cmd_rate"] * HALF_TURN, thrust], axis=1),
         ),
         "esc_status": ([("esc_report[4]", "esc")], motors),
         "battery_status": ([("float", "voltage_v")], signals["voltage"]),
@@ -148,12 +144,12 @@ column = "t"
 def write_table(folder: Path, signals: Signals) -> Written:
     """Write a table as teams export it from PX4, north-east-down, with its mapping file."""
     converted = {
-        "pos": signals["pos"] * FLIP,
-        "vel": signals["vel"] * FLIP,
+        "pos": signals["pos"] * HALF_TURN,
+        "vel": signals["vel"] * HALF_TURN,
         "quat": signals["quat"] * QUAT_HALF_TURN,
-        "rate": signals["rate"] * FLIP * DEG,
-        "acc": signals["acc"] * FLIP,
-        "cmd_rate": signals["cmd_rate"] * FLIP,
+        "rate": signals["rate"] * HALF_TURN * DEG,
+        "acc": signals["acc"] * HALF_TURN,
+        "cmd_rate": signals["cmd_rate"] * HALF_TURN,
         "motor": signals["motor"][:, [0, 2, 3, 1]] * RPM,
         "pwm": signals["pwm"][:, [0, 2, 3, 1]],
         "throttle": signals["throttle"],

@@ -14,6 +14,8 @@ from eval.importers.formats import ardupilot, betaflight, px4
 from eval.importers.formats.crazyflie import unpack_quaternion
 from eval.importers.options import ImportOptions
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.check import CheckContext, check_log
+from eval.vehicles.vehicle import MotorMap
 from tests.support import foreign_logs as made
 from tests.support import known_flight
 from tests.support.imported import TRUE, levels, near, same_flight, text
@@ -300,10 +302,26 @@ def test_an_ardupilot_log_equals_the_flight(tmp_path, pose):
     np.testing.assert_allclose(log.rate_cmd_b[:-1], truth.cmd_rate[:-1], atol=0.05)
     np.testing.assert_allclose(log.rotor_speed, truth.motor, atol=2.0)
     np.testing.assert_allclose(log.pwm[:-1], truth.motor[:-1] / 2100.0, atol=0.01)
+    np.testing.assert_allclose(log.thrust_cmd[:-1], truth.thrust[:-1], atol=0.05)
     np.testing.assert_allclose(log.voltage, truth.voltage, atol=0.01)
     if pose:
         np.testing.assert_allclose(log.pos_w, truth.pos, atol=0.01)
         np.testing.assert_allclose(log.rot_w, truth.rot, atol=1e-3)
+
+
+def test_the_thrust_of_ardupilot_is_no_throttle_of_the_motors(tmp_path):
+    """A vehicle file's [motors] are of the pulses; ArduPilot has undone their curve in ThO."""
+    truth = known_flight.fly(np.arange(0.0, 8.0, 0.01))
+    path = write_bin(tmp_path / "00000001.BIN", truth, pose=True)
+    full = 30.0 * PLAIN.mass / 4.0
+    rotors = replace(PLAIN.rotors, thrust_coefficient=full / PLAIN.rotors.speed_max**2)
+    vehicle = replace(PLAIN, rotors=rotors, motors=MotorMap((0.0, full), 16.0, 0.0))
+    log, findings = import_log(path, None, ImportOptions(vehicle=vehicle))
+    truth = known_flight.fly(log.time_s)
+    np.testing.assert_allclose(log.thrust_cmd[:-1], truth.thrust[:-1], atol=0.05)
+    assert "throttle_curve" not in {f.fault for f in findings if f.status == "doubt"}
+    found, _ = check_log(log, CheckContext(vehicle))
+    assert "throttle_curve" not in {f.fault for f in found if f.status == "doubt"}
 
 
 def test_px4_and_crazyflie_without_a_position_are_read(tmp_path):

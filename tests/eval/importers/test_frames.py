@@ -5,8 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eval.importers.commands import SHIPPED_ORDER, order_motors, rates_wanted, thrust_command
-from eval.importers.formats import betaflight
+from eval.importers.commands import (
+    SHARE,
+    SHIPPED_ORDER,
+    order_motors,
+    rates_wanted,
+    thrust_command,
+)
+from eval.importers.formats import ardupilot, betaflight
 from eval.importers.frames import (
     attitude,
     body_vector,
@@ -22,7 +28,8 @@ from eval.importers.options import ImportOptions
 from eval.importers.rows import rows_at
 from eval.importers.signals import Recording, Signal
 from eval.logs.faults.reading import TIMES
-from eval.vehicles.vehicle import MotorMap
+from eval.quadrotor.loops import KINDS, loop_of, start, update
+from eval.vehicles.vehicle import MotorMap, command_of_thrust
 from tests.support.vehicles import PLAIN
 
 ROOT_HALF = np.sqrt(0.5)
@@ -72,7 +79,7 @@ ONE = {
     "s": 1.0, "ms": 0.001, "us": 0.000001, "ns": 0.000000001,
     "m": 1.0, "cm": 0.01, "mm": 0.001, "m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001,
     "rad": 1.0, "deg": TURN / 360, "rad/s": 1.0, "deg/s": TURN / 360, "mrad/s": 0.001,
-    "m/s^2": 1.0, "m/s2": 1.0, "g": G, "rpm": TURN / 60, "Hz": TURN,
+    "m/s^2": 1.0, "m/s/s": 1.0, "g": G, "rpm": TURN / 60, "Hz": TURN,
     "1": 1.0, "%": 0.01, "65535": 1 / 65535, "N": 1.0, "N m": 1.0, "V": 1.0, "mV": 0.001,
 }  # fmt: skip
 """One of each unit in SI; `65535` is the full scale of a motor command."""
@@ -91,10 +98,48 @@ def test_every_unit_is_what_it_says():
 
 def test_a_column_is_in_the_unit_of_its_header(tmp_path):
     path = tmp_path / "log.csv"
-    path.write_text("loopIteration,time (us),vbatLatest (mV)\n0,0,16100\n1,500,16000\n")
+    names = "loopIteration,time (us),vbatLatest (mV),accSmooth[2] (m/s/s)"
+    path.write_text(f"{names}\n0,0,16100,9.8\n1,500,16000,9.7\n")
     box = betaflight.Blackbox(path)
+    acc = box.values(["accSmooth[2]"], betaflight._ACCELERATION)
+    np.testing.assert_allclose(acc[:, 0], [9.8, 9.7])
     np.testing.assert_allclose(box.values(["vbatLatest"], betaflight._VOLT)[:, 0], [16.1, 16.0])
     np.testing.assert_allclose(box.values(["time"], betaflight._TIME)[:, 0], [0.0, 5e-4])
+
+
+@pytest.mark.parametrize(
+    ("header", "raw", "share"),
+    [
+        ((158, 2047), 1047.5, 0.5),  # DShot with 5.5 % of idle
+        ((158, 1647), 2047.0, 1.0),  # and a motor_output_limit of 80 %
+        (None, 1047.5, 0.5),
+        ((1070, 2000), 1500.0, 0.5),  # pulses, which begin at minthrottle
+        (None, 1500.0, 0.5),
+    ],
+)
+def test_motor_outputs_are_shares_of_their_protocols_range(header, raw, share):
+    """The vehicle file's [motors] and loops count commands from a motor's stop, not its idle."""
+    least = 158.0 if raw != 1500.0 else 1070.0
+    box = betaflight.Blackbox.__new__(betaflight.Blackbox)
+    box.name, box.findings, box.header = "log", [], {"motorOutput": header} if header else {}
+    box.columns = {f"motor[{k}]": np.array([least, raw]) for k in range(4)}
+    box.units = {name: (name, "") for name in box.columns}
+    np.testing.assert_allclose(betaflight._outputs(box)["pwm"][1], share, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("motors", "sticks", "pulses"),
+    [
+        ((), {}, (1000.0, 2000.0)),
+        ((1100.0, 1900.0), {"RC3_MIN": 990.0}, (1100.0, 1900.0)),
+        ((0.0, 0.0), {"RC3_MIN": 1100.0, "RC3_MAX": 1940.0}, (1100.0, 1940.0)),  # Copter 3 and 4.0
+        ((0.0, 1900.0), {"RCMAP_THROTTLE": 2.0, "RC2_MAX": 1950.0}, (1000.0, 1950.0)),
+        ((1900.0, 1100.0), {"RC3_MIN": 2000.0}, (1000.0, 2000.0)),
+    ],
+)
+def test_pulses_of_ardupilot_are_of_the_motors_else_of_the_sticks_range(motors, sticks, pulses):
+    parameters = dict(zip(("MOT_PWM_MIN", "MOT_PWM_MAX"), motors, strict=False)) | sticks
+    assert ardupilot._pulse_range(parameters) == pulses
 
 
 def thrust_rows(felt=None, count=200):
@@ -139,6 +184,36 @@ def test_a_throttle_goes_through_the_vehicles_motors_with_the_battery():
     findings = thrust_command(rows, ImportOptions(vehicle=vehicle))
     np.testing.assert_allclose(rows["cmd_thrust"], 4 * 0.159375 / vehicle.mass)
     assert "with the battery's voltage" in findings[0].evidence
+
+
+def test_a_thrust_that_the_firmware_makes_linear_does_not_go_through_the_motors():
+    vehicle = replace(PLAIN, motors=MotorMap((0.2, 0.6), 4.0))
+    rows = {SHARE: np.full((3, 1), 0.5), "voltage": np.full((3, 1), 3.0)}
+    thrust_command(rows, ImportOptions(vehicle=vehicle))
+    np.testing.assert_allclose(rows["cmd_thrust"], 0.5 * vehicle.full_thrust)
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "throttle_of"),
+    [
+        ("betaflight", {"dshot_idle_value": 550.0}, lambda u: (u - 0.055) / 0.945),
+        ("px4", {"THR_MDL_FAC": 0.3}, lambda u: 0.3 * u**2 + 0.7 * u),
+        ("px4", {"THR_MDL_FAC": 0.0}, lambda u: u),
+        ("crazyflie", {}, lambda u: u),
+    ],
+)
+def test_a_firmwares_throttle_gives_the_thrust_of_its_motor_commands(kind, settings, throttle_of):
+    """The thrust that the simulated loop makes of the motor commands that it gives at rest."""
+    controller = replace(PLAIN.controller, kind=kind, settings=KINDS[kind].Settings(**settings))
+    vehicle = replace(PLAIN, controller=controller, motors=MotorMap((0.5, 7.0), 4.0))
+    force, loop = np.array([4.0, 9.0, 15.0]), loop_of(vehicle)
+    still, each = np.zeros((3, 3)), np.ones((3, 3))
+    _, thrust = update(loop, start(loop, (3,), np), force, still, still, 0.002, each)
+    np.testing.assert_allclose(thrust, np.repeat(force[:, None] / 4.0, 4, axis=1), rtol=1e-9)
+    command = command_of_thrust(vehicle.motors.thrust, thrust[:, :1])
+    rows = {"throttle": throttle_of(command)}
+    thrust_command(rows, ImportOptions(vehicle=vehicle))
+    np.testing.assert_allclose(rows["cmd_thrust"][:, 0], force / PLAIN.mass, rtol=1e-9)
 
 
 def motor_rows():

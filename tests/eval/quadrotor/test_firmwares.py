@@ -147,6 +147,13 @@ def test_thrust_gives_way_to_roll_and_yaw_to_thrust_and_none_is_added(thrust, to
     np.testing.assert_allclose(given, motors, atol=1e-9)
 
 
+def test_motors_that_hardly_roll_the_body_do_not_limit_its_roll():
+    """Motor 1 gives 0.15 of motor 3's roll and would reach 1.004: the clip takes it, not all."""
+    layout = LAYOUT._replace(roll=np.array([0.15, -0.15, 1.0, -1.0]), pitch=np.zeros(4))
+    given = px4._fit_into_range(np.array([1.004, 0.8, 0.9, 0.9]), px4.columns(layout)[0], 1.0)
+    np.testing.assert_array_equal(given, [1.004, 0.8, 0.9, 0.9])
+
+
 def test_no_integral_of_px4_into_what_the_clip_takes_from_yaw():
     """Torque 0.54 at a thrust of 0.6: 1.14 and 0.06, lowered by 0.14 to 1 and -0.08, clipped to 0.
 

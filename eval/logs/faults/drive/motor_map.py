@@ -22,6 +22,7 @@ from eval.logs.faults.drive.motors import FITS, fit_force
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import WIDTH_S, Rows
 from eval.logs.faults.relation import jackknife_error, shift_rows, smooth
+from eval.quadrotor.loops import command_of_throttle
 from eval.vehicles.vehicle import MotorMap, Vehicle, motor_thrust
 
 LATE_S, STEP_S = 0.16, 0.01
@@ -142,7 +143,10 @@ def _drives(rows: Rows, vehicle: Vehicle | None) -> Iterator[Drive]:
     if "pwm" in rows and motors is not None:
         yield Drive("pwm", "motor map", "motor_map", motors, rows["pwm"], *about)
     if "throttle" in rows:
-        yield Drive("throttle", "throttle", "throttle_curve", motors, rows["throttle"], *about)
+        command = rows["throttle"]
+        if vehicle is not None and motors is not None:
+            command = command_of_throttle(vehicle.controller, command)
+        yield Drive("throttle", "throttle", "throttle_curve", motors, command, *about)
     elif "cmd_thrust" in rows and vehicle is not None:
         share = rows["cmd_thrust"] / vehicle.full_thrust
         yield Drive("cmd_thrust", "thrust command", "throttle_curve", None, share, *about)

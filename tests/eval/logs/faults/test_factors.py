@@ -352,6 +352,25 @@ def test_a_throttle_that_is_not_linear_or_of_another_full_thrust_is_named(
     assert [f.fault for f in found(rows, vehicle)] == faults
 
 
+@pytest.mark.parametrize(
+    ("kind", "settings", "throttle_of"),
+    [
+        ("betaflight", {"dshot_idle_value": 2000.0}, lambda u: (u - 0.2) / 0.8),
+        ("px4", {"THR_MDL_FAC": 0.8}, lambda u: 0.8 * u**2 + 0.2 * u),
+    ],
+)
+def test_the_throttle_of_a_firmware_is_no_other_curve_than_that_of_its_motors(
+    kind, settings, throttle_of
+):
+    rows = flown(depth=1.0, drained=False)
+    total = rows["motor"] ** 2 @ np.full(4, PLAIN.rotors.thrust_coefficient)
+    command = command_of_thrust(TRUE.thrust, total[:, None] / 4.0)
+    rows = {"time": rows["time"], "acc": rows["acc"], "throttle": throttle_of(command)}
+    controller = replace(PLAIN.controller, kind=kind, settings=KINDS[kind].Settings(**settings))
+    assert not found(rows, replace(with_motors(), controller=controller))
+    assert [f.fault for f in found(rows, with_motors())] == ["throttle_curve"]
+
+
 @pytest.mark.parametrize(("late", "expected"), [(12, ["throttle_curve"]), (30, [])])
 def test_a_curve_needs_a_delay_that_is_known(late, expected):
     """A throttle with a wrong curve, so late that no tried delay fits, shows nothing."""
