@@ -55,7 +55,7 @@ REFUSED = {
         ({"vehicle": "racer5"}, "vehicle is 'racer5', allowed is a Vehicle or None"),
         ({"spec": "race"}, "spec is 'race', allowed is a PolicySpec or None"),
         ({"rules": {}}, "rules is {}, allowed is an eval.worlds.trial.Rules"),
-        ({"rules": Rules(near_radius_m=-1.0)}, "rules.near_radius_m is -1.0, allowed is 0 to 100"),
+        ({"rules": Rules(rate_limit=-1.0)}, "rules.rate_limit is -1.0, allowed is above 0"),
     ],
     RaceVectorEnv: [
         ({"rewards": {"gates": 1.0}}, "unknown reward term 'gates'. Did you mean 'gate'"),
