@@ -11,7 +11,7 @@ import numpy as np
 
 CONFIDENCE = 0.95
 """Confidence of every interval in tables and result files."""
-NORMAL_QUANTILE = 1.959964
+NORMAL_QUANTILE = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
 """97.5 % quantile of the standard normal distribution."""
 LEAST_VALUES = 6
 """Smallest number of values for which a median has an interval: even the whole range of five values
@@ -58,8 +58,7 @@ def wilson(successes: float, trials: int) -> Interval:
             f"{successes} successes in {trials} trials: expected 0 <= successes <= trials and at "
             "least one trial"
         )
-    z = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
-    rate = successes / trials
+    z, rate = NORMAL_QUANTILE, successes / trials
     middle = (rate + z * z / (2 * trials)) / (1 + z * z / trials)
     half = z / (1 + z * z / trials) * sqrt(rate * (1 - rate) / trials + (z / (2 * trials)) ** 2)
     # Exactly 0 and 1 at the ends, without rounding errors.
