@@ -260,8 +260,8 @@ class Races:
     ) -> None:
         """Begin an episode in each of `slots`.
 
-        Each slot has a random generator for the level, the track and the vehicle. Without
-        `track_seed`, it is that of the configuration, or a random one.
+        Each slot has a random generator for level, track and vehicle. A track file has level 0, as
+        in the judge. Without `track_seed`, it is that of the configuration, or a random one.
 
         Raises:
             ValueError: for a `track_seed` that is not a whole number.
@@ -270,7 +270,7 @@ class Races:
         config = self.config
         entries: list[tuple[int, Track, TrialSpec]] = []
         for slot, rng in zip(slots, rngs, strict=True):
-            lowest, highest = levels_of(config)
+            lowest, highest = (0, 0) if self._file_track else levels_of(config)
             level = lowest if lowest == highest else int(rng.integers(lowest, highest + 1))
             seed = config.track_seed if track_seed is None else track_seed
             seed = int(rng.integers(SEEDS)) if seed is None else int(seed)

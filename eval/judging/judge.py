@@ -41,8 +41,6 @@ from tracks.common.work import Workers, run_pieces, usable_cores, worker_count
 from tracks.families import check_family
 from tracks.track import Track
 
-COMPILED_SLOTS = 64
-"""Numbers of slots are multiples of this in simulators that compile a program for each number."""
 MOST_A_PIECE = 640
 """Largest number of trials of a piece: the trials that one process flies at a time."""
 Trial = TypeVar("Trial")
@@ -183,9 +181,8 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
     policy = task.policy if _is_policy(task.policy) else task.policy()
     check_is_policy(policy)
     options = task.options
-    # Empty slots take little time, but another number of slots may need a compilation.
-    block = COMPILED_SLOTS if compiles(task.world) else 1
-    slots = min(options.slots, block * max(1, math.ceil(len(share) / block)))
+    # In a compiling world, another number of slots is another program, which rounds otherwise.
+    slots = options.slots if compiles(task.world) else min(options.slots, len(share))
     world = world_class(task.world)(
         task.vehicle, policy.spec.camera, layout_of(task.tracks.values()), options.rules,
         slots=slots, threads=options.threads, **action_argument(task.world, policy.spec.action),

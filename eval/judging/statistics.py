@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import comb, sqrt
+from math import comb, nan, sqrt
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -11,8 +11,11 @@ import numpy as np
 
 CONFIDENCE = 0.95
 """Confidence of every interval in tables and result files."""
-NORMAL_QUANTILE = 1.959964
+NORMAL_QUANTILE = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
 """97.5 % quantile of the standard normal distribution."""
+LEAST_VALUES = 6
+"""Smallest number of values for which a median has an interval: even the whole range of five values
+contains the median of their distribution with a probability of only 94 %."""
 AT_ONCE = 10_000_000
 """Largest number of resampled values that a bootstrap holds in memory at once."""
 
@@ -55,8 +58,7 @@ def wilson(successes: float, trials: int) -> Interval:
             f"{successes} successes in {trials} trials: expected 0 <= successes <= trials and at "
             "least one trial"
         )
-    z = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
-    rate = successes / trials
+    z, rate = NORMAL_QUANTILE, successes / trials
     middle = (rate + z * z / (2 * trials)) / (1 + z * z / trials)
     half = z / (1 + z * z / trials) * sqrt(rate * (1 - rate) / trials + (z / (2 * trials)) ** 2)
     # Exactly 0 and 1 at the ends, without rounding errors.
@@ -88,11 +90,12 @@ def bootstrap(
 ) -> Interval:
     """Return a statistic of values (n,) with its percentile bootstrap interval (Efron 1979).
 
-    Without values, estimate and interval are NaN. The same seed gives the same interval.
+    Without values the estimate is NaN, and with fewer than `LEAST_VALUES` the ends of the interval
+    are. The same seed gives the same interval.
     """
     values = np.asarray(values, float)
-    if not len(values):
-        return Interval(float("nan"), float("nan"), float("nan"))
+    if len(values) < LEAST_VALUES:
+        return Interval(float(statistic(values)) if len(values) else nan, nan, nan)
     rng, rows = np.random.default_rng(seed), max(1, AT_ONCE // len(values))
     resampled = np.concatenate(
         [

@@ -22,8 +22,8 @@ PRINTED_TRIALS = 10
 """Number of trials of a cell in the published tables with which results are compared."""
 NOTE = (
     "Success: rate with its 95 % Wilson interval. v_max, v_mean, lap: median over the cell's "
-    "trials (lap: over its finished ones) with its 95 % bootstrap interval; v_max is each trial's "
-    "largest speed before any contact."
+    "trials (lap: over its finished ones), from six on with a 95 % bootstrap interval; v_max is "
+    "each trial's largest speed before any contact."
 )
 """Note below every table."""
 PAIR_NOTE = "Differences are on the same trials; success: Newcombe's paired interval."
@@ -45,7 +45,8 @@ class Tally(NamedTuple):
     v_mean: Interval
     """Mean speed of a trial, median over trials [m/s]."""
     lap_s: Interval
-    """Median lap time over finished trials [s]; NaN where there is none."""
+    """Median lap time over finished trials [s]; NaN where there is none. The ends of intervals of
+    fewer than six values are NaN."""
     ended_by: dict[str, int]
     """Ending -> number of trials with it."""
     late: int = 0
@@ -134,11 +135,15 @@ def percent(interval: Interval) -> str:
     return f"{value:.0f} % [{low:.0f}, {high:.0f}]"
 
 
-def with_interval(interval: Interval) -> str:
-    """Return a number with its interval: "6.55 [6.31, 6.70]", or "-" for none."""
+def with_interval(interval: Interval, scale: float = 1.0, form: str = ".2f") -> str:
+    """Return a number with its interval, times `scale`: "6.55 [6.31, 6.70]".
+
+    Without an interval it is "6.55", and "-" without a number.
+    """
     if np.isnan(interval.value):
         return "-"
-    return f"{interval.value:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
+    value, low, high = (f"{scale * x:{form}}" for x in interval)
+    return value if np.isnan(interval.low) else f"{value} [{low}, {high}]"
 
 
 def grids(summary: dict[str, Any]) -> list[Grid]:
@@ -180,19 +185,14 @@ def _other_endings(cell: Tally) -> str:
 
 def _pair_grid(paired: Sequence[Pairing]) -> Grid:
     """Return a table of the differences from the first policy."""
-
-    def points(pair: Pairing) -> str:
-        value, low, high = (100 * x for x in pair.success)
-        return f"{value:+.0f} [{low:+.0f}, {high:+.0f}] points"
-
     return table_of(
         paired,
         ("difference", lambda pair: f"{pair.policy} - {pair.against}"),
         ("track", lambda pair: pair.track),
         ("level", lambda pair: str(pair.difficulty)),
         ("pairs", lambda pair: str(pair.trials)),
-        ("success", points),
+        ("success", lambda pair: f"{with_interval(pair.success, 100, '+.0f')} points"),
         ("p (McNemar)", lambda pair: f"{pair.p_value:.3g}"),
-        ("v_mean [m/s]", lambda pair: "{:+.2f} [{:+.2f}, {:+.2f}]".format(*pair.v_mean)),
+        ("v_mean [m/s]", lambda pair: with_interval(pair.v_mean, form="+.2f")),
         note=PAIR_NOTE,
     )

@@ -86,8 +86,8 @@ class World(Protocol):
     - `integrator` (`"euler"`) is written to flight logs, with the length of a step. A log without
       it counts as continuous in time: a diagnosis assumes that its integrator has no error.
     - `cost` is the computing time of a trial relative to MuJoCo's, for estimates; default 1.
-    - `compiles` is true where each number of slots needs a compilation. Such a world gets all
-      trials at once, in one process.
+    - `compiles` is true where each number of slots needs a compilation. Such a world has the same
+      number of slots for any number of trials, and gets all trials at once, in one process.
     - `actions` are the supported kinds of action other than acceleration. The class then takes an
       argument `action`, a `policies.spec.ActionSpec`.
 

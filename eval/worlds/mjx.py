@@ -4,7 +4,8 @@ MuJoCo's JAX engine moves the free body. Its contacts are disabled: they take te
 all other computations, and a trial ends at the first contact anyway. Collisions are found by signed
 distances instead, and depth images by analytic ray casting. The steps between two decisions of the
 policy are one compiled function. States are float32, so a flight departs slowly from the same
-flight in `mujoco`. A trial's outcome does not depend on the other trials.
+flight in `mujoco`. A trial's outcome does not depend on the other trials, but another number of
+slots changes the last bits.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple
 
 from eval.quadrotor.plant import Motion, Wrench
 from tracks.families import make_track
-from tracks.geometry.crossing import NEAR_RADIUS_M, crossing, is_near
+from tracks.geometry.crossing import crossing, is_near
 from tracks.geometry.scene import Array, Gates
 from tracks.input.ranges import Range, TimeLimit, check_ranges, check_type
 from tracks.track import Track
@@ -22,6 +22,8 @@ ENDINGS = ("finished", "collision", "tipped", "timeout", "diverged")
 """Values of `TrialResult.ended_by`; `Progress.ended` is 1 + the index."""
 FINISHED, COLLISION, TIPPED, TIMEOUT, DIVERGED = range(1, 6)
 """Codes in `Progress.ended` of the `ENDINGS`, in their order."""
+SHORT_WINDOW_S = 8.0
+"""Gates passed by this time count as `gates_8s` [s]."""
 
 
 class TrialSpec(NamedTuple):
@@ -105,10 +107,6 @@ class Rules:
 
     time_limit_s: TimeLimit = 20.0
     """A trial ends at this time [s]."""
-    short_window_s: Annotated[float, Range(0.0, 3600.0)] = 8.0
-    """Gates passed by this time count as `gates_8s` [s]."""
-    near_radius_m: Annotated[float, Range(0.0, 100.0)] = NEAR_RADIUS_M
-    """By the baseline's rule a gate counts within this distance of its centre [m]."""
     speed_limit: Annotated[float, Range(0.0, 1e3, above=True)] = 1e3
     """A body faster than this [m/s] has diverged."""
     rate_limit: Annotated[float, Range(0.0, 1e4, above=True)] = 1e4
@@ -146,7 +144,7 @@ class Progress(NamedTuple):
     gates: Array
     """Number of gates crossed in order, which is the index of the next gate, int32."""
     gates_8s: Array
-    """Number of gates crossed within `Rules.short_window_s`, int32."""
+    """Number of gates crossed within `SHORT_WINDOW_S`, int32."""
     gates_035: Array
     """Number of gates by the baseline's rule, int32."""
     v_max: Array
@@ -239,12 +237,12 @@ def judge_state(
     gate = next_gate(course, progress.gates)
     passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, progress.pos_w, pos_w)
     gates = progress.gates + (passed & live_without_contact & (progress.gates < course.count))
-    is_at_next_centre = is_near(next_centre(course, progress.gates_035), pos_w, rules.near_radius_m)
+    is_at_next_centre = is_near(next_centre(course, progress.gates_035), pos_w)
     gates_035 = progress.gates_035 + (
         is_at_next_centre & live_without_contact & (progress.gates_035 < course.count)
     )
     speed = xp.sqrt((vel_w * vel_w).sum(-1))
-    last_step, short_step = round(rules.time_limit_s / dt), round(rules.short_window_s / dt)
+    last_step, short_step = round(rules.time_limit_s / dt), round(SHORT_WINDOW_S / dt)
 
     ended = xp.where(live_without_contact & (progress.step >= last_step), TIMEOUT, progress.ended)
     ended = xp.where(live_without_contact & (rot_w[:, 2, 2] < 0), TIPPED, ended)

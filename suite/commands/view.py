@@ -75,9 +75,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     for rollout in rollouts:
         written.append(write_picture(config.out / f"{_name(rollout)}.png", *rollout))
         result = rollout[2]
-        collision = f" with {result.collided_with}" if result.collided_with else ""
         console.say(
-            f"{_name(rollout)}: {result.gates_passed} gates, {result.ended_by}{collision} after "
+            f"{_name(rollout)}: {result.gates_passed} gates, {result.ending} after "
             f"{result.time_s:.1f} s"
         )
         before = chosen.judged.get(result.trial, result)

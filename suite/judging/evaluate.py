@@ -157,9 +157,11 @@ def evaluate(
 def _laps_over_plan(results: Sequence[TrialResult], trial_set: TrialSet) -> list[OverPlan]:
     """Return each policy's lap times divided by planned ones; none for another vehicle.
 
-    The planned laps are shipped, for one vehicle and for families of tracks only.
+    The planned laps are shipped, for one vehicle and for families of tracks only. A simulator that
+    differs from the vehicle file flies another vehicle.
     """
-    if vehicle_table(trial_set.vehicle) != vehicle_table(load_vehicle(VEHICLE)):
+    is_planned = vehicle_table(trial_set.vehicle) == vehicle_table(load_vehicle(VEHICLE))
+    if trial_set.differences or not is_planned:
         return []
     return over_plan([row for row in results if row.track not in trial_set.tracks])
 

@@ -56,7 +56,7 @@ def read_evaluation(folder: Path) -> Evaluation:
     return evaluation
 
 
-def read_digests(folder: Path, number: int = 0) -> dict[str, str]:
+def read_digests(folder: Path, number: int) -> dict[str, str]:
     """Return the SHA-256 of the inputs of the evaluation in `folder`, by name.
 
     The inputs are policy `number` (from 0), the vehicle, the sensors and the tracks; see

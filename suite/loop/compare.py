@@ -15,6 +15,7 @@ from eval.judging.statistics import (
     paired_success,
     wilson,
 )
+from eval.judging.tables import with_interval
 from eval.worlds.trial import TrialResult
 from tracks.common.grid import Cell, Grid, table
 
@@ -120,7 +121,7 @@ def overall_grid(
         headers += [f"minus {labels[reference]}", "p"]
     rows = []
     for result in results:
-        row: list[str | Cell] = [labels[result.name], value_text(result.success, 100, 0)]
+        row: list[str | Cell] = [labels[result.name], with_interval(result.success, 100, ".0f")]
         differences = {difference.against: difference for difference in result.differences}
         for reference in references:
             difference = differences.get(reference)
@@ -128,7 +129,7 @@ def overall_grid(
                 row += [difference_cell(difference.success), f"{difference.p_value:.2g}"]
             else:
                 row += ["", ""]
-        rows.append([*row, *(value_text(value, 1, 2) for value in (result.gates, result.v_mean))])
+        rows.append([*row, *(with_interval(value) for value in (result.gates, result.v_mean))])
     headers += ["gates passed, mean", "mean speed, median [m/s]"]
     return table(headers, rows, f"Over {trials} trials of each policy")
 
@@ -137,16 +138,10 @@ def cell_grid(results: Sequence[PolicyResult], labels: Mapping[str, str]) -> Gri
     """Return the table of success rates, with a row per track and level and a column per policy."""
     headers = ["track and level", *(labels[result.name] for result in results)]
     rows = [
-        [cell, *(value_text(result.by_cell[cell], 100, 0) for result in results)]
+        [cell, *(with_interval(result.by_cell[cell], 100, ".0f") for result in results)]
         for cell in results[0].by_cell
     ]
     return table(headers, rows, "Success by track and level [%]")
-
-
-def value_text(interval: Interval, scale: float, digits: int) -> str:
-    """Return a number with its interval for a table; both are multiplied by `scale`."""
-    value, low, high = (f"{scale * x:.{digits}f}" for x in interval)
-    return f"{value} [{low}, {high}]"
 
 
 def difference_cell(interval: Interval | PairedDifference) -> Cell:

@@ -19,7 +19,7 @@ from eval.sensors.sensors_file import PERFECT, SensorSet
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.engine import DepthCamera, compile_model, contact_name, motion_of, start_state
 from eval.worlds.slots import GustDraws, layout_of
-from eval.worlds.trial import Rules, TrialResult, TrialSpec, track_of
+from eval.worlds.trial import SHORT_WINDOW_S, Rules, TrialResult, TrialSpec, track_of
 from policies.observation import observe, view_of
 from policies.policy import Policy
 from tracks.geometry.crossing import crossing, is_near
@@ -106,14 +106,14 @@ def fly_trial(
             passed += bool(crossing(*gate, before_w, pos_w)[0])
             if passed_035 < count:
                 near_w = gates.center_w[passed_035]
-                passed_035 += bool(is_near(near_w, pos_w, rules.near_radius_m))
+                passed_035 += bool(is_near(near_w, pos_w))
             if passed == count:
                 ended_by = "finished"
             elif motion.rot_w[0, 2, 2] < 0:
                 ended_by = "tipped"
             elif step >= round(rules.time_limit_s / dt):
                 ended_by = "timeout"
-        if step <= round(rules.short_window_s / dt):
+        if step <= round(SHORT_WINDOW_S / dt):
             passed_8s = passed
         before_w = pos_w
         if ended_by is not None:

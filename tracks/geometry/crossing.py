@@ -64,7 +64,7 @@ def crossing(
     return crosses & inside, crosses & ~inside
 
 
-def is_near(center_w: Array, point_w: Array, radius_m: float = NEAR_RADIUS_M) -> Array:
-    """Return whether point_w (..., 3) is within radius_m of the gate's centre (..., 3)."""
+def is_near(center_w: Array, point_w: Array) -> Array:
+    """Return whether point_w (..., 3) is within `NEAR_RADIUS_M` of a gate's centre (..., 3)."""
     away = point_w - center_w
-    return (away * away).sum(-1) <= radius_m**2
+    return (away * away).sum(-1) <= NEAR_RADIUS_M**2

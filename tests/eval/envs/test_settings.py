@@ -14,8 +14,10 @@ import pytest
 
 import suite
 import tracks
+from eval.effects.wind import Gusts
 from eval.envs.gymnasium_env import RaceEnv, RaceVectorEnv
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.vehicles.vehicle import with_effects
 from eval.worlds.trial import Rules
 from policies.spec import ActionSpec, DepthEncoding, PolicySpec
 from tests.support.courses import IN_CONTACT
@@ -55,7 +57,7 @@ REFUSED = {
         ({"vehicle": "racer5"}, "vehicle is 'racer5', allowed is a Vehicle or None"),
         ({"spec": "race"}, "spec is 'race', allowed is a PolicySpec or None"),
         ({"rules": {}}, "rules is {}, allowed is an eval.worlds.trial.Rules"),
-        ({"rules": Rules(near_radius_m=-1.0)}, "rules.near_radius_m is -1.0, allowed is 0 to 100"),
+        ({"rules": Rules(rate_limit=-1.0)}, "rules.rate_limit is -1.0, allowed is above 0"),
     ],
     RaceVectorEnv: [
         ({"rewards": {"gates": 1.0}}, "unknown reward term 'gates'. Did you mean 'gate'"),
@@ -122,6 +124,20 @@ def test_paths_and_numpy_numbers_are_taken():
     with pytest.warns(UserWarning, match="no levels and seeds: (level|track_seed) does not change"):
         RaceEnv(track=file, track_seed=1, **given)
     assert RaceEnv(level=np.array([2, 2])).reset(seed=0)[1]["level"] == 2
+
+
+def test_gusts_on_a_track_file_are_those_of_its_only_level_as_in_the_judge(tmp_path):
+    path = tmp_path / "gate.toml"
+    path.write_text("[[gates]]\ncenter = [0, 0, 1.3]\nwidth = 1\nheight = 1\n")
+    vehicle = with_effects(load_vehicle("reference"), {"gusts": Gusts(3.0, 5.0)})
+    reached = []
+    for level in (0, 3):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that the level has no effect
+            env = RaceEnv(track=path, level=level, track_seed=7, vehicle=vehicle)
+        assert env.reset(seed=0)[1]["level"] == 0
+        reached.append([env.step(np.zeros(3, np.float32))[0]["state"] for _ in range(5)])
+    np.testing.assert_array_equal(*reached)
 
 
 def test_a_track_on_which_the_vehicle_starts_in_contact_is_refused(tmp_path):

@@ -10,7 +10,8 @@ from eval.judging.judge import JudgeOptions, Record
 from eval.judging.recorder import Recorder
 from eval.judging.results import Journal
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.worlds import Rows
+from eval.worlds import WORLDS, Rows
+from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
 from tests.support.courses import fly_on, straight
@@ -124,6 +125,22 @@ def test_outcomes_are_the_same_at_any_order_number_of_slots_and_threads(expected
     same(TRIALS[5:1:-2], results(TRIALS[5:1:-2]), expected)
     # With 3 slots trials start in the middle of others, each in any slot.
     same(TRIALS, results(TRIALS, slots=3, threads=2), expected)
+
+
+def test_a_world_that_compiles_has_the_same_slots_for_any_number_of_trials(monkeypatch):
+    """Another number of slots would be another program, with other rounding."""
+    slots = set()
+
+    def make(*arguments, **settings):
+        slots.add(settings["slots"])
+        return MujocoWorld(*arguments, **settings)
+
+    make.compiles = True
+    monkeypatch.setitem(WORLDS._values, "compiling", make)
+    monkeypatch.setitem(WORLDS._entries, "compiling", make)
+    for trials in TRIALS[:1], TRIALS:
+        results(trials, slots=70, world="compiling")
+    assert slots == {70}
 
 
 def test_reference_world_flies_the_same(expected):

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eval.judging.statistics import (
+    CONFIDENCE,
     bootstrap,
     expected_largest,
     mcnemar_exact,
@@ -75,6 +76,14 @@ def test_bootstrap_repeats_and_has_no_value_without_trials():
     assert bootstrap(values, 3) != bootstrap(values[::2], 3)
     assert bootstrap(values).value == 16
     assert np.isnan(bootstrap(np.array([]))).all()
+
+
+def test_a_median_has_an_interval_where_one_can_hold_in_95_percent():
+    """The range of n values contains the median with a probability of 1 - 2 / 2^n."""
+    for count in range(1, 9):
+        interval = bootstrap(np.arange(1.0 * count))
+        assert interval.value == (count - 1) / 2
+        assert np.isnan(interval[1:]).all() == (1 - 2 / 2**count < CONFIDENCE)
 
 
 def test_the_expected_largest_is_that_of_all_picks():

@@ -225,6 +225,7 @@ def test_what_a_world_flies_otherwise_is_said_once_and_written(
     assert [text.split(":")[0] for text in summary["flown_otherwise"]] == [
         "linear_drag", "the rotors' drag acts at each hub and depends on the hub's airspeed",
     ]  # fmt: skip
+    assert summary["over_plan"] == []  # the plans are laps of the vehicle in the file
     assert {row.world for row in read_trials(tmp_path / "trials.parquet")} == {"rotorpy"}
 
 
