@@ -66,6 +66,9 @@ def test_slow_rotor_speeds_are_left_out_and_of_too_many_rows_a_share_of_each_sig
     own = log.rate_b[row % 3 == 1]
     averaged = [own[max(k - 1, 0) : k + 2].mean(axis=0) for k in range(0, len(own), 3)]
     np.testing.assert_allclose(few.rate_b[turning][1:-1], averaged[1:-1], atol=1e-6)
+    # A command holds until the next row that stays, so it is the mean of those in between.
+    held = [log.thrust_cmd[k : k + 3].mean() for k in range(0, len(row), 3)]
+    np.testing.assert_allclose(few.thrust_cmd[position], held)
     for motor in range(4):
         kept_speed = few.rotor_speed[np.isfinite(few.rotor_speed[:, motor]), motor]
         np.testing.assert_array_equal(kept_speed, log.rotor_speed[row % 4 == motor, motor][::2])
