@@ -226,7 +226,7 @@ def check_log(
     Stored findings of an import are repeated, unless a check finds the same fault again, or they
     are of the import's vehicle file and `against` has one.
     """
-    checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
+    checks = (*CLOCK, *POSE, lambda rows, given: check_clock(rows, given.vehicle), *DRIVE)
     rows = rows_of(log)
     findings, readings, _ = run_checks(rows, checks, against, fix)
     action = {} if log.action_b is None else {"action": log.action_b}
