@@ -329,10 +329,12 @@ def _window(
     rotor_valid = valid[5]
     if rotor_spacing_s is not None:
         valid[5] = np.zeros_like(rotor_valid)  # the model's input is not compared
-    # Not simulated: the time before the start, of the accelerometer's first row and of late poses.
+    # Not simulated: the time before the start and after the end, of the accelerometer's first row
+    # and of late or early poses.
     valid[4][0] = False
+    pose_s = time_s[rows] - begin_s - pose_delay(vehicle.effects)
     for pose in valid[:3]:
-        pose[time_s[rows] - begin_s < pose_delay(vehicle.effects) - 1e-9] = False
+        pose[(pose_s < -1e-9) | (pose_s > window.edge_s[-1] + 1e-9)] = False
 
     def padded(values: np.ndarray) -> np.ndarray:
         padding = np.zeros((ROWS - len(rows), *values.shape[1:]), values.dtype)

@@ -204,16 +204,18 @@ def test_windows_hold_the_rows_and_commands_of_their_time(log):
     )
 
 
-def test_a_pose_from_before_the_start_is_not_compared(log):
+@pytest.mark.parametrize("late_s", [0.018, -0.018])
+def test_a_pose_from_before_the_start_or_after_the_end_is_not_compared(log, late_s):
     """A rollout has no pose from then; the vehicle file says how late the log has poses."""
-    late = with_effects(PLAIN, clock_offset=(0.018,))
+    late = with_effects(PLAIN, clock_offset=(late_s,))
     (in_time, _), (windows, _) = (cut([log], vehicle, False) for vehicle in (PLAIN, late))
     pose = np.r_[SLICES["position"], SLICES["attitude"], SLICES["velocity"]]
-    is_before = np.asarray(windows.row_s) < 0.018
-    assert is_before.sum(axis=1).min() >= 2 and in_time.valid[is_before][:, pose].all()
-    assert not windows.valid[is_before][:, pose].any()
-    assert windows.valid[is_before][:, SLICES["rates"]].all()
-    np.testing.assert_array_equal(windows.valid[~is_before], in_time.valid[~is_before])
+    row_s = np.asarray(windows.row_s)
+    is_outside = row_s < late_s if late_s > 0.0 else row_s > row_s[:, -1:] + late_s
+    assert is_outside.sum(axis=1).min() >= 2 and in_time.valid[is_outside][:, pose].all()
+    assert not windows.valid[is_outside][:, pose].any()
+    assert windows.valid[is_outside][:, SLICES["rates"]].all()
+    np.testing.assert_array_equal(windows.valid[~is_outside], in_time.valid[~is_outside])
 
 
 def test_few_shapes_hold_rows_of_every_rate(log):
