@@ -146,7 +146,8 @@ def cut(
         rotor_input: whether measured rotor speeds are the input; then they are not compared.
         stride_s: time between the starts of two windows [s]; by default windows do not overlap.
         limits: longest hole in a window, and largest numbers of windows.
-        integrator: integrator of the model; with "euler" its steps are the rate loop's periods.
+        integrator: integrator of the model; with "euler" its steps are those that the log states,
+            or else the rate loop's periods.
         coarser: windows of an earlier call, which are cut again with steps of twice the length
             and every second rotor speed.
         only: numbers of the flights that are cut; all if not given.
@@ -178,11 +179,11 @@ def cut(
     if len(starts) > most:
         warnings.append(f"{most} stretches of 1 s, evenly spread, are used of {len(starts)}")
         starts = [starts[k] for k in np.linspace(0, len(starts) - 1, most).astype(int)]
-    longest_s = 1.0 / vehicle.controller.frequency if integrator == "euler" else LONGEST_S
-    if coarser is not None and integrator != "euler":
-        longest_s *= 2.0
+    steps_s = [LONGEST_S * (1.0 if coarser is None else 2.0)] * len(logs)
+    if integrator == "euler":
+        steps_s = [log.step_s or 1.0 / vehicle.controller.frequency for log in logs]
     held = 1 if fewer_commands is None else 2
-    inputs = [_input_of(logs[number], row, vehicle, longest_s, held) for number, row in starts]
+    inputs = [_input_of(logs[k], row, vehicle, steps_s[k], held) for k, row in starts]
     like, stride = coarser or fewer_commands, 1 if coarser is None else 2
     windows = [
         _window(logs[k], states[k], k, row, vehicle, spacings_s.get(k), one, stride)

@@ -218,6 +218,13 @@ def test_a_pose_from_before_the_start_or_after_the_end_is_not_compared(log, late
     np.testing.assert_array_equal(windows.valid[~is_outside], in_time.valid[~is_outside])
 
 
+def test_eulers_steps_are_those_that_a_log_states_or_periods_of_the_rate_loop(log):
+    for about, step_s in (({"step_s": 0.0025}, 0.0025), ({}, 1.0 / PLAIN.controller.frequency)):
+        windows, _ = cut([replace(log, about=about)], PLAIN, False, integrator="euler")
+        length_s = np.diff(windows.edge_s)
+        np.testing.assert_allclose(length_s[length_s > 0.0], step_s, rtol=1e-6)
+
+
 def test_few_shapes_hold_rows_of_every_rate(log):
     few, many = (144 + 512 + 1, 192), (144 + 512 + 1, 1536)
     more = 704 - 512
