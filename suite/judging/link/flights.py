@@ -151,8 +151,8 @@ def write_log(
 ) -> str | None:
     """Write a flight's log into `out` and return its name; None if it is no valid flight log.
 
-    A flight with fewer than two states has none. `about` has the track, level and seed, of a
-    simulated flight also the integrator, and is stored in the log. `console` shows why a log is not written.
+    A flight with fewer than two states has none. `about` is stored in the log: track, level and
+    seed, and of a simulated flight the integrator. `console` shows why a log is not written.
     """
     rows = companion.rows
     if len(rows) < 2:
