@@ -101,8 +101,8 @@ FAULTS = (
           "xp.where(live_without_contact & (rot_w[:, 2, 2] < 0.05), TIPPED", "test_trial"),
     Fault("eval/worlds", "progress.step <= short_step, gates", "progress.step < short_step, gates",
           "test_trial"),
-    Fault("eval/judging", "np.rint((place + 1) * self._period - ages)",
-          "np.floor((place + 1) * self._period - ages)", "test_ages"),
+    Fault("eval/judging", "np.rint(step[place + 1] - ages)",
+          "np.floor(step[place + 1] - ages)", "test_ages"),
     Fault("eval/judging", "+ (z / (2 * trials)) ** 2)", "+ (z / trials) ** 2)", "test_statistics"),
     # suite: losses, gradient, point mass
     Fault("suite/train", "jnp.maximum(1.0 - step.margin, 0.0) ** 2",

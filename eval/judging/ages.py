@@ -88,16 +88,16 @@ class Aged:
             factor = self._rngs[slot].uniform(1.0 - self._jitter, 1.0 + self._jitter, count)
             self._ages[-count:, slot] = self._mean * factor
 
-    def due(self) -> Iterator[Due]:
-        """Yield the views to take before the next decision."""
-        # A view belongs to this period between decisions if its age, rounded up to periods, is the
-        # number of periods until its decision.
-        periods = np.maximum(np.ceil(self._ages / self._period - 1e-9), 1)
+    def due(self, decision: np.ndarray) -> Iterator[Due]:
+        """Yield the views to take between the decisions with these numbers (N,) and the next."""
+        # Physics steps of this decision, the next one, and so on.
+        step = np.rint((decision + np.arange(self.ahead + 1)[:, None]) * self._period)
         for place, ages in enumerate(self._ages):
-            rows = periods[place] == place + 1
+            taken = np.rint(step[place + 1] - ages)
+            # A view without age is taken at the next decision itself.
+            rows = (taken >= step[0]) & ((taken < step[1]) | (place == 0))
             if rows.any():
-                pause = np.rint((place + 1) * self._period - ages).astype(int)
-                yield Due(np.where(rows, pause, 0), rows, place)
+                yield Due(np.where(rows, taken - step[0], 0).astype(int), rows, place)
 
     def take(self, due: Due, view: View) -> None:
         """Store the current view in the slots of `due`."""
@@ -124,9 +124,12 @@ class Delays:
         depth_m = self.image.see(now, fresh, flying).depth_m
         return self.state.see(now, fresh, flying)._replace(depth_m=depth_m)
 
-    def moments(self) -> Iterator[Moment]:
-        """Yield the times at which views are taken before the next decision, in order."""
-        uses = [(aged, due) for aged in (self.state, self.image) for due in aged.due()]
+    def moments(self, decision: np.ndarray) -> Iterator[Moment]:
+        """Yield the times at which views are taken after `decision` (N,), see `Aged.due`, in order.
+
+        They are not after the next decision.
+        """
+        uses = [(aged, due) for aged in (self.state, self.image) for due in aged.due(decision)]
         if not uses:
             return
         pauses = np.array([due.pause for _, due in uses])

@@ -296,13 +296,13 @@ class _Slots:
         if self._recorder:
             self._recorder.decided(np.flatnonzero(flying), self._action_b, view.depth_m)
         steps = steps_to_next(self._decision, self._steps_a_decision)
-        self._decision += 1
         self._fly_steps(np.where(flying, steps, 0), flying)
+        self._decision += 1
 
     def _fly_steps(self, steps: np.ndarray, flying: np.ndarray) -> None:
         """Fly the actions for physics steps (N,), and take the views of delayed sensors."""
         done = np.zeros_like(steps)
-        for moment in self._delays.moments() if self._delays else ():
+        for moment in self._delays.moments(self._decision) if self._delays else ():
             part = np.minimum(steps, moment.pause)
             self._advance(part - done)
             done = part

@@ -2,7 +2,7 @@
 
 At the policy's low resolution, a rotation of the camera shifts all pixels of an image equally. The
 shift is the body rate times the time, divided by a pixel's angle. The rate is the mean rate since
-the previous observation.
+the previous observation. Where state and image have different ages, it is that of the state.
 """
 
 from __future__ import annotations

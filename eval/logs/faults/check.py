@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.rows import continuous
+from eval.importers.rows import HELD, continuous, held
+from eval.importers.signals import Signal
 from eval.logs.columns import GROUPS
 from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.clocks.delay import check_clock
@@ -225,7 +226,7 @@ def check_log(
     Stored findings of an import are repeated, unless a check finds the same fault again, or they
     are of the import's vehicle file and `against` has one.
     """
-    checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
+    checks = (*CLOCK, *POSE, lambda rows, given: check_clock(rows, given.vehicle), *DRIVE)
     rows = rows_of(log)
     findings, readings, _ = run_checks(rows, checks, against, fix)
     action = {} if log.action_b is None else {"action": log.action_b}
@@ -287,7 +288,7 @@ def not_identifiable(findings: Sequence[Finding]) -> list[dict[str, str]]:
 def rows_of(log: FlightLog) -> dict[str, np.ndarray]:
     """Return a log's signals on its rows (see `run_checks`).
 
-    Missing values of slower signals are interpolated linearly.
+    Missing values of slower signals are interpolated linearly; commands hold their last value.
     """
     columns, rows = columns_from_log(log), {"time": log.time_s}
     for group, value in signals_of(columns).items():
@@ -295,7 +296,7 @@ def rows_of(log: FlightLog) -> dict[str, np.ndarray]:
             is_far = jumps_of(log.time_s, value, in_metres=False) > 0.0
             value = np.where(is_far[:, None], np.nan, value)
         if np.isfinite(value).all(axis=1).sum() > LEAST_ROWS:
-            fill = _filled_attitude if group == "quat" else filled
+            fill = _filled_attitude if group == "quat" else _held if group in HELD else filled
             rows[group] = fill(log.time_s, value)
     for name in ("throttle", "baro"):
         if name in columns and np.asarray(columns[name]).dtype.kind in "fiu":
@@ -323,6 +324,12 @@ def _filled_attitude(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
     same_sign[known] = continuous(quat[known])
     value = filled(time_s, same_sign)
     return np.where(known[:, None], quat, value / np.linalg.norm(value, axis=1, keepdims=True))
+
+
+def _held(time_s: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Return commands (T, C), each held until the next one; NaN before the first."""
+    known = np.isfinite(value).all(axis=1)
+    return held(Signal(time_s[known], value[known]), time_s)
 
 
 def signals_of(

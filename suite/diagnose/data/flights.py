@@ -299,16 +299,17 @@ def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:
     A command holds until the next row, and acts after the vehicle's delay and first-order lag.
     """
     constants = make_plant(vehicle, LONGEST_S).constants
-    command_time_s = log.time_s - float(constants.delay)
-    row = np.searchsorted(log.time_s, command_time_s + 1e-9, side="right") - 1
+    acts_s, lag = log.time_s + float(constants.delay), float(constants.time_constant)
+    # A delayed command may begin to act between two rows.
+    at_s = np.union1d(log.time_s, acts_s) if lag > 0.0 else log.time_s
+    row = np.searchsorted(acts_s, at_s + 1e-9, side="right") - 1
     wanted = wanted[np.maximum(row, 0)]  # NaN in holes stay NaN
-    lag = float(constants.time_constant)
     if lag <= 0.0:
         return wanted
-    remaining_share = np.exp(-np.diff(log.time_s) / lag)[:, None]
+    remaining_share = np.exp(-np.diff(at_s) / lag)[:, None]
     speed = wanted.copy()
-    for row in range(1, len(wanted)):
-        last_speed = np.where(np.isfinite(speed[row - 1]), speed[row - 1], wanted[row])
-        target = np.where(np.isfinite(wanted[row - 1]), wanted[row - 1], last_speed)
-        speed[row] = target + remaining_share[row - 1] * (last_speed - target)
-    return np.where(np.isfinite(wanted), speed, np.nan)
+    for k in range(1, len(wanted)):
+        last_speed = np.where(np.isfinite(speed[k - 1]), speed[k - 1], wanted[k])
+        target = np.where(np.isfinite(wanted[k - 1]), wanted[k - 1], last_speed)
+        speed[k] = target + remaining_share[k - 1] * (last_speed - target)
+    return np.where(np.isfinite(wanted), speed, np.nan)[np.searchsorted(at_s, log.time_s)]

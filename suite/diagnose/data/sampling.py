@@ -70,7 +70,8 @@ def with_fewer_rows(
 
     Each signal is thinned alone, as each may have values in other rows: the first value of every n
     rows, and more of a slow signal, at most `SPARSEST_S` apart. Rates and accelerations are
-    averaged about the rows that remain, because vibrations would otherwise alias.
+    averaged about the rows that remain, because vibrations would otherwise alias. Commands are
+    averaged until the next row that remains, as they hold until then.
     """
     count = sum(len(log.time_s) for log in logs)
     # -(-a // b) is a / b, rounded up.
@@ -102,6 +103,9 @@ def with_fewer_rows(
                 # The first value of every `width` rows of the log: so all signals keep one row.
                 width = step * max(1, round(float(np.median(np.diff(own_rows, prepend=-1)))))
                 first = np.unique(own_rows // width, return_index=True)[1]
+                if name in HELD:
+                    count_of = np.diff(first, append=len(series))[:, None]
+                    series[first] = np.add.reduceat(series, first) / count_of
                 thinned_table[np.ix_(own_rows[first], part)] = series[first]
         rows = np.zeros(len(log.time_s), bool)
         for values in signals.values():

@@ -146,7 +146,8 @@ def cut(
         rotor_input: whether measured rotor speeds are the input; then they are not compared.
         stride_s: time between the starts of two windows [s]; by default windows do not overlap.
         limits: longest hole in a window, and largest numbers of windows.
-        integrator: integrator of the model; with "euler" its steps are the rate loop's periods.
+        integrator: integrator of the model; with "euler" its steps are those that the log states,
+            or else the rate loop's periods.
         coarser: windows of an earlier call, which are cut again with steps of twice the length
             and every second rotor speed.
         only: numbers of the flights that are cut; all if not given.
@@ -178,11 +179,11 @@ def cut(
     if len(starts) > most:
         warnings.append(f"{most} stretches of 1 s, evenly spread, are used of {len(starts)}")
         starts = [starts[k] for k in np.linspace(0, len(starts) - 1, most).astype(int)]
-    longest_s = 1.0 / vehicle.controller.frequency if integrator == "euler" else LONGEST_S
-    if coarser is not None and integrator != "euler":
-        longest_s *= 2.0
+    steps_s = [LONGEST_S * (1.0 if coarser is None else 2.0)] * len(logs)
+    if integrator == "euler":
+        steps_s = [log.step_s or 1.0 / vehicle.controller.frequency for log in logs]
     held = 1 if fewer_commands is None else 2
-    inputs = [_input_of(logs[number], row, vehicle, longest_s, held) for number, row in starts]
+    inputs = [_input_of(logs[k], row, vehicle, steps_s[k], held) for k, row in starts]
     like, stride = coarser or fewer_commands, 1 if coarser is None else 2
     windows = [
         _window(logs[k], states[k], k, row, vehicle, spacings_s.get(k), one, stride)
@@ -329,10 +330,12 @@ def _window(
     rotor_valid = valid[5]
     if rotor_spacing_s is not None:
         valid[5] = np.zeros_like(rotor_valid)  # the model's input is not compared
-    # Not simulated: the time before the start, of the accelerometer's first row and of late poses.
+    # Not simulated: the time before the start and after the end, of the accelerometer's first row
+    # and of late or early poses.
     valid[4][0] = False
+    pose_s = time_s[rows] - begin_s - pose_delay(vehicle.effects)
     for pose in valid[:3]:
-        pose[time_s[rows] - begin_s < pose_delay(vehicle.effects) - 1e-9] = False
+        pose[(pose_s < -1e-9) | (pose_s > window.edge_s[-1] + 1e-9)] = False
 
     def padded(values: np.ndarray) -> np.ndarray:
         padding = np.zeros((ROWS - len(rows), *values.shape[1:]), values.dtype)

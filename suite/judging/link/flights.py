@@ -19,6 +19,7 @@ import numpy as np
 from eval.logs import flight as recorded
 from eval.logs.columns import FlightLogError
 from eval.logs.flight_log import log_from_flight, write_flight
+from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.trial import Rules, TrialSpec, track_of
 from policies.observation import Observation
 from policies.policy import Policy
@@ -111,12 +112,14 @@ def _fly_trial(
         link.close()
     assert result is not None
     trial_row = {**result.trial._asdict(), **companion.outputs.columns(0)}
+    step_s = 1.0 / trial_set.vehicle.controller.frequency
+    about = {**trial_row, "integrator": MujocoWorld.integrator, "step_s": step_s}
     row = {
         **trial_row,
         "handed_over": None if companion.over == FINISHED else companion.over,
         "vehicle_slips": result.slips,
         "missed_decisions": companion.missed_decisions,
-        "file": write_log(companion, trial_row, out, console),
+        "file": write_log(companion, about, out, console),
     }
     return Flight(row, companion.rows)
 
@@ -148,8 +151,8 @@ def write_log(
 ) -> str | None:
     """Write a flight's log into `out` and return its name; None if it is no valid flight log.
 
-    A flight with fewer than two states has none. `about` has the track, level and seed, and is
-    stored in the log. `console` shows why a log is not written.
+    A flight with fewer than two states has none. `about` is stored in the log: track, level and
+    seed, and of a simulated flight the integrator. `console` shows why a log is not written.
     """
     rows = companion.rows
     if len(rows) < 2:

@@ -28,20 +28,21 @@ def seen_at(time_s, n=2):
     return View(at, np.zeros((n, 3, 3)), at, at, at, at, at, image)
 
 
-def ages_seen(ages, trials, decisions):
+def ages_seen(ages, trials, decisions, period=STEPS):
     """Ages (decisions, 2, N) of state and image at each decision, as a judge would take them."""
     n = len(trials)
-    delays = Delays(ages, n, STEPS, DT)
+    delays = Delays(ages, n, period, DT)
     for slot, trial in enumerate(trials):
         delays.start(slot, trial)
     found = []
     for k in range(decisions):
-        now = k * PERIOD_S
+        now = round(k * period) * DT
         shown = delays.see(seen_at(now, n), np.full(n, k == 0), np.ones(n, bool))
         found.append([now - shown.pos_w[:, 0], now - shown.depth_m[:, 0, 0]])
         clock = np.zeros(n, int)
-        for moment in delays.moments():
-            assert (moment.pause >= clock).all() and (moment.pause <= STEPS).all()
+        for moment in delays.moments(np.full(n, k)):
+            steps = round((k + 1) * period) - round(k * period)
+            assert (moment.pause >= clock).all() and (moment.pause <= steps).all()
             clock = moment.pause
             # Where no image is wanted there is none.
             view = seen_at(now + clock * DT, n)
@@ -71,11 +72,18 @@ def test_an_age_between_two_physics_steps_is_that_of_the_nearer_one(age_s, steps
     assert found == pytest.approx(steps * DT, abs=1e-9)
 
 
+@pytest.mark.parametrize("steps", [0, 1, 8, 16, 20, 34, 51])
+def test_decisions_between_two_physics_steps_do_not_change_an_age(steps):
+    """At 30 Hz and 500 Hz physics, 17, 16 and 17 steps lie between decisions."""
+    found = ages_seen(Ages(state_s=steps * DT), TRIALS[:1], 30, 500.0 / 30.0)[6:, 0]
+    assert found == pytest.approx(steps * DT, abs=1e-9)
+
+
 def test_a_fresh_trial_sees_its_own_start_while_the_others_go_on():
     aged, none = Aged(0.1, 0.5, 2, STEPS, DT), np.zeros(2, bool)
     for k in range(4):
         aged.see(seen_at(k), none | (k == 0), ~none)
-        for due in aged.due():
+        for due in aged.due(np.full(2, k)):
             aged.take(due, seen_at(k + 0.5))
     again = aged.see(seen_at(99.0), np.array([False, True]), ~none)
     assert (again.pos_w[1] == 99.0).all() and (again.pos_w[0] < 4.0).all()

@@ -15,12 +15,14 @@ from typing import NamedTuple
 import numpy as np
 
 from eval.effects.interface import GRAVITY
+from eval.effects.log_faults import pose_delay
 from eval.importers.frames import rates_between, rotate
 from eval.logs.faults.clocks.rotation import fit_rotation, rotation_findings
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import SPAN_S, WIDTH_S, Rows, turns_of
 from eval.logs.faults.relation import interpolate, jackknife_error, smooth
 from eval.logs.velocity import velocity_from_position
+from eval.vehicles.vehicle import Vehicle
 
 REACH_S, STEP_S = 0.1, 0.002
 """Largest delay that is tried, in both directions, and the step between trials [s]."""
@@ -126,8 +128,11 @@ class Late(NamedTuple):
         )
 
 
-def check_clock(rows: Rows) -> list[Finding]:
-    """Return findings on the pose's delay against the gyro, and on the drift of this delay."""
+def check_clock(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding]:
+    """Return findings on the pose's delay against the gyro, and on the drift of this delay.
+
+    A delay that the vehicle file states (`clock_offset`) is no fault.
+    """
     if not {"quat", "rate"} <= rows.keys():
         return []
     known_signals = []
@@ -145,14 +150,17 @@ def check_clock(rows: Rows) -> list[Finding]:
     drift += late.drift_findings("doubt", fix)
     if late.jump_s:
         return drift
-    if abs(late.delay_s) < max(LATE_S, SURE * late.error_s):
+    known_s = 0.0 if vehicle is None else float(pose_delay(vehicle.effects))
+    if abs(late.delay_s - known_s) < max(LATE_S, SURE * late.error_s):
         return [Finding("ok", *late.figures(OF_POSE)), *drift]
     moved = late.moved({name: (rows["time"], value) for name, value in rows.items()})
     fix = "suite import of the log that it was made of moves it"
     if "rate" not in moved:
         fix = "suite import moves it; or [effects.clock_offset] of the vehicle file"
     about = ("clock_offset", late.delay_s, 0.95, fix)
-    return [Finding("doubt", *late.figures(moved), *about), *drift]
+    subject, figures = late.figures(moved)
+    figures += f"; clock_offset of the vehicle file: {1e3 * known_s:g} ms" if known_s else ""
+    return [Finding("doubt", subject, figures, *about), *drift]
 
 
 def late_against(

@@ -7,7 +7,15 @@ import pytest
 
 from eval.importers.frames import rotate
 from eval.logs.faults.catalogue import FAULTS
-from eval.logs.faults.check import DRIVE, POSE, CheckContext, check_log, run_checks, with_fixes
+from eval.logs.faults.check import (
+    DRIVE,
+    POSE,
+    CheckContext,
+    check_log,
+    rows_of,
+    run_checks,
+    with_fixes,
+)
 from eval.logs.faults.checked import check_flights, lines_of
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.position import check_jumps
@@ -31,6 +39,24 @@ def faults(parts):
     """The doubts and corrections of these rows."""
     findings, _, _ = run_checks(parts, (*POSE, *DRIVE), CheckContext(), True)
     return [f for f in findings if f.status in ("doubt", "corrected")]
+
+
+def test_commands_that_few_rows_have_are_held_as_those_that_every_row_has():
+    time_s, command = np.arange(0.0, 20.0, 0.01), np.zeros((2000, 3))
+    command[:] = np.repeat(np.random.default_rng(0).uniform(-2.0, 2.0, (100, 3)), 20, axis=0)
+    rate = np.zeros((2000, 3))
+    for k in range(1999):
+        rate[k + 1] = rate[k] + 0.15 * (command[k] - rate[k])
+    log = replace(
+        flight_at_rest(time_s), rate_b=rate, rate_cmd_b=command, about={"partial": ["quat", "pos"]}
+    )
+    is_new = np.arange(2000)[:, None] % 20 == 0
+    sparse = replace(log, rate_cmd_b=np.where(is_new, command, np.nan))
+    np.testing.assert_array_equal(rows_of(sparse)["cmd_rate"], command)
+    found, same = (
+        [f for f in check_log(one)[0] if f.signal == "rate command"] for one in (sparse, log)
+    )
+    assert [f.status for f in found] == ["ok"] and found == same
 
 
 @pytest.mark.parametrize("text", ["time=0", "time=-1", "time=nan", "rate=ms", "time=drop"])

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from eval.logs.faults.check import CheckContext, check_log
 from eval.logs.faults.heading import check_heading
 from tests.support.diagnosis_flights import fly
-from tests.support.vehicles import PLAIN
+from tests.support.vehicles import PLAIN, with_effects
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +60,17 @@ def test_set_points_and_late_signals_are_the_only_finding(log, names, late_s, fa
     (found,), _ = findings(shifted(log, late_s, names))
     assert found.fault == fault and evidence in found.evidence
     assert abs(found.size) == pytest.approx(abs(late_s), abs=0.005)
+
+
+def test_a_late_pose_is_no_fault_if_the_vehicle_file_states_the_delay(log):
+    late, stated = shifted(log, 0.1, ("pos_w", "vel_w", "quat_wxyz")), []
+    for flight, offset_s in ((late, 0.1), (late, 0.03), (log, 0.1)):
+        vehicle = with_effects(PLAIN, clock_offset=(offset_s,))
+        stated.append([f for f in check_log(flight, CheckContext(vehicle))[0] if f.is_open])
+    assert stated[0] == []
+    for (found,), size_s in zip(stated[1:], (0.1, 0.0), strict=True):
+        assert found.fault == "clock_offset" and found.size == pytest.approx(size_s, abs=0.005)
+        assert "clock_offset of the vehicle file: " in found.evidence
 
 
 def test_a_position_in_time_and_wrong_axes_are_no_delay(log):

@@ -66,6 +66,9 @@ def test_slow_rotor_speeds_are_left_out_and_of_too_many_rows_a_share_of_each_sig
     own = log.rate_b[row % 3 == 1]
     averaged = [own[max(k - 1, 0) : k + 2].mean(axis=0) for k in range(0, len(own), 3)]
     np.testing.assert_allclose(few.rate_b[turning][1:-1], averaged[1:-1], atol=1e-6)
+    # A command holds until the next row that stays, so it is the mean of those in between.
+    held = [log.thrust_cmd[k : k + 3].mean() for k in range(0, len(row), 3)]
+    np.testing.assert_allclose(few.thrust_cmd[position], held)
     for motor in range(4):
         kept_speed = few.rotor_speed[np.isfinite(few.rotor_speed[:, motor]), motor]
         np.testing.assert_array_equal(kept_speed, log.rotor_speed[row % 4 == motor, motor][::2])
@@ -201,16 +204,25 @@ def test_windows_hold_the_rows_and_commands_of_their_time(log):
     )
 
 
-def test_a_pose_from_before_the_start_is_not_compared(log):
+@pytest.mark.parametrize("late_s", [0.018, -0.018])
+def test_a_pose_from_before_the_start_or_after_the_end_is_not_compared(log, late_s):
     """A rollout has no pose from then; the vehicle file says how late the log has poses."""
-    late = with_effects(PLAIN, clock_offset=(0.018,))
+    late = with_effects(PLAIN, clock_offset=(late_s,))
     (in_time, _), (windows, _) = (cut([log], vehicle, False) for vehicle in (PLAIN, late))
     pose = np.r_[SLICES["position"], SLICES["attitude"], SLICES["velocity"]]
-    is_before = np.asarray(windows.row_s) < 0.018
-    assert is_before.sum(axis=1).min() >= 2 and in_time.valid[is_before][:, pose].all()
-    assert not windows.valid[is_before][:, pose].any()
-    assert windows.valid[is_before][:, SLICES["rates"]].all()
-    np.testing.assert_array_equal(windows.valid[~is_before], in_time.valid[~is_before])
+    row_s = np.asarray(windows.row_s)
+    is_outside = row_s < late_s if late_s > 0.0 else row_s > row_s[:, -1:] + late_s
+    assert is_outside.sum(axis=1).min() >= 2 and in_time.valid[is_outside][:, pose].all()
+    assert not windows.valid[is_outside][:, pose].any()
+    assert windows.valid[is_outside][:, SLICES["rates"]].all()
+    np.testing.assert_array_equal(windows.valid[~is_outside], in_time.valid[~is_outside])
+
+
+def test_eulers_steps_are_those_that_a_log_states_or_periods_of_the_rate_loop(log):
+    for about, step_s in (({"step_s": 0.0025}, 0.0025), ({}, 1.0 / PLAIN.controller.frequency)):
+        windows, _ = cut([replace(log, about=about)], PLAIN, False, integrator="euler")
+        length_s = np.diff(windows.edge_s)
+        np.testing.assert_allclose(length_s[length_s > 0.0], step_s, rtol=1e-6)
 
 
 def test_few_shapes_hold_rows_of_every_rate(log):

@@ -360,6 +360,8 @@ def test_a_flight_in_real_time_over_the_loopback(tmp_path, capsys):
     assert found["set_points"] > found["decisions"] > 0 and found["judge_successes"] == 1
     assert found["successes"] == flight["success"]
     assert flight["success"] or flight["handed_over"] or flight["vehicle_slips"]
+    log = read_flight(tmp_path / flight["file"])
+    assert (log.integrator, log.step_s) == ("euler", 0.002), "the steps that a diagnosis repeats"
 
 
 def test_a_speed_and_the_judges_monitor_fly_in_real_time_too(capsys, tmp_path, monkeypatch):
