@@ -30,11 +30,11 @@ CHANGES = {
     "explains it.",
 }
 """A sentence for each verdict, if a change since reference flights was searched for."""
-ONLY_VIEWS = (
-    "The forces and torques that were compared agree within the measurement noise, but simulated "
-    "flights of 1 s stay far from the measured ones."
-)
-"""The sentence for `no_gap` if rollouts could not be used."""
+ONLY_VIEWS = "The forces and torques that were compared agree within the measurement noise."
+STAYS_FAR = "But simulated flights of 1 s stay far from the measured ones."
+"""The sentences for `no_gap` if rollouts could not be used."""
+ONLY_ROTORS = "This explains how measured and commanded rotor speeds differ."
+"""The sentence if only a rotor lag was named: force and torque, whose gap it is, do not show it."""
 NEGLIGIBLE = {
     False: "Significant but too small to matter",
     True: "Perhaps only an error of the model, or cancelled by another effect",
@@ -106,21 +106,25 @@ def answer(result: Mapping[str, Any]) -> str:
     for in_log, heading in HEADINGS[is_change].items():
         effects = [one for one in result["effects"] if is_of_log(one) == in_log]
         words += [heading, *map(_effect_words, effects)] if effects else []
+    if result["effects"] and all(one["view"] == "commands" for one in result["effects"]):
+        words.append(ONLY_ROTORS)
+        verdict = {"named": "no_gap", "partly": "unknown"}[verdict]
     sentence, rest = (CHANGES if is_change else VERDICTS)[verdict], remaining_words(result)
-    sentence = ONLY_VIEWS if _is_far(result) else sentence
+    is_far = _is_far(result, verdict)
+    sentence = ONLY_VIEWS if is_far else sentence
     if rest and (verdict == "named" or (verdict == "no_gap" and not is_change)):
         agreed = sentence.removesuffix(".").removesuffix(" within the measurement noise")
         sentence = f"{agreed}, except for {rest}."
-    words.append(sentence)
+    words += [sentence, *([STAYS_FAR] if is_far else [])]
     for is_large, reason in NEGLIGIBLE.items() if verdict == "no_gap" else ():
         names = [one["name"] for one in result["negligible"] if one["relevant"] == is_large]
         words += [f"{reason}: {', '.join(names)}."] * bool(names)
     return " ".join(words)
 
 
-def _is_far(result: Mapping[str, Any]) -> bool:
+def _is_far(result: Mapping[str, Any], verdict: str) -> bool:
     """Return whether there is no gap in force and torque, but simulated flights diverge."""
-    return result["verdict"] == "no_gap" and FAR in result.get("warnings", ())
+    return verdict == "no_gap" and FAR in result.get("warnings", ())
 
 
 def remaining_words(result: Mapping[str, Any]) -> str:
@@ -153,7 +157,7 @@ def next_steps(result: Mapping[str, Any]) -> list[str]:
     """Return advice on what to do after the verdict of a diagnosis.json, most useful first."""
     verdict, is_change = result["verdict"], bool(result["reference"])
     search_for = _search_for(result["unexplained"])
-    if _is_far(result):
+    if _is_far(result, verdict):
         return [CHECK, "Then estimate the rate loop with suite identify, and repeat this."]
     if verdict == "no_gap":
         if is_change:
@@ -189,7 +193,9 @@ def next_steps(result: Mapping[str, Any]) -> list[str]:
     if verdict == "named":
         last = "Or remove the cause, fly again and repeat this: expect no_gap."
         return [*steps, last]
-    steps[0] += " Its values are approximate; on held-out flights it is closer than your file."
+    is_closer = result["gap"]["after"] < result["gap"]["before"]
+    closer = "; on held-out flights it is closer than your file" if is_closer else ""
+    steps[0] += f" Its values are approximate{closer}."
     return [*steps, CHECK, *search_for]
 
 
@@ -244,6 +250,8 @@ class Component(NamedTuple):
             return "not identifiable", ""
         if self.ci95 is None:
             return f"{self.value:.4g}", ""
+        if not self.unit:
+            return f"{self.value}", f"{self.ci95[0]} to {self.ci95[1]}"
         numbers = (self.value, *self.ci95)
         value, low, high = (in_digits(number, numbers) for number in numbers)
         if not self.is_significant:

@@ -138,6 +138,8 @@ def test_a_weak_motor_has_its_number_and_the_motors_that_it_may_be():
     theta, width = space.array("start"), dict.fromkeys(at, 0.01)
     unsure = as_json.parameters_json(space, "weak_motor", [at[1]], theta, width, undecided=[at[2]])
     assert (unsure["index"]["value"], unsure["index"]["ci95"]) == (2, [2, 3])
+    index = summary.components({"name": "weak_motor", "parameters": unsure})[0]
+    assert index.texts() == ("2", "2 to 3")
     several = as_json.parameters_json(space, "weak_motor", [at[1], at[3]], theta, width)
     assert several["index"] == {"value": [2, 4], "unit": "1", "ci95": [[2, 2], [4, 4]]}
     shown = summary.components({"name": "weak_motor", "parameters": several})
@@ -191,6 +193,7 @@ DRAG = {
     "parameters": {"coefficient": {"value": [0.31, 0.302, 0.01], "unit": "1/s",
                                    "ci95": [[0.3, 0.32], [0.29, 0.31], [-0.01, 0.03]]}},
     "size": {"force": 0.8, "torque": 0.0, "drift": 0.4},
+    "view": "force",
 }  # fmt: skip
 
 
@@ -199,6 +202,7 @@ def entries(verdict, effects=(), where=None, **more):
     base |= {"unexplained": {"where": where, "above_noise": []}, "identified": False}
     advice = ["linear_drag from rotor_drag: bob up and down on a circle"]
     base["separate_with"] = advice if effects else []
+    base["gap"] = {"before": 17.3, "after": 4.78}
     return {**base, **more}
 
 
@@ -217,7 +221,7 @@ def test_an_answer_has_the_effect_its_values_and_its_size_or_what_is_too_small()
         "0.8 m/s² and 0.4 m after one second (RMS). This explains the gap between simulation and "
         "flights."
     )
-    arm = {"name": "lever_arm", "alternatives": [], "parameters": {}, "size": None}
+    arm = {**DRAG, "name": "lever_arm", "alternatives": [], "parameters": {}, "size": None}
     both = summary.answer(entries("named", [arm, DRAG]))
     assert both.index("in the vehicle file: Drag") < both.index(". Wrong in the logs: Position")
     by_force = {**DRAG, "size": {**DRAG["size"], "drift": None}}
@@ -260,6 +264,28 @@ def test_a_headline_states_the_floor_the_errors_that_remain_and_offsets_that_do_
     assert "error" not in summary.answer(entries("no_gap", reference=["a"]))
     # The unit of rollouts is the noise floor.
     assert "floor" not in measured("unknown", 17.3, floor=1.0)
+
+
+def test_simulated_flights_that_stay_far_are_no_part_of_what_agrees():
+    text = measured("no_gap", 17.3, (), "that logged signals hardly predict", warnings=[FAR])
+    assert text.startswith(
+        "The forces and torques that were compared agree, except for an error that logged signals "
+        "hardly predict. But simulated flights of 1 s stay far from the measured ones."
+    )
+
+
+def test_a_rotor_lag_alone_explains_no_gap_of_force_and_torque():
+    lag = {**DRAG, "name": "motor_lag", "parameters": {}, "size": None, "view": "commands"}
+    lag["alternatives"] = []
+    agree, differ = (measured(verdict, 17.3, [lag]) for verdict in ("named", "partly"))
+    rotors = "This explains how measured and commanded rotor speeds differ. "
+    assert f"{rotors}Simulation and flights agree within the measurement noise." in agree
+    assert f"{rotors}Simulation and flights differ, and no effect of the" in differ
+    assert "explains the gap" in measured("named", 4.78, [lag, DRAG])
+    far = measured("named", 17.3, [lag], warnings=[FAR])
+    assert "compared agree within" in far and "stay far" in far and "Simulation and" not in far
+    same = entries("partly", [lag], gap={"before": 17.3, "after": 17.3})
+    assert summary.next_steps(same)[0].endswith(" Its values are approximate.")
 
 
 @pytest.mark.parametrize(
