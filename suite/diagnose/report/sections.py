@@ -102,7 +102,7 @@ def _mismatch(mismatch: Mapping[str, Any]) -> Grid:
     turn = ", ".join(map(spread, mismatch["turn"]))
     rows = [
         ("standard deviation of the speeds", f"{mismatch['spread']:.1f} rad/s"),
-        ("difference, with the vehicle file's lag", f"{mismatch['rms']:.1f} rad/s ({explained})"),
+        ("difference, with the file's lag and delay", f"{mismatch['rms']:.1f} rad/s ({explained})"),
         ("lag that fits best", f"{1e3 * mismatch['time_constant']:.1f} ms"),
         ("delay before it", f"{1e3 * mismatch['delay']:.1f} ms"),
         ("measured over commanded, by rotor", ", ".join(f"{s:.4f}" for s in mismatch["scale"])),

@@ -161,6 +161,10 @@ def test_lag_and_delay_are_estimated_separately(lag, delay):
     assert both == pytest.approx((lag, delay), abs=accuracy)
     if delay:
         assert found.rms > 2.0 * found.rms_fitted
+        # With lag and delay among the effects of the file, it explains the speeds.
+        given = with_effects(LAGGED, motor_lag=(lag,), command_delay=(delay,))
+        (own,) = actuators.actuator_mismatches(logs, given)
+        assert own.followed > 0.99 > found.followed and own.rms < 1.3 * NOISE["motor"]
     else:
         assert found.followed > 0.99 and found.rms < 1.3 * NOISE["motor"]
         assert abs(found.thrust[0]) < 0.02
