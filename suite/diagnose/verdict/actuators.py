@@ -38,6 +38,8 @@ RATE_LOOP, LOGGED = "nominal rate loop", "logged motor commands"
 """What commands rotor speeds: the rate loop at the measured body rates, or the log's commands."""
 LAG = "motor_lag"
 """Name of the rotor lag in the catalogue of effects."""
+LEAST_P = 1e-12
+"""Lower limit of a p-value, as no distribution is exact so far from its middle."""
 
 
 class TestedEffect(NamedTuple):
@@ -53,6 +55,15 @@ class TestedEffect(NamedTuple):
     p_value: float
     view: str
     """Name of the source in which it was found."""
+
+    def is_in(self, vehicle: Vehicle) -> bool:
+        """Return whether the file of `vehicle` has this effect, with values in the intervals."""
+        values = vehicle.effects.get(self.name)
+        spans = {name: entry["ci95"] for name, entry in self.parameters.items()}
+        return values is not None and all(
+            span is not None and span[0] <= getattr(values, name) <= span[1]
+            for name, span in spans.items()
+        )
 
 
 class ActuatorMismatch(NamedTuple):
@@ -333,7 +344,7 @@ def find_rotor_lag(
     fitted_error = sum(mismatch.rms_fitted**2 for mismatch in mismatches)
     closed = 1.0 - fitted_error / max(own_error, 1e-12)
     t = (difference - half_step) / max(standard_error, 1e-9)
-    p_value = float(2.0 * stats.t.sf(t, len(lags) - 1))
+    p_value = max(float(2.0 * stats.t.sf(t, len(lags) - 1)), LEAST_P)
     if p_value > limits.name_p_value or closed < limits.lag_closed_share:
         return None
     lag, low = float(lags.mean()), max(float(lags.mean()) - half_width, 0.0)
