@@ -66,7 +66,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "swing": swing and {"period_s": swing.period_s, "length_m": swing.length_m},
             **main.remaining.details,
         },
-        "reference": list(diagnosis.references),
+        "reference": list(diagnosis.flights.references),
         "not_examined": not_examined(diagnosis),
     }
     return {"headline": headline(entries), **entries}
@@ -135,19 +135,25 @@ def effects_json(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     ]
     keys = ("name", "parameters", "gap_removed", "p_value", "view")
     tested = [
-        {**{key: getattr(effect, key) for key in keys}, "alternatives": [], "size": None}
+        {
+            **{key: getattr(effect, key) for key in keys},
+            "alternatives": [],
+            "size": None,
+            "relevant": True,
+        }
         for effect in diagnosis.tested
     ]
-    return [{**effect, "relevant": True} for effect in (*searched, *tested)]
+    return [*searched, *tested]
 
 
 def _effect(finding: Finding, name: str, names: Sequence[NamedEffect]) -> dict[str, Any]:
     """Return the entry of the effect `name`; `names` are its named effects, one for each motor."""
     indices = sorted(index for named in names for index in named.candidate.indices)
     space, width, size = finding.source.space, finding.half_width, finding.sizes.get(name)
+    limits, names_small = finding.source.limits, finding.source.names_small
     # The same effect of another motor may fit about as well: the flights do not decide which.
     rises = [rise for named in names for rise in named.worse_by.items()]
-    close = {label for label, rise in rises if rise <= finding.source.limits.rival_chi2}
+    close = {label for label, rise in rises if rise <= limits.rival_chi2}
     undecided = [
         index
         for index, entry in enumerate(space.entries)
@@ -162,6 +168,8 @@ def _effect(finding: Finding, name: str, names: Sequence[NamedEffect]) -> dict[s
         "gap_removed": finding.removed(names),
         "p_value": max(named.p_value for named in names),
         "size": size and size._asdict(),
+        # Effects of irrelevant size were left out, unless a change is searched for.
+        "relevant": not (names_small and size) or size.relevant(limits),
         "view": finding.source.name,
     }
 

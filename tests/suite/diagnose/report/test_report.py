@@ -23,6 +23,7 @@ from suite.diagnose.report.page import channels_grid, page
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.source import FAR
 from suite.diagnose.verdict.actuators import actuator_mismatches
+from suite.diagnose.verdict.gap import Gap
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN
 from tracks.common.files import plain
@@ -58,6 +59,13 @@ def test_the_json_has_what_was_found(drag, found):
     assert np.all(np.abs([0.15, 0.15, 0.05] - (low + high) / 2) < high - low)
     assert found["control"]["after"] > 1.5 * found["gap"]["after"]
     assert found["gap"]["channels"]["1 s"]["velocity"]["noise_floor"] > 0.0
+    # A change since reference flights is named whatever its size, and then its size is compared.
+    limits = replace(drag.main.source.limits, relevance=(1e6, 1e6, 1e6))
+    for names_small in (True, False):
+        source = replace(drag.main.source, limits=limits, names_small=names_small)
+        findings = (replace(drag.main, source=source),)
+        (effect,) = as_json.effects_json(replace(drag, findings=findings))
+        assert effect["relevant"] is not names_small
 
 
 def test_each_view_names_its_own_effect_and_the_page_has_its_headline_first(by_views):
@@ -102,6 +110,15 @@ def test_numbers_of_views_are_those_that_are_judged_and_the_rest_has_its_reason(
     words, table = sections.residual_section({**found, "unexplained": loud}).parts[:2]
     assert words == "Above the noise floor remains an error that logged signals hardly predict."
     assert texts(table)[0][:3] == ["torque", "4.78 rad/s²", "0.15"]
+
+
+def test_no_share_is_above_one_and_a_single_stretch_has_no_interval():
+    before, after = (Gap(np.array([score]), np.ones(1), {}) for score in (1.44, 0.9))
+    main = SimpleNamespace(before=before, after=after, names=(1,), without={}, control=None)
+    main.source = SimpleNamespace(measure="RMS")
+    shown = SimpleNamespace(main=main, seed=0)
+    rows = texts(sections.evidence_section(shown, {"gap": {"held_out": ["a"]}}).parts[-1])
+    assert rows == [["as given", "1.2", "", ""], ["with the named effects", "0.949", "", "100 %"]]
 
 
 def test_what_no_source_tests_is_listed(by_views, drag, monkeypatch, capsys, tmp_path):
