@@ -129,7 +129,6 @@ def _diagnose(given: DiagnosisInput, by: Sequence[str], seed: int) -> Diagnosis:
         tested=tested,
         flights=flights,
         vehicle=with_names(given.vehicle, unique, tested),
-        references=tuple(log.name for log in given.references),
         warnings=warnings,
         seconds=0.0,
         seed=seed,
@@ -160,8 +159,6 @@ class Diagnosis:
     """The sources of evidence from these flights."""
     vehicle: Vehicle
     """The vehicle that the simulation used, with the named effects."""
-    references: tuple[str, ...]
-    """Names of the flights before a change, if one was searched for."""
     warnings: list[str]
     seconds: float
     """Duration of the diagnosis [s]."""
