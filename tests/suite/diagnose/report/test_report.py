@@ -25,7 +25,7 @@ from suite.diagnose.sources.source import FAR
 from suite.diagnose.verdict.actuators import actuator_mismatches
 from suite.diagnose.verdict.gap import Gap
 from tests.support.diagnosis_flights import fly
-from tests.support.vehicles import PLAIN
+from tests.support.vehicles import PLAIN, with_effects
 from tracks.common.files import plain
 
 
@@ -161,6 +161,18 @@ def test_a_weak_motor_has_its_number_and_the_motors_that_it_may_be():
     assert several["index"] == {"value": [2, 4], "unit": "1", "ci95": [[2, 2], [4, 4]]}
     shown = summary.components({"name": "weak_motor", "parameters": several})
     assert [one.label for one in shown] == ["scale 2 [1]", "scale 4 [1]"]
+    # A motor that is weak in the vehicle file stays so, and is in the total.
+    given = make_space(with_effects(PLAIN, weak_motor=((0.9, 1.0, 1.0, 1.0),)))
+    theta = given.array("start")
+    theta[at[2]], half = 0.8, {at[2]: 0.01}
+    total = as_json.parameters_json(given, "weak_motor", [at[2]], theta, half, undecided=[at[3]])
+    assert total["index"] == {"value": [1, 3], "unit": "1", "ci95": [[1, 1], [3, 4]]}
+    assert total["scale"]["value"] == [0.9, 0.8] and total["scale"]["ci95"][0] is None
+    shown = summary.components({"name": "weak_motor", "parameters": total})
+    assert [(one.label, one.texts()[0]) for one in shown] == [
+        ("scale 1 [1]", "0.9"),
+        ("scale 3 [1]", "0.800"),
+    ]
 
 
 def test_sections_show_the_numbers(drag, found):
