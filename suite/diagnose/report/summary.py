@@ -31,8 +31,9 @@ CHANGES = {
 }
 """A sentence for each verdict, if a change since reference flights was searched for."""
 ONLY_VIEWS = "The forces and torques that were compared agree within the measurement noise."
+"""The sentence for `no_gap` if rollouts could not be used."""
 STAYS_FAR = "But simulated flights of 1 s stay far from the measured ones."
-"""The sentences for `no_gap` if rollouts could not be used."""
+"""A further sentence if rollouts could not be used, for `no_gap` and `named`."""
 ONLY_ROTORS = "This explains how measured and commanded rotor speeds differ."
 """The sentence if only a rotor lag was named: force and torque, whose gap it is, do not show it."""
 NEGLIGIBLE = {
@@ -110,11 +111,11 @@ def answer(result: Mapping[str, Any]) -> str:
         words.append(ONLY_ROTORS)
         verdict = {"named": "no_gap", "partly": "unknown"}[verdict]
     sentence, rest = (CHANGES if is_change else VERDICTS)[verdict], remaining_words(result)
-    is_far = _is_far(result, verdict)
-    sentence = ONLY_VIEWS if is_far else sentence
+    sentence = ONLY_VIEWS if _is_far(result, verdict) else sentence
     if rest and (verdict == "named" or (verdict == "no_gap" and not is_change)):
         agreed = sentence.removesuffix(".").removesuffix(" within the measurement noise")
         sentence = f"{agreed}, except for {rest}."
+    is_far = verdict in ("no_gap", "named") and FAR in result.get("warnings", ())
     words += [sentence, *([STAYS_FAR] if is_far else [])]
     for is_large, reason in NEGLIGIBLE.items() if verdict == "no_gap" else ():
         names = [one["name"] for one in result["negligible"] if one["relevant"] == is_large]

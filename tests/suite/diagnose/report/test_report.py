@@ -301,6 +301,8 @@ def test_simulated_flights_that_stay_far_are_no_part_of_what_agrees():
         "The forces and torques that were compared agree, except for an error that logged signals "
         "hardly predict. But simulated flights of 1 s stay far from the measured ones."
     )
+    named = measured("named", 4.78, [DRAG], warnings=[FAR])
+    assert "between simulation and flights. But simulated flights of 1 s stay far" in named
 
 
 def test_a_rotor_lag_alone_explains_no_gap_of_force_and_torque():
