@@ -36,6 +36,8 @@ STAYS_FAR = "But simulated flights of 1 s stay far from the measured ones."
 """A further sentence if rollouts could not be used, for `no_gap` and `named`."""
 ONLY_ROTORS = "This explains how measured and commanded rotor speeds differ."
 """The sentence if only a rotor lag was named: force and torque, whose gap it is, do not show it."""
+ONLY_OFFSET = "This explains a constant offset of the flights."
+"""The sentence if the named effects lower the flights' offsets, which are no part of the gap."""
 NEGLIGIBLE = {
     False: "Significant but too small to matter",
     True: "Perhaps only an error of the model, or cancelled by another effect",
@@ -107,8 +109,8 @@ def answer(result: Mapping[str, Any]) -> str:
     for in_log, heading in HEADINGS[is_change].items():
         effects = [one for one in result["effects"] if is_of_log(one) == in_log]
         words += [heading, *map(_effect_words, effects)] if effects else []
-    if result["effects"] and all(one["view"] == "commands" for one in result["effects"]):
-        words.append(ONLY_ROTORS)
+    if other := _explains_instead(result):
+        words.append(other)
         verdict = {"named": "no_gap", "partly": "unknown"}[verdict]
     sentence, rest = (CHANGES if is_change else VERDICTS)[verdict], remaining_words(result)
     sentence = ONLY_VIEWS if _is_far(result, verdict) else sentence
@@ -121,6 +123,23 @@ def answer(result: Mapping[str, Any]) -> str:
         names = [one["name"] for one in result["negligible"] if one["relevant"] == is_large]
         words += [f"{reason}: {', '.join(names)}."] * bool(names)
     return " ".join(words)
+
+
+def _explains_instead(result: Mapping[str, Any]) -> str:
+    """Return what the named effects explain in place of the gap; empty if they explain the gap."""
+    effects, gap = result["effects"], result["gap"]
+    views = {one["view"] for one in effects}
+    if views == {"commands"}:
+        return ONLY_ROTORS
+    # A random wind explains an error without lowering it.
+    if (
+        len(views) != 1
+        or gap["after"] < gap["before"]
+        or any(e["gap_removed"] is None for e in effects)
+    ):
+        return ""
+    is_lower = any(offset["after"] < offset["before"] for offset in gap["offset"].values())
+    return ONLY_OFFSET if is_lower else ""
 
 
 def _is_far(result: Mapping[str, Any], verdict: str) -> bool:
@@ -143,11 +162,12 @@ def _effect_words(effect: Mapping[str, Any]) -> str:
     """Return a sentence on a named effect, and one on its size on these flights."""
     names = " or ".join([effect["name"], *effect["alternatives"]])
     summary = EFFECTS[effect["name"]].summary if effect["name"] in EFFECTS else "An effect"
+    known = [one for one in components(effect) if one.value is not None]
     values = ", ".join(
         f"{one.name} {one.value:.3g} {'' if one.unit == '1' else one.unit}".rstrip()
-        for one in components(effect)
+        for one in known
         if one.is_significant
-    )
+    ) or ", ".join(f"{one.name} {one.texts()[0]}" for one in known)
     words = f"{summary} ({names}){': ' if values else ''}{values}."
     if effect["size"] is None:
         return words

@@ -223,6 +223,7 @@ DRAG = {
                                    "ci95": [[0.3, 0.32], [0.29, 0.31], [-0.01, 0.03]]}},
     "size": {"force": 0.8, "torque": 0.0, "drift": 0.4},
     "view": "force",
+    "gap_removed": 0.9,
 }  # fmt: skip
 
 
@@ -231,7 +232,7 @@ def entries(verdict, effects=(), where=None, **more):
     base |= {"unexplained": {"where": where, "above_noise": []}, "identified": False}
     advice = ["linear_drag from rotor_drag: bob up and down on a circle"]
     base["separate_with"] = advice if effects else []
-    base["gap"] = {"before": 17.3, "after": 4.78}
+    base["gap"] = {"before": 17.3, "after": 4.78, "offset": {}}
     return {**base, **more}
 
 
@@ -268,7 +269,8 @@ def test_an_answer_has_the_effect_its_values_and_its_size_or_what_is_too_small()
 
 def measured(verdict, after, effects=(), reason=None, floor=0.15, offset=7.9, **more):
     gap = {"of": "error of the torque", "unit": "rad/s^2", "before": 17.3, "after": after}
-    gap |= {"noise_floor": floor, "offset": {"torque": {"after": offset, "unit": "rad/s^2"}}}
+    offsets = {"before": 9.0, "after": offset, "unit": "rad/s^2"}
+    gap |= {"noise_floor": floor, "offset": {"torque": offsets}}
     rest = [{"reason": reason}] if reason else []
     more |= {"relevance": {"torque": 0.5}, "unexplained": {"where": None, "above_noise": rest}}
     return summary.headline(entries(verdict, effects, gap=gap, **more))
@@ -303,6 +305,24 @@ def test_simulated_flights_that_stay_far_are_no_part_of_what_agrees():
     )
     named = measured("named", 4.78, [DRAG], warnings=[FAR])
     assert "between simulation and flights. But simulated flights of 1 s stay far" in named
+
+
+def test_an_effect_that_lowers_the_offsets_alone_explains_no_gap():
+    agree, differ = (measured(verdict, 17.3, [DRAG]) for verdict in ("named", "partly"))
+    offset = "(RMS). This explains a constant offset of the flights. Simulation and flights"
+    assert f"{offset} agree within" in agree and f"{offset} differ, and no effect" in differ
+    # A random wind explains an error that no simulation lowers, and offsets may not fall either.
+    for effects, left in (([{**DRAG, "gap_removed": None}], 7.9), ([DRAG], 9.0)):
+        assert "explains the gap" in measured("named", 17.3, effects, offset=left)
+
+
+def test_a_drag_of_the_file_that_the_flights_do_not_show_is_not_said_to_be_missing():
+    interval = [[0.0, 0.01]] * 3
+    none = {"coefficient": {"value": [0.0, 1e-17, 0.004], "unit": "1/s", "ci95": interval}}
+    answer = summary.answer(entries("named", [{**DRAG, "parameters": none}]))
+    assert (
+        "(linear_drag or rotor_drag): coefficient x not different from 0, coefficient y" in answer
+    )
 
 
 def test_a_rotor_lag_alone_explains_no_gap_of_force_and_torque():
