@@ -103,7 +103,7 @@ def _diagnose(given: DiagnosisInput, by: Sequence[str], seed: int) -> Diagnosis:
         warnings += notes
     unique, notes = one_cause(findings)
     warnings += notes
-    tested, limits = tested_in(unique, flights), unique[0].source.limits
+    tested, limits = tested_in(unique, flights, given.vehicle), unique[0].source.limits
     names = [named for finding in unique for named in finding.names]
     verdict = verdict_on(unique, bool(tested or names), limits)
     # Effects that leave most of the gap are not the cause: remove them, and decide again.
@@ -112,7 +112,7 @@ def _diagnose(given: DiagnosisInput, by: Sequence[str], seed: int) -> Diagnosis:
         labels = ", ".join(named.candidate.label for one in wrong for named in one.names)
         warnings.append(f"nearest in the catalogue, but most of the gap remains: {labels}")
         unique = tuple(without_names(one, seed) if one in wrong else one for one in unique)
-        tested = tested_in(unique, flights)
+        tested = tested_in(unique, flights, given.vehicle)
         if not any(one.names for one in unique):
             verdict = verdict_on(unique, bool(tested), limits)
     if verdict.label == "unknown" and (tested or any(one.names for one in unique)):
@@ -129,7 +129,6 @@ def _diagnose(given: DiagnosisInput, by: Sequence[str], seed: int) -> Diagnosis:
         tested=tested,
         flights=flights,
         vehicle=with_names(given.vehicle, unique, tested),
-        references=tuple(log.name for log in given.references),
         warnings=warnings,
         seconds=0.0,
         seed=seed,
@@ -160,8 +159,6 @@ class Diagnosis:
     """The sources of evidence from these flights."""
     vehicle: Vehicle
     """The vehicle that the simulation used, with the named effects."""
-    references: tuple[str, ...]
-    """Names of the flights before a change, if one was searched for."""
     warnings: list[str]
     seconds: float
     """Duration of the diagnosis [s]."""
@@ -184,9 +181,16 @@ def main_of(findings: Sequence[Finding]) -> Finding:
     return max(findings, key=lambda one: (bool(one.names), one.remaining.explainable))
 
 
-def tested_in(findings: Sequence[Finding], flights: SourceSet) -> tuple[TestedEffect, ...]:
-    """Return the effects that separate tests named: random wind and rotor lag."""
-    return (*filter(None, (one.remaining.wind for one in findings)), *flights.tested)
+def tested_in(
+    findings: Sequence[Finding], flights: SourceSet, vehicle: Vehicle
+) -> tuple[TestedEffect, ...]:
+    """Return the effects that separate tests found, and that the file of `vehicle` lacks.
+
+    They are random wind and rotor lag. No simulation reproduces the course of a random wind, so
+    that of the file is found in every flight.
+    """
+    found = (*filter(None, (one.remaining.wind for one in findings)), *flights.tested)
+    return tuple(effect for effect in found if not effect.is_in(vehicle))
 
 
 def verdict_on(findings: Sequence[Finding], named: bool, limits: Thresholds) -> Verdict:

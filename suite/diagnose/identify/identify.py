@@ -262,12 +262,13 @@ class _Fits:
             flapping = flapping_of(with_voltage, vehicle, perturbed)
             vehicle, more, more_notes = with_entries(vehicle, [flapping] if flapping else [])
             numbers, notes = [*numbers, *more], [*notes, *more_notes]
+        file_delay_s = float(all_values(vehicle)["command_delay"].delay)
         fits = [name for name in ("force", "torque") if name in results]
         further = notes_on(self.flights, self.without_voltage, original, vehicle)
         return Identified(
             vehicle,
             tuple(numbers),
-            (*not_identified(results, by_key), *lacking),
+            (*not_identified(results, by_key, file_delay_s), *lacking),
             self.drive,
             {name: results[name].residual_rms.tolist() for name in fits},
             tuple(flight.name for flight in self.flights),

@@ -93,18 +93,25 @@ def number_lines(numbers: Sequence[Number]) -> list[str]:
     ]
 
 
-def not_identified(fitted: Mapping[str, Fitted], entries: Mapping[str, Number]) -> list[str]:
-    """Return a line for people for each number that was fitted and that no fit has identified."""
+def not_identified(
+    fitted: Mapping[str, Fitted], entries: Mapping[str, Number], file_delay_s: float
+) -> list[str]:
+    """Return a line for people for each number that was fitted and that no fit has identified.
+
+    `file_delay_s` is the delay that is written to the vehicle file [s].
+    """
     fits = list(fitted.values())
     identified = {name for fit in fits for name in fit.names if fit.identifies(name)}
     names = dict.fromkeys(name for fit in fits for name in fit.not_identified)
     lines = [WHY[name] for name in names if name not in identified and name in WHY]
     total_s = [fit.values()["late"] for fit in fits if fit.identifies("late")]
     if total_s and not entries[DELAY].is_identified:
-        delay_s = max(entries[DELAY].value[0], 0.0)
+        delay_s, words = entries[DELAY].value[0], "this sum minus the file's lag"
+        if delay_s != file_delay_s:
+            words = f"the nearest allowed value to {words}, {delay_s:.3g} s"
         lines.append(
             f"command_delay: only its sum with the rotors' lag, {total_s[-1]:.3g} s; the file's "
-            f"delay, {delay_s:.3g} s, is this sum minus the file's lag"
+            f"delay, {file_delay_s:.3g} s, is {words}"
         )
     return lines
 

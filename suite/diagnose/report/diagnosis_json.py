@@ -66,7 +66,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "swing": swing and {"period_s": swing.period_s, "length_m": swing.length_m},
             **main.remaining.details,
         },
-        "reference": list(diagnosis.references),
+        "reference": list(diagnosis.flights.references),
         "not_examined": not_examined(diagnosis),
     }
     return {"headline": headline(entries), **entries}
@@ -135,19 +135,25 @@ def effects_json(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     ]
     keys = ("name", "parameters", "gap_removed", "p_value", "view")
     tested = [
-        {**{key: getattr(effect, key) for key in keys}, "alternatives": [], "size": None}
+        {
+            **{key: getattr(effect, key) for key in keys},
+            "alternatives": [],
+            "size": None,
+            "relevant": True,
+        }
         for effect in diagnosis.tested
     ]
-    return [{**effect, "relevant": True} for effect in (*searched, *tested)]
+    return [*searched, *tested]
 
 
 def _effect(finding: Finding, name: str, names: Sequence[NamedEffect]) -> dict[str, Any]:
     """Return the entry of the effect `name`; `names` are its named effects, one for each motor."""
     indices = sorted(index for named in names for index in named.candidate.indices)
     space, width, size = finding.source.space, finding.half_width, finding.sizes.get(name)
+    limits, names_small = finding.source.limits, finding.source.names_small
     # The same effect of another motor may fit about as well: the flights do not decide which.
     rises = [rise for named in names for rise in named.worse_by.items()]
-    close = {label for label, rise in rises if rise <= finding.source.limits.rival_chi2}
+    close = {label for label, rise in rises if rise <= limits.rival_chi2}
     undecided = [
         index
         for index, entry in enumerate(space.entries)
@@ -162,6 +168,8 @@ def _effect(finding: Finding, name: str, names: Sequence[NamedEffect]) -> dict[s
         "gap_removed": finding.removed(names),
         "p_value": max(named.p_value for named in names),
         "size": size and size._asdict(),
+        # Effects of irrelevant size were left out, unless a change is searched for.
+        "relevant": not (names_small and size) or size.relevant(limits),
         "view": finding.source.name,
     }
 
@@ -180,23 +188,36 @@ def parameters_json(
     are parameters for other motors that fit as well.
     """
 
-    def value_and_interval(index: int) -> tuple[float, list[float]]:
-        """Return the value of a parameter and its interval, within the parameter's bounds."""
+    def value_and_interval(index: int) -> tuple[float, list[float] | None]:
+        """Return the value of a parameter and its interval, within the parameter's bounds.
+
+        A parameter that was not fitted has its value in the vehicle file, and no interval.
+        """
         entry = space.entries[index]
-        value, width = float(theta[index]), half_width[index]
+        value, width = float(theta[index]), half_width.get(index)
+        if width is None:
+            return value, None
         return value, [max(value - width, entry.low), min(value + width, entry.high)]
 
     entries: dict[str, Any] = {}
     fitted = {(space.entries[i].parameter, space.entries[i].component): i for i in indices}
     for parameter in EFFECTS[name].parameters:
-        # An effect of single motors: the motors' numbers, and a value for each. If only one motor
-        # was named, the interval of its number covers the other motors that fit as well.
+        # An effect of single motors: the motors' numbers, and a value for each, also for those
+        # that the vehicle file has. If only one motor was named, the interval of its number covers
+        # the other motors that fit as well.
         if parameter.one_at_a_time:
-            values, spans = zip(*map(value_and_interval, indices), strict=True)
-            motors = [_motor_number(space, index) for index in indices]
-            is_single = len(motors) == 1
-            possible = [*motors, *(_motor_number(space, index) for index in undecided)]
-            ranges = [[min(possible), max(possible)]] if is_single else [[k, k] for k in motors]
+            of_file = (
+                index
+                for index, entry in enumerate(space.entries)
+                if entry.effect == name and entry.start != parameter.neutral
+            )
+            present = sorted({*indices, *of_file})
+            values, spans = zip(*map(value_and_interval, present), strict=True)
+            motors = [_motor_number(space, index) for index in present]
+            is_single, ranges = len(present) == 1, [[motor, motor] for motor in motors]
+            if len(indices) == 1:
+                possible = [_motor_number(space, index) for index in (*indices, *undecided)]
+                ranges[present.index(indices[0])] = [min(possible), max(possible)]
             for key, unit, columns in (
                 ("index", "1", (motors, ranges)),
                 (parameter.name, parameter.unit, (values, spans)),

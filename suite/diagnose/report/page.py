@@ -75,8 +75,8 @@ def page(
     }
     if result["not_examined"]:
         facts["not examined"] = ", ".join(result["not_examined"])
-    if diagnosis.references:
-        facts["reference"] = f"{len(diagnosis.references)} flights"
+    if result["reference"]:
+        facts["reference"] = f"{len(result['reference'])} flights"
     details = [
         Section("Errors on held-out flights", [channels_grid(gap["channels"])]),
         *([logs_section(flown.logs), noise_section(diagnosis)] if flown else []),
@@ -156,7 +156,7 @@ def _answer(result: Mapping[str, Any]) -> Section:
     ]  # fmt: skip
     note = (
         "Values are totals: they replace those of the vehicle file. Of the gap: the share that "
-        "this effect removes when it is added last. Chance gives a false name with a probability "
+        "this effect removes when it is added last. Chance gives each name with a probability "
         f"of at most {max(effect['p_value'] for effect in effects):.1g}."
     )
     return Section(title, [*words, table(headers, rows, note=note)])

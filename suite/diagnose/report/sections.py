@@ -14,7 +14,7 @@ from eval.logs.flight_log import FlightLog
 from suite.common.report import Part, Section
 from suite.diagnose.data.windows import SLICES, UNITS
 from suite.diagnose.diagnose import Diagnosis
-from suite.diagnose.report.summary import remaining_words, short_name, superscripts
+from suite.diagnose.report.summary import figure, remaining_words, short_name, superscripts
 from suite.diagnose.sources.rollout_source import of_rollouts
 from tracks.common.grid import Cell, Grid, table, table_of
 
@@ -102,7 +102,7 @@ def _mismatch(mismatch: Mapping[str, Any]) -> Grid:
     turn = ", ".join(map(spread, mismatch["turn"]))
     rows = [
         ("standard deviation of the speeds", f"{mismatch['spread']:.1f} rad/s"),
-        ("difference, with the vehicle file's lag", f"{mismatch['rms']:.1f} rad/s ({explained})"),
+        ("difference, with the file's lag and delay", f"{mismatch['rms']:.1f} rad/s ({explained})"),
         ("lag that fits best", f"{1e3 * mismatch['time_constant']:.1f} ms"),
         ("delay before it", f"{1e3 * mismatch['delay']:.1f} ms"),
         ("measured over commanded, by rotor", ", ".join(f"{s:.4f}" for s in mismatch["scale"])),
@@ -131,7 +131,7 @@ def candidates_section(diagnosis: Diagnosis) -> Section:
             )
             for s in scores
         ]
-        words = CHANGED if diagnosis.references else ALONE.format(count=len(scores))
+        words = CHANGED if diagnosis.flights.references else ALONE.format(count=len(scores))
         words += (
             f" P is the probability that the best of all candidates gains as much by chance, left "
             f"out up to {LEAST_P:g}. Effects are named one after another while p is at most "
@@ -223,10 +223,10 @@ def evidence_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section
         gaps["with the named effects"] = main.after
     before, floor, rows = main.before.rms, main.before.floor, []
     for label, gap in gaps.items():
-        (low, high), removed = gap.ci95(diagnosis.seed), ""
+        interval, removed = " to ".join(map(figure, gap.ci95(diagnosis.seed) or ())), ""
         if gap.rms != before and before > floor:
-            removed = f"{100 * (before - gap.rms) / (before - floor):.0f} %"
-        rows.append((label, f"{gap.rms:.3f}", f"{low:.3f} to {high:.3f}", removed))
+            removed = f"{min(100 * (before - gap.rms) / (before - floor), 100.0):.0f} %"
+        rows.append((label, figure(gap.rms), interval, removed))
     words = (
         f"{main.source.measure}. Held out of search and fits: "
         f"{', '.join(result['gap']['held_out'])}. The noise floor is {floor:.3g}."
@@ -257,4 +257,6 @@ def agreement_section(diagnosis: Diagnosis) -> Section:
             rows = [(f"{k + 1}", f"{gain:.1f}") for k, gain in enumerate(named.gains)]
             title = f"{finding.source.name}: {named.candidate.label}"
             parts.append(table(["fitted flight or third", "gain"], rows, title, note))
-    return Section("Do the flights agree", [*parts, *diagnosis.flights.compares])
+    if diagnosis.flights.compares:
+        parts.append(diagnosis.flights.compares)
+    return Section("Do the flights agree", parts)

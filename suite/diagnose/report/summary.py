@@ -30,11 +30,14 @@ CHANGES = {
     "explains it.",
 }
 """A sentence for each verdict, if a change since reference flights was searched for."""
-ONLY_VIEWS = (
-    "The forces and torques that were compared agree within the measurement noise, but simulated "
-    "flights of 1 s stay far from the measured ones."
-)
+ONLY_VIEWS = "The forces and torques that were compared agree within the measurement noise."
 """The sentence for `no_gap` if rollouts could not be used."""
+STAYS_FAR = "But simulated flights of 1 s stay far from the measured ones."
+"""A further sentence if rollouts could not be used, for `no_gap` and `named`."""
+ONLY_ROTORS = "This explains how measured and commanded rotor speeds differ."
+"""The sentence if only a rotor lag was named: force and torque, whose gap it is, do not show it."""
+ONLY_OFFSET = "This explains a constant offset of the flights."
+"""The sentence if the named effects lower the flights' offsets, which are no part of the gap."""
 NEGLIGIBLE = {
     False: "Significant but too small to matter",
     True: "Perhaps only an error of the model, or cancelled by another effect",
@@ -106,21 +109,42 @@ def answer(result: Mapping[str, Any]) -> str:
     for in_log, heading in HEADINGS[is_change].items():
         effects = [one for one in result["effects"] if is_of_log(one) == in_log]
         words += [heading, *map(_effect_words, effects)] if effects else []
+    if other := _explains_instead(result):
+        words.append(other)
+        verdict = {"named": "no_gap", "partly": "unknown"}[verdict]
     sentence, rest = (CHANGES if is_change else VERDICTS)[verdict], remaining_words(result)
-    sentence = ONLY_VIEWS if _is_far(result) else sentence
+    sentence = ONLY_VIEWS if _is_far(result, verdict) else sentence
     if rest and (verdict == "named" or (verdict == "no_gap" and not is_change)):
         agreed = sentence.removesuffix(".").removesuffix(" within the measurement noise")
         sentence = f"{agreed}, except for {rest}."
-    words.append(sentence)
+    is_far = verdict in ("no_gap", "named") and FAR in result.get("warnings", ())
+    words += [sentence, *([STAYS_FAR] if is_far else [])]
     for is_large, reason in NEGLIGIBLE.items() if verdict == "no_gap" else ():
         names = [one["name"] for one in result["negligible"] if one["relevant"] == is_large]
         words += [f"{reason}: {', '.join(names)}."] * bool(names)
     return " ".join(words)
 
 
-def _is_far(result: Mapping[str, Any]) -> bool:
+def _explains_instead(result: Mapping[str, Any]) -> str:
+    """Return what the named effects explain in place of the gap; empty if they explain the gap."""
+    effects, gap = result["effects"], result["gap"]
+    views = {one["view"] for one in effects}
+    if views == {"commands"}:
+        return ONLY_ROTORS
+    # A random wind explains an error without lowering it.
+    if (
+        len(views) != 1
+        or gap["after"] < gap["before"]
+        or any(e["gap_removed"] is None for e in effects)
+    ):
+        return ""
+    is_lower = any(offset["after"] < offset["before"] for offset in gap["offset"].values())
+    return ONLY_OFFSET if is_lower else ""
+
+
+def _is_far(result: Mapping[str, Any], verdict: str) -> bool:
     """Return whether there is no gap in force and torque, but simulated flights diverge."""
-    return result["verdict"] == "no_gap" and FAR in result.get("warnings", ())
+    return verdict == "no_gap" and FAR in result.get("warnings", ())
 
 
 def remaining_words(result: Mapping[str, Any]) -> str:
@@ -138,11 +162,12 @@ def _effect_words(effect: Mapping[str, Any]) -> str:
     """Return a sentence on a named effect, and one on its size on these flights."""
     names = " or ".join([effect["name"], *effect["alternatives"]])
     summary = EFFECTS[effect["name"]].summary if effect["name"] in EFFECTS else "An effect"
+    known = [one for one in components(effect) if one.value is not None]
     values = ", ".join(
         f"{one.name} {one.value:.3g} {'' if one.unit == '1' else one.unit}".rstrip()
-        for one in components(effect)
+        for one in known
         if one.is_significant
-    )
+    ) or ", ".join(f"{one.name} {one.texts()[0]}" for one in known)
     words = f"{summary} ({names}){': ' if values else ''}{values}."
     if effect["size"] is None:
         return words
@@ -153,7 +178,7 @@ def next_steps(result: Mapping[str, Any]) -> list[str]:
     """Return advice on what to do after the verdict of a diagnosis.json, most useful first."""
     verdict, is_change = result["verdict"], bool(result["reference"])
     search_for = _search_for(result["unexplained"])
-    if _is_far(result):
+    if _is_far(result, verdict):
         return [CHECK, "Then estimate the rate loop with suite identify, and repeat this."]
     if verdict == "no_gap":
         if is_change:
@@ -189,7 +214,9 @@ def next_steps(result: Mapping[str, Any]) -> list[str]:
     if verdict == "named":
         last = "Or remove the cause, fly again and repeat this: expect no_gap."
         return [*steps, last]
-    steps[0] += " Its values are approximate; on held-out flights it is closer than your file."
+    is_closer = result["gap"]["after"] < result["gap"]["before"]
+    closer = "; on held-out flights it is closer than your file" if is_closer else ""
+    steps[0] += f" Its values are approximate{closer}."
     return [*steps, CHECK, *search_for]
 
 
@@ -244,6 +271,8 @@ class Component(NamedTuple):
             return "not identifiable", ""
         if self.ci95 is None:
             return f"{self.value:.4g}", ""
+        if not self.unit:
+            return f"{self.value}", f"{self.ci95[0]} to {self.ci95[1]}"
         numbers = (self.value, *self.ci95)
         value, low, high = (in_digits(number, numbers) for number in numbers)
         if not self.is_significant:

@@ -108,13 +108,14 @@ class RotorSpread:
     freedom_along: Mapping[str, np.ndarray]
     """(3,) degrees of freedom of the estimate of each axis alone, by view."""
 
-    def words(self, count: int) -> tuple[str, ...]:
-        """Return a text for people on how much the `count` reference flights differ."""
+    @property
+    def words(self) -> str:
+        """Description of how much flights of an unchanged vehicle differ, for people."""
         return (
-            f"The {count} reference flights differ as if each rotor's thrust varied by "
-            f"{100 * self.share:.1f} % from flight to flight ({self.freedom} degrees of freedom). "
-            "The differences along each axis count as well. A change is named if it exceeds these "
-            "differences significantly.",
+            "Within the reference flights and within the new ones, flights differ as if each "
+            f"rotor's thrust varied by {100 * self.share:.1f} % from flight to flight "
+            f"({self.freedom} degrees of freedom). The differences along each axis count as well. "
+            "A change is named if it exceeds these differences significantly."
         )
 
     def variance_ratios(

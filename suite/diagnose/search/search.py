@@ -170,7 +170,9 @@ def _best_candidate(
         at_fit = [trial for trial in close if trial.name.candidate == tested]
         p_values = [_p_value_at_fit(task, current, others, unnamed, trial) for trial in at_fit]
         significant = [
-            trial for trial, p in zip(at_fit, p_values, strict=True) if p <= limits.name_p_value
+            trial._replace(name=replace(trial.name, p_value=p))
+            for trial, p in zip(at_fit, p_values, strict=True)
+            if p <= limits.name_p_value
         ]
     if not significant:
         return None

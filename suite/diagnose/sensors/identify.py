@@ -218,7 +218,8 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
         for key, (interval, unit) in parameters.items()
     ]
     header += number_lines(numbers)
-    save_sensors(sensor_set(_file_values(parameters), out.stem), out, "\n".join(header))
+    values, notes = _file_values(parameters)
+    save_sensors(sensor_set(values, out.stem), out, "\n".join(header))
     return {
         "sensors": str(out),
         "parameters": numbers_json(numbers),
@@ -229,7 +230,7 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
         "clock_s": clocks_s,
         "findings": checked.findings,
         "flights": [log.name for log in used],
-        "warnings": warnings,
+        "warnings": [*warnings, *notes],
         **stamp(SCHEMA, None),
     }
 
@@ -247,18 +248,26 @@ def say_held_out(result: Mapping[str, Any], console: Console) -> None:
         )
 
 
-def _file_values(parameters: Mapping[str, tuple[Interval, str]]) -> dict[str, dict[str, float]]:
+def _file_values(
+    parameters: Mapping[str, tuple[Interval, str]],
+) -> tuple[dict[str, dict[str, float]], list[str]]:
     """Return the entries of the sensors file: parameters by model, then by name.
 
-    A delay, scale or drift whose interval contains 0 is left out.
+    A delay, scale or drift whose interval contains 0 is left out. Returned is also a line for
+    people for each value that had to differ from the fitted one.
     """
-    models: dict[str, dict[str, float]] = {}
-    for key, (interval, _) in parameters.items():
+    models, notes = dict[str, dict[str, float]](), list[str]()
+    for key, (interval, unit) in parameters.items():
         model, name = key.split(".")
         noise = model == "measured_state" and name not in ("velocity_scale", "position_drift")
-        value = interval.value if noise else significant(interval)
+        fitted = interval.value if noise else significant(interval)
         limits = next(p for p in SENSORS.find(model).parameters if p.name == name)
-        value = min(max(value, limits.low), limits.high)
+        value = min(max(fitted, limits.low), limits.high)
+        if value != fitted:
+            notes.append(
+                f"{key}: these flights give {fitted:.4g} ({interval.low:.4g} to "
+                f"{interval.high:.4g}) {unit}; the file has {value:.4g}, the nearest allowed value"
+            )
         if noise or value:
             models.setdefault(model, {})[name] = float(f"{value:.4g}")
-    return models
+    return models, notes

@@ -86,7 +86,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     windows_of = partial(cut, logs, vehicle, rotor_input, limits=limits, integrator=integrator)
     windows, notes = windows_of()
     if windows is None:
-        raise ValueError("no flight has a stretch of 1.3 s without holes; log more, or faster")
+        raise ValueError(f"{'; '.join(notes)}: fly longer, or log faster")
     warnings += notes
     count = len(windows.flight)
     _check_count(count, limits)  # before anything is compiled

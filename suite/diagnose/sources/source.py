@@ -236,7 +236,9 @@ class SourceSet:
     warnings: Sequence[str] = ()
     tested: tuple[TestedEffect, ...] = ()
     """Effects that separate tests of the flights have named."""
-    compares: tuple[str, ...] = ()
+    references: tuple[str, ...] = ()
+    """Names of the flights before a change that are used, if a change is searched for."""
+    compares: str | None = None
     """For people, if a change is searched for: how flights of the unchanged vehicle differ."""
 
 

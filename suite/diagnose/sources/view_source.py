@@ -182,7 +182,8 @@ class ViewSource(Source):
         )
         variance = (centred(before.residual, before.flight) ** 2).mean(axis=0)
         beyond, spread = with_both - closed, evidence.repeatability
-        return Shares(closed, np.maximum(explainable, closed), beyond, variance, spread)
+        explainable = np.maximum(np.maximum(explainable, closed), 0.0)
+        return Shares(closed, explainable, beyond, variance, spread)
 
     def series(self, found: SearchResult) -> Series:
         """Return the stretch that the named effects change most, or else that of most error."""

@@ -72,7 +72,7 @@ def by_views(given: DiagnosisInput) -> SourceSet:
         for view in flights.views
     }
     # `earlier` is the evidence of the reference flights by view; empty if there are none.
-    earlier, spread, left_out = references_of(given, flights, evidence)
+    before, earlier, spread, left_out = references_of(given, flights, evidence)
     rows = min(sum(len(log.time_s) for log in logs), limits.most_rows)
     about = ", ".join(view.about for view in flights.views)
     given.say(f"views: {about}; by {flights.source}; {rows} rows: "
@@ -127,7 +127,8 @@ def by_views(given: DiagnosisInput) -> SourceSet:
         flights.source,
         (*notes, *not_shown, *left_out, *untested),
         (lag,) if lag else (),
-        spread.words(len(references)) if spread else (),
+        before,
+        spread.words if spread else None,
     )
 
 
@@ -243,8 +244,8 @@ def _deviations(reference: ViewEvidence, theta: np.ndarray) -> np.ndarray:
 
 def references_of(
     given: DiagnosisInput, flights: ViewFlights, evidence: Mapping[str, ViewEvidence]
-) -> tuple[dict[str, ViewEvidence], RotorSpread | None, tuple[str, ...]]:
-    """Return the evidence of the reference flights by view, the spread between flights, and notes.
+) -> tuple[tuple[str, ...], dict[str, ViewEvidence], RotorSpread | None, tuple[str, ...]]:
+    """Return names and evidence (by view) of the usable reference flights, spread, and notes.
 
     `flights` and `evidence` are those of the other flights.
 
@@ -252,7 +253,7 @@ def references_of(
         ValueError: if less than two are usable, or their signals differ from the other flights'.
     """
     if not given.references:
-        return {}, None, ()
+        return (), {}, None, ()
     before = ready(given.references, given.vehicle, given.limits, given.logs)
     if len(before.logs) < 2:
         words = (
@@ -267,7 +268,8 @@ def references_of(
             "log the same signals in both"
         )
     earlier = {n: replace(one, flights=before.smoothed[n]) for n, one in evidence.items()}
-    return earlier, rotor_spread([*earlier.values(), *evidence.values()]), before.notes
+    spread = rotor_spread([*earlier.values(), *evidence.values()])
+    return tuple(log.name for log in before.logs), earlier, spread, before.notes
 
 
 def _view_words(flights: ViewFlights) -> str:

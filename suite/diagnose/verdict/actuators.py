@@ -11,7 +11,6 @@ diagnosis chooses the model's input (commands or measured rotor speeds) and esti
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -39,6 +38,8 @@ RATE_LOOP, LOGGED = "nominal rate loop", "logged motor commands"
 """What commands rotor speeds: the rate loop at the measured body rates, or the log's commands."""
 LAG = "motor_lag"
 """Name of the rotor lag in the catalogue of effects."""
+LEAST_P = 1e-12
+"""Lower limit of a p-value, as no distribution is exact so far from its middle."""
 
 
 class TestedEffect(NamedTuple):
@@ -55,6 +56,15 @@ class TestedEffect(NamedTuple):
     view: str
     """Name of the source in which it was found."""
 
+    def is_in(self, vehicle: Vehicle) -> bool:
+        """Return whether the file of `vehicle` has this effect, with values in the intervals."""
+        values = vehicle.effects.get(self.name)
+        spans = {name: entry["ci95"] for name, entry in self.parameters.items()}
+        return values is not None and all(
+            span is not None and span[0] <= getattr(values, name) <= span[1]
+            for name, span in spans.items()
+        )
+
 
 class ActuatorMismatch(NamedTuple):
     """How measured rotor speeds differ from commanded ones; written to diagnosis.json as it is."""
@@ -62,7 +72,7 @@ class ActuatorMismatch(NamedTuple):
     commanded_by: str
     """"nominal rate loop" or "logged motor commands"."""
     rms: float
-    """RMS difference with the vehicle file's lag [rad/s]."""
+    """RMS difference with the vehicle file's lag and delay [rad/s]."""
     spread: float
     """Standard deviation of the measured speeds about each rotor's mean [rad/s]."""
     time_constant: float
@@ -80,7 +90,8 @@ class ActuatorMismatch(NamedTuple):
     turn: tuple[tuple[float, float], ...]
     """The same of the angular acceleration about body x, y and z each [rad/s^2]."""
     followed: float
-    """Share of the speeds' variance that the commands and the vehicle file's lag explain."""
+    """Share of the speeds' variance that the commands explain, with the vehicle file's lag and
+    delay."""
 
 
 class _Stretch(NamedTuple):
@@ -99,7 +110,7 @@ def actuator_mismatches(
 ) -> list[ActuatorMismatch]:
     """Compare measured rotor speeds with those by the rate loop and those by motor commands.
 
-    Returned are the comparisons that the logs allow. Effects of `vehicle` are ignored.
+    Returned are the comparisons that the logs allow.
     """
     mismatches = (_mismatch(source, logs, vehicle, limits) for source in (RATE_LOOP, LOGGED))
     return [mismatch for mismatch in mismatches if mismatch is not None]
@@ -154,8 +165,9 @@ def _mismatch(
 
     None where no log has both commanded and measured rotor speeds.
     """
-    dt, nominal_lag, stretches = step_s(vehicle), vehicle.rotors.time_constant, list[_Stretch]()
-    plant = make_plant(vehicle, dt, {})
+    dt, stretches = step_s(vehicle), list[_Stretch]()
+    plant = make_plant(vehicle, dt)
+    own_delay, own_lag = float(plant.constants.delay), float(plant.constants.time_constant)
     for log in logs:
         if sum(int(np.ptp(one.row)) for one in stretches) * dt < LONGEST_S:
             stretches += _stretches(log, plant, commanded_by, limits)
@@ -185,15 +197,15 @@ def _mismatch(
         )
         return min((float(best.fun), float(best.x)), (cost(0.0), 0.0))
 
-    # Best delay and lag together, and the best delay for the nominal lag.
+    # Best delay and lag together, and the best delay for the vehicle file's lag.
     delay, _ = _best_delay(lambda delay: best_lag(delay)[0])
     _, time_constant = best_lag(delay)
-    _, nominal_error = _best_delay(lambda delay: squared_error(commanded(delay), nominal_lag))
-    nominal = lagged(commanded(0.0), nominal_lag)
+    _, own_error = _best_delay(lambda delay: squared_error(commanded(delay), own_lag))
+    own = lagged(commanded(own_delay), own_lag)
     fitted = lagged(commanded(delay), time_constant)
     scale = scales(fitted)
-    thrust, turn = wrench_difference(measured, nominal, vehicle)
-    rms, spread = _rms(measured - nominal), _rms(measured - measured.mean(axis=0))
+    thrust, turn = wrench_difference(measured, own, vehicle)
+    rms, spread = _rms(measured - own), _rms(measured - measured.mean(axis=0))
     return ActuatorMismatch(
         commanded_by=commanded_by,
         rms=rms,
@@ -202,7 +214,7 @@ def _mismatch(
         delay=delay,
         scale=tuple(float(s) for s in scale),
         rms_fitted=_rms(measured - scale * fitted),
-        rms_own=float(np.sqrt(nominal_error)),
+        rms_own=float(np.sqrt(own_error)),
         thrust=(float(thrust.mean()), float(thrust.std())),
         turn=tuple((float(t.mean()), float(t.std())) for t in turn.T),
         followed=1.0 - (rms / max(spread, 1e-9)) ** 2,
@@ -313,9 +325,7 @@ def find_rotor_lag(
     """
     if has_firmware_loop(vehicle):
         return None
-    effect = vehicle.effects.get(LAG)
-    known = vehicle.rotors.time_constant if effect is None else float(effect.time_constant)
-    vehicle = replace(vehicle, rotors=replace(vehicle.rotors, time_constant=known))
+    known = float(make_plant(vehicle, step_s(vehicle)).constants.time_constant)
     by_flight = [_mismatch(RATE_LOOP, [log], vehicle, limits) for log in logs if not log.partial]
     unexplained = 1.0 - limits.lag_followed_share
     mismatches = [
@@ -330,11 +340,11 @@ def find_rotor_lag(
     standard_error = float(lags.std(ddof=1)) / np.sqrt(len(lags))
     half_width = float(stats.t.ppf(0.975, len(lags) - 1)) * standard_error + half_step
     difference = float(abs(lags.mean() - known))
-    nominal_error = sum(mismatch.rms_own**2 for mismatch in mismatches)
+    own_error = sum(mismatch.rms_own**2 for mismatch in mismatches)
     fitted_error = sum(mismatch.rms_fitted**2 for mismatch in mismatches)
-    closed = 1.0 - fitted_error / max(nominal_error, 1e-12)
+    closed = 1.0 - fitted_error / max(own_error, 1e-12)
     t = (difference - half_step) / max(standard_error, 1e-9)
-    p_value = float(2.0 * stats.t.sf(t, len(lags) - 1))
+    p_value = max(float(2.0 * stats.t.sf(t, len(lags) - 1)), LEAST_P)
     if p_value > limits.name_p_value or closed < limits.lag_closed_share:
         return None
     lag, low = float(lags.mean()), max(float(lags.mean()) - half_width, 0.0)

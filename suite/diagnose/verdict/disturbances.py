@@ -32,7 +32,7 @@ from suite.diagnose.evidence.evidence import flights_agree
 from suite.diagnose.evidence.rollout import Flown
 from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.evidence.views import ViewEvidence
-from suite.diagnose.verdict.actuators import TestedEffect
+from suite.diagnose.verdict.actuators import LEAST_P, TestedEffect
 from suite.diagnose.verdict.residual_structure import DisturbanceEquations, diagonalised
 
 STEP_HZ = 0.01
@@ -237,7 +237,7 @@ def find_turbulence(
             ("length", length, "m", lengths_m, likely.any(axis=1)),
         )
     }
-    values, p_value = Gusts(intensity, length), float(np.exp(-ratio))
+    values, p_value = Gusts(intensity, length), max(float(np.exp(-ratio)), LEAST_P)
     return TestedEffect(GUSTS.name, values, parameters, None, p_value, "whole"), ratio
 
 

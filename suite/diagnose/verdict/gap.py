@@ -83,8 +83,10 @@ class Gap(NamedTuple):
         """RMS error over all stretches, with the flights' trims."""
         return float(np.hypot(self.rms, self.offset))
 
-    def ci95(self, seed: int) -> tuple[float, float]:
-        """Return the 95 % interval of `rms` by a block bootstrap over stretches."""
+    def ci95(self, seed: int) -> tuple[float, float] | None:
+        """Return the 95 % interval of `rms` by a block bootstrap; None of a single stretch."""
+        if len(self.score) < 2:
+            return None
         low, high = np.quantile(np.sqrt(self._means(self.score, seed)), [0.025, 0.975])
         return float(low), float(high)
 

@@ -224,7 +224,22 @@ def test_what_one_fit_leaves_and_another_identifies_is_identified():
     torque = known.fitted(("lag", "late"), left=("lag", "late"))
     fitted = {"torque": torque, "loop": known.fitted(("lag",))}
     given = {entries.DELAY: Number(entries.DELAY, "s", [0.0], [None])}
-    assert [line.split(":")[0] for line in not_identified(fitted, given)] == ["command_delay"]
+    lines = not_identified(fitted, given, 0.0)
+    assert [line.split(":")[0] for line in lines] == ["command_delay"]
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "words"),
+    [
+        (0.0, "this sum minus the file's lag"),
+        (-0.01, "the nearest allowed value to this sum minus the file's lag, -0.01 s"),
+    ],
+)
+def test_a_sum_shorter_than_the_lag_is_not_said_to_be_in_the_file(delay_s, words):
+    fitted = {"torque": known.fitted(("lag", "late"), left=("lag",))}
+    given = {entries.DELAY: Number(entries.DELAY, "s", [delay_s], [None], True)}
+    _, line = not_identified(fitted, given, 0.0)
+    assert line.endswith(f"the file's delay, 0 s, is {words}")
 
 
 COMPLETE = {"force": ("thrust", "drag_x"), "loop": ("gain_x",), "torque": ("inertia_x", "late")}

@@ -23,8 +23,9 @@ from suite.diagnose.report.page import channels_grid, page
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.source import FAR
 from suite.diagnose.verdict.actuators import actuator_mismatches
+from suite.diagnose.verdict.gap import Gap
 from tests.support.diagnosis_flights import fly
-from tests.support.vehicles import PLAIN
+from tests.support.vehicles import PLAIN, with_effects
 from tracks.common.files import plain
 
 
@@ -58,6 +59,13 @@ def test_the_json_has_what_was_found(drag, found):
     assert np.all(np.abs([0.15, 0.15, 0.05] - (low + high) / 2) < high - low)
     assert found["control"]["after"] > 1.5 * found["gap"]["after"]
     assert found["gap"]["channels"]["1 s"]["velocity"]["noise_floor"] > 0.0
+    # A change since reference flights is named whatever its size, and then its size is compared.
+    limits = replace(drag.main.source.limits, relevance=(1e6, 1e6, 1e6))
+    for names_small in (True, False):
+        source = replace(drag.main.source, limits=limits, names_small=names_small)
+        findings = (replace(drag.main, source=source),)
+        (effect,) = as_json.effects_json(replace(drag, findings=findings))
+        assert effect["relevant"] is not names_small
 
 
 def test_each_view_names_its_own_effect_and_the_page_has_its_headline_first(by_views):
@@ -104,6 +112,15 @@ def test_numbers_of_views_are_those_that_are_judged_and_the_rest_has_its_reason(
     assert texts(table)[0][:3] == ["torque", "4.78 rad/s²", "0.15"]
 
 
+def test_no_share_is_above_one_and_a_single_stretch_has_no_interval():
+    before, after = (Gap(np.array([score]), np.ones(1), {}) for score in (1.44, 0.9))
+    main = SimpleNamespace(before=before, after=after, names=(1,), without={}, control=None)
+    main.source = SimpleNamespace(measure="RMS")
+    shown = SimpleNamespace(main=main, seed=0)
+    rows = texts(sections.evidence_section(shown, {"gap": {"held_out": ["a"]}}).parts[-1])
+    assert rows == [["as given", "1.2", "", ""], ["with the named effects", "0.949", "", "100 %"]]
+
+
 def test_what_no_source_tests_is_listed(by_views, drag, monkeypatch, capsys, tmp_path):
     """On the page and, under each verdict, on the console."""
     assert as_json.not_examined(drag) == []
@@ -138,10 +155,24 @@ def test_a_weak_motor_has_its_number_and_the_motors_that_it_may_be():
     theta, width = space.array("start"), dict.fromkeys(at, 0.01)
     unsure = as_json.parameters_json(space, "weak_motor", [at[1]], theta, width, undecided=[at[2]])
     assert (unsure["index"]["value"], unsure["index"]["ci95"]) == (2, [2, 3])
+    index = summary.components({"name": "weak_motor", "parameters": unsure})[0]
+    assert index.texts() == ("2", "2 to 3")
     several = as_json.parameters_json(space, "weak_motor", [at[1], at[3]], theta, width)
     assert several["index"] == {"value": [2, 4], "unit": "1", "ci95": [[2, 2], [4, 4]]}
     shown = summary.components({"name": "weak_motor", "parameters": several})
     assert [one.label for one in shown] == ["scale 2 [1]", "scale 4 [1]"]
+    # A motor that is weak in the vehicle file stays so, and is in the total.
+    given = make_space(with_effects(PLAIN, weak_motor=((0.9, 1.0, 1.0, 1.0),)))
+    theta = given.array("start")
+    theta[at[2]], half = 0.8, {at[2]: 0.01}
+    total = as_json.parameters_json(given, "weak_motor", [at[2]], theta, half, undecided=[at[3]])
+    assert total["index"] == {"value": [1, 3], "unit": "1", "ci95": [[1, 1], [3, 4]]}
+    assert total["scale"]["value"] == [0.9, 0.8] and total["scale"]["ci95"][0] is None
+    shown = summary.components({"name": "weak_motor", "parameters": total})
+    assert [(one.label, one.texts()[0]) for one in shown] == [
+        ("scale 1 [1]", "0.9"),
+        ("scale 3 [1]", "0.800"),
+    ]
 
 
 def test_sections_show_the_numbers(drag, found):
@@ -191,6 +222,8 @@ DRAG = {
     "parameters": {"coefficient": {"value": [0.31, 0.302, 0.01], "unit": "1/s",
                                    "ci95": [[0.3, 0.32], [0.29, 0.31], [-0.01, 0.03]]}},
     "size": {"force": 0.8, "torque": 0.0, "drift": 0.4},
+    "view": "force",
+    "gap_removed": 0.9,
 }  # fmt: skip
 
 
@@ -199,6 +232,7 @@ def entries(verdict, effects=(), where=None, **more):
     base |= {"unexplained": {"where": where, "above_noise": []}, "identified": False}
     advice = ["linear_drag from rotor_drag: bob up and down on a circle"]
     base["separate_with"] = advice if effects else []
+    base["gap"] = {"before": 17.3, "after": 4.78, "offset": {}}
     return {**base, **more}
 
 
@@ -217,7 +251,7 @@ def test_an_answer_has_the_effect_its_values_and_its_size_or_what_is_too_small()
         "0.8 m/s² and 0.4 m after one second (RMS). This explains the gap between simulation and "
         "flights."
     )
-    arm = {"name": "lever_arm", "alternatives": [], "parameters": {}, "size": None}
+    arm = {**DRAG, "name": "lever_arm", "alternatives": [], "parameters": {}, "size": None}
     both = summary.answer(entries("named", [arm, DRAG]))
     assert both.index("in the vehicle file: Drag") < both.index(". Wrong in the logs: Position")
     by_force = {**DRAG, "size": {**DRAG["size"], "drift": None}}
@@ -235,7 +269,8 @@ def test_an_answer_has_the_effect_its_values_and_its_size_or_what_is_too_small()
 
 def measured(verdict, after, effects=(), reason=None, floor=0.15, offset=7.9, **more):
     gap = {"of": "error of the torque", "unit": "rad/s^2", "before": 17.3, "after": after}
-    gap |= {"noise_floor": floor, "offset": {"torque": {"after": offset, "unit": "rad/s^2"}}}
+    offsets = {"before": 9.0, "after": offset, "unit": "rad/s^2"}
+    gap |= {"noise_floor": floor, "offset": {"torque": offsets}}
     rest = [{"reason": reason}] if reason else []
     more |= {"relevance": {"torque": 0.5}, "unexplained": {"where": None, "above_noise": rest}}
     return summary.headline(entries(verdict, effects, gap=gap, **more))
@@ -260,6 +295,48 @@ def test_a_headline_states_the_floor_the_errors_that_remain_and_offsets_that_do_
     assert "error" not in summary.answer(entries("no_gap", reference=["a"]))
     # The unit of rollouts is the noise floor.
     assert "floor" not in measured("unknown", 17.3, floor=1.0)
+
+
+def test_simulated_flights_that_stay_far_are_no_part_of_what_agrees():
+    text = measured("no_gap", 17.3, (), "that logged signals hardly predict", warnings=[FAR])
+    assert text.startswith(
+        "The forces and torques that were compared agree, except for an error that logged signals "
+        "hardly predict. But simulated flights of 1 s stay far from the measured ones."
+    )
+    named = measured("named", 4.78, [DRAG], warnings=[FAR])
+    assert "between simulation and flights. But simulated flights of 1 s stay far" in named
+
+
+def test_an_effect_that_lowers_the_offsets_alone_explains_no_gap():
+    agree, differ = (measured(verdict, 17.3, [DRAG]) for verdict in ("named", "partly"))
+    offset = "(RMS). This explains a constant offset of the flights. Simulation and flights"
+    assert f"{offset} agree within" in agree and f"{offset} differ, and no effect" in differ
+    # A random wind explains an error that no simulation lowers, and offsets may not fall either.
+    for effects, left in (([{**DRAG, "gap_removed": None}], 7.9), ([DRAG], 9.0)):
+        assert "explains the gap" in measured("named", 17.3, effects, offset=left)
+
+
+def test_a_drag_of_the_file_that_the_flights_do_not_show_is_not_said_to_be_missing():
+    interval = [[0.0, 0.01]] * 3
+    none = {"coefficient": {"value": [0.0, 1e-17, 0.004], "unit": "1/s", "ci95": interval}}
+    answer = summary.answer(entries("named", [{**DRAG, "parameters": none}]))
+    assert (
+        "(linear_drag or rotor_drag): coefficient x not different from 0, coefficient y" in answer
+    )
+
+
+def test_a_rotor_lag_alone_explains_no_gap_of_force_and_torque():
+    lag = {**DRAG, "name": "motor_lag", "parameters": {}, "size": None, "view": "commands"}
+    lag["alternatives"] = []
+    agree, differ = (measured(verdict, 17.3, [lag]) for verdict in ("named", "partly"))
+    rotors = "This explains how measured and commanded rotor speeds differ. "
+    assert f"{rotors}Simulation and flights agree within the measurement noise." in agree
+    assert f"{rotors}Simulation and flights differ, and no effect of the" in differ
+    assert "explains the gap" in measured("named", 4.78, [lag, DRAG])
+    far = measured("named", 17.3, [lag], warnings=[FAR])
+    assert "compared agree within" in far and "stay far" in far and "Simulation and" not in far
+    same = entries("partly", [lag], gap={"before": 17.3, "after": 17.3})
+    assert summary.next_steps(same)[0].endswith(" Its values are approximate.")
 
 
 @pytest.mark.parametrize(

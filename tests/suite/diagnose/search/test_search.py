@@ -15,6 +15,7 @@ from suite.diagnose.estimate.block import Block, Estimate, normal_equations
 from suite.diagnose.estimate.gauss_newton import chi2_fall, intervals95, solve
 from suite.diagnose.estimate.parameters import ParameterSpace, candidates, effects_in, make_space
 from suite.diagnose.evidence.evidence import Evaluation, Evidence, flights_agree
+from suite.diagnose.search import search as searching
 from suite.diagnose.search.evaluation import NamedEffect, cross_validated_chi2, linear_change
 from suite.diagnose.search.search import (
     SearchTask,
@@ -316,10 +317,11 @@ class Bent(Response):
         return self.measured
 
 
-def test_a_fitted_effect_is_tested_at_its_fit_where_its_slopes_hold():
+def test_a_fitted_effect_is_tested_at_its_fit_where_its_slopes_hold(monkeypatch):
     """At the start they explain a hundredth of what the effect does."""
     command, away, noise = np.random.default_rng(0).standard_normal((3, COUNT, 20))
-    flown = Bent(away, command, command + noise)
+    entries = tuple(replace(entry, tried=()) for entry in SPACE.entries)
+    flown = Bent(away, command, command + noise, replace(SPACE, entries=entries))
     (delay,) = [c for c in COMMANDED if c.indices == (DELAY,)]
     current = flown.relinearise(BEGIN)
     (score,) = flown.scores(current, [], [delay], 0)
@@ -329,3 +331,7 @@ def test_a_fitted_effect_is_tested_at_its_fit_where_its_slopes_hold():
     trial = _Trial(0.0, NamedEffect(delay, score.p_value, 0.0), Estimate(theta, BEGIN.free))
     task = SearchTask([delay], lambda _: None, 0)
     assert _p_value_at_fit(task, current, [], [delay], trial) <= THRESHOLDS.name_p_value
+    # The name that stays has the p-value of this test.
+    monkeypatch.setattr(searching, "fit_with", lambda *_: flown.relinearise(trial.at))
+    (kept,), _ = searching._replace_or_drop(task, flown, trial.at, [trial.name], 0, [delay])
+    assert kept.candidate == delay and kept.p_value <= THRESHOLDS.name_p_value

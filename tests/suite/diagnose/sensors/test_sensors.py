@@ -159,6 +159,21 @@ def test_the_file_that_is_written_reads_back_with_what_was_found(tmp_path):
     assert "95 % intervals" in file.read_text()
 
 
+def test_an_estimate_ahead_of_its_reference_has_no_delay_in_the_file_and_a_warning(
+    tmp_path, monkeypatch
+):
+    for number, log in enumerate(flights()[:2]):
+        late = Clock(log.time_s, np.full(len(log.time_s), DELAY_S + 0.05))
+        write_flight(tmp_path / f"{number}.parquet", on_gyro_clock(log, late))
+    # The gyro shows the shift, which would be removed.
+    monkeypatch.setattr(identify, "clock_of", lambda log: Clock(np.zeros(1), np.zeros(1)))
+    found = identify_sensors([tmp_path], tmp_path / "mine.toml", Console())
+    assert found["parameters"]["delay.state"]["ci95"][1] < 0.0
+    assert load_sensors(tmp_path / "mine.toml").ages.state_s == 0.0
+    (warning,) = [text for text in found["warnings"] if text.startswith("delay.state: these")]
+    assert "the file has 0, the nearest allowed value" in warning
+
+
 def test_a_log_without_an_estimate_or_a_reference_is_refused(tmp_path):
     log = flights()[0]
     bare = replace(log, extra={})

@@ -18,7 +18,7 @@ from suite.diagnose.sources.source import Remaining, Source, SourceSet
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict import actuators
 from suite.diagnose.verdict.gap import Channel, EffectSize, Gap, remaining_share
-from tests.support.vehicles import PLAIN
+from tests.support.vehicles import PLAIN, with_effects
 from tracks.common.files import plain
 
 SPACE = make_space(PLAIN)
@@ -139,6 +139,29 @@ def test_an_effect_of_a_separate_test_leaves_no_unknown(monkeypatch, wind):
     found = diagnosis_json(diagnose([], PLAIN, by="air"))
     assert [effect["name"] for effect in found["effects"]] == ["motor_lag"]
     assert found["verdict"] == "partly"
+
+
+@pytest.mark.parametrize(
+    ("own", "label"), [(None, "named"), ((2.0, 5.0), "named"), ((0.85, 4.0), "no_gap")]
+)
+def test_a_random_wind_that_the_file_has_is_not_named_again(monkeypatch, own, label):
+    class WindySource(ThermometerSource):
+        """The same, where random wind explains the error."""
+
+        def remaining(self, found, gaps, seed):
+            spans = (("intensity", 0.8, [0.7, 0.9]), ("length", 5.0, [3.0, 7.0]))
+            values = {n: {"value": value, "unit": "", "ci95": span} for n, value, span in spans}
+            gusts = EFFECTS["gusts"].values(0.8, 5.0)
+            wind = actuators.TestedEffect("gusts", gusts, values, None, 1e-5, self.name)
+            return Remaining(False, 1.0, wind=wind)
+
+    monkeypatch.setitem(SOURCES, "air", lambda _: sources(0.0, kind=WindySource))
+    vehicle = with_effects(PLAIN, gusts=own) if own else PLAIN
+    result = diagnose([], vehicle, by="air")
+    found = diagnosis_json(result)
+    assert found["verdict"] == label and len(found["effects"]) == (label == "named")
+    kept = result.vehicle.effects["gusts"].intensity
+    assert kept == (0.8 if label == "named" else 0.85)
 
 
 @pytest.mark.parametrize(("size", "label"), [(0.8, "named"), (0.0, "no_gap")])

@@ -16,7 +16,9 @@ from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.summary import next_steps
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.examine import contradicted
+from suite.diagnose.sources.source import DiagnosisInput
 from suite.diagnose.sources.view_source import closed_share, fit_black_box, inputs_of
+from suite.diagnose.sources.views import by_views as sources_of
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict.disturbances import Swing, residual_swing
 from tests.support.diagnosis_flights import fly_all
@@ -116,6 +118,17 @@ def test_a_black_box_explains_what_depends_on_the_motion_and_no_noise(by_views):
     left = real - inputs @ fit_black_box(inputs, real, flight)
     assert closed_share(real, left, flight).min() > 0.8
     assert np.abs(centred(real, flight)[flight == 0].mean(axis=0)).max() < 1e-12
+
+
+def test_a_reference_flight_that_never_flies_is_not_listed_as_one():
+    new, old = flights(2, 8, 3.0), flights(2, 9, 3.0)
+    still = {key: 0.0 * getattr(old[0], key) for key in ("vel_w", "thrust_cmd", "rotor_speed")}
+    given = DiagnosisInput(
+        new, VEHICLE, [*old, replace(old[0], **still)], "auto", "auto", print, THRESHOLDS, True
+    )
+    made = sources_of(given)
+    assert made.references == tuple(log.name for log in old)
+    assert any(text.startswith(f"{old[0].name}: no stretch") for text in made.warnings)
 
 
 SIDE = (0.25, 0.45, 0.1)
