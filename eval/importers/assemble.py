@@ -33,7 +33,7 @@ from eval.logs.faults.finding import Finding, finding_lines
 from eval.logs.faults.position import check_jumps
 from eval.logs.faults.reading import BY_ATTITUDE, MOTORS, read_rows
 from eval.logs.faults.sensors import check_copy
-from eval.logs.faults.vehicle import check_vehicle_name
+from eval.logs.faults.vehicle import check_controller, check_vehicle_name
 from eval.logs.flight_log import FlightLog, log_from_columns
 
 SLOW_HZ = 40.0
@@ -177,6 +177,7 @@ def assemble(
         "imported_from": recording.name.replace("\\", "/").rsplit("/", 1)[-1],
     }
     findings += check_vehicle_name(about, options.vehicle)
+    findings += check_controller(about, options.vehicle)
     if options.vehicle is not None:
         about["vehicle"] = options.vehicle.name
     if missing:

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import fields
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,7 @@ from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.reading import DEG
 from eval.logs.files import first_line, read_columns, read_head
+from eval.quadrotor.loops.betaflight import Settings
 
 SUMMARY = "Blackbox log (.bbl, .bfl), or CSV of blackbox_decode; --pose or --partial"
 TAKES_MAP = TAKES_SOURCE = False
@@ -155,9 +158,33 @@ def read(path: Path, options: ImportOptions) -> Recording:
     signals, more_findings = collect(
         {name: (time_s, value) for name, value in parts.items()}, box.name
     )
-    about = {our_key: str(box.header[key]) for key, our_key in ABOUT.items() if box.header.get(key)}
+    about: dict[str, Any] = {
+        our_key: str(box.header[key]) for key, our_key in ABOUT.items() if box.header.get(key)
+    }
+    if loop := _controller(box):
+        about["controller"] = {"kind": "betaflight", **loop}
     findings = (*findings, *more_findings)
     return Recording(box.name, signals, findings, MOTOR_SIDE, about, has_seconds=True)
+
+
+def _controller(box: Blackbox) -> dict[str, float]:
+    """Return the header's settings of the rate loop, named as in the vehicle file."""
+    found = {field.name: box.settings(field.name, (nan,))[0] for field in fields(Settings)}
+    # From 4.0 to 4.5, D begins at d_min and grows to the D of the header's PID.
+    none = (nan,) * 3
+    least_d, forward = box.settings("d_min", (0.0,) * 3), box.settings("ff_weight", none)
+    for axis, name in enumerate(("roll", "pitch", "yaw")):
+        p, i, d = box.settings(f"{name}PID", none)
+        found |= {f"p_{name}": p, f"i_{name}": i, f"d_{name}": least_d[axis] or d}
+        found[f"f_{name}"] = forward[axis]
+    if box.settings("iterm_relax", (1.0,))[0] == 0.0:
+        found["iterm_relax_cutoff"] = 0.0
+    # Filters whose cutoff changes in flight have no setting in the vehicle file.
+    changing = [f"{name}_static_hz" for name in ("gyro_lpf1", "dterm_lpf1")
+                if box.settings(f"{name}_dyn_hz", (0.0, 0.0))[0] > 0.0]  # fmt: skip
+    if found["rc_smoothing_setpoint_cutoff"] == 0.0:  # automatic
+        changing.append("rc_smoothing_setpoint_cutoff")
+    return {name: float(v) for name, v in found.items() if name not in changing and np.isfinite(v)}
 
 
 def _volts(voltage: np.ndarray, unit: str, fix: bool, findings: list[Finding]) -> np.ndarray:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from eval.logs.faults.finding import CUT, Finding
 from eval.logs.faults.reading import RPM
 from eval.logs.faults.sensors import check_voltage_fails
 from eval.logs.files import read_head
+from eval.quadrotor.loops.px4 import Settings
 from tracks.input.ranges import is_number
 
 SUMMARY = "PX4 ULog (.ulg)"
@@ -80,8 +82,13 @@ def read(path: Path, options: ImportOptions) -> Recording:
     findings += _other_battery(parts, batteries)
     findings += _check_position(topics.get("vehicle_local_position", {}))
     signals, more_findings = collect(parts, str(path))
-    info = log.msg_info_dict
-    about = {key: str(info[key]) for key in ("sys_name", "ver_hw", "ver_sw") if key in info}
+    info, parameters = log.msg_info_dict, log.initial_parameters
+    about: dict[str, Any] = {
+        key: str(info[key]) for key in ("sys_name", "ver_hw", "ver_sw") if key in info
+    }
+    loop = {field.name: parameters.get(field.name) for field in fields(Settings)}
+    if loop := {name: float(value) for name, value in loop.items() if is_number(value)}:
+        about["controller"] = {"kind": "px4", **loop}
     return Recording(
         str(path), signals, (*findings, *more_findings), motor_side, about, has_seconds=True
     )

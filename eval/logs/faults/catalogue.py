@@ -59,6 +59,10 @@ FAULTS: dict[str, tuple[str, str]] = {
     "rate_curve": ("the firmware maps sticks by another curve", STICKS),
     "command_delay": ("commands act too late", STICKS),
     "controller_rate": ("the controller runs at another rate", FASTER),
+    "controller_settings": (
+        "the firmware's rate loop has other settings than the vehicle file",
+        "",
+    ),
     "thrust_command_unit": ("the thrust command is not in m/s^2 along body z", HOVER),
     "throttle_range": ("the throttle is not from 0 to 1", HOVER),
     "throttle_curve": ("thrust grows with the throttle by another curve, or its size", CLIMB),

@@ -44,6 +44,7 @@ from eval.logs.faults.vectors import check_accelerometer, check_gyro, check_velo
 from eval.logs.faults.vehicle import (
     LIFT,
     check_camera,
+    check_controller,
     check_vehicle_name,
     check_vehicle_numbers,
 )
@@ -129,7 +130,7 @@ SIGNALS = {
 """Subject of a finding (`Finding.signal`) -> name of the signal in the rows."""
 
 
-OF_VEHICLE_FILE = ("motor_map", "thrust_scale", "vehicle_inertia")
+OF_VEHICLE_FILE = ("motor_map", "thrust_scale", "vehicle_inertia", "controller_settings")
 """Faults of the vehicle file, not of the log: with a vehicle file, only its own ones count."""
 
 
@@ -246,6 +247,7 @@ def check_log(
         text += f"{SLOWEST_S:g} s apart or less, are needed"
         findings.append(Finding("note", NOT_CHECKED, text))
     findings += check_vehicle_name(log.about, against.vehicle)
+    findings += check_controller(log.about, against.vehicle)
     again = {finding.fault for finding in findings if finding.fault}
     stored = [f for f in findings_of(log.about) if f.status in ("doubt", "corrected")]
     if against.vehicle is not None:

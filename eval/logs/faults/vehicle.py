@@ -40,6 +40,10 @@ FIRMWARE_GAIN = 0.05
 """A firmware's P gain below this share of its default is probably in another unit."""
 UNSURE = 0.85
 """Confidence of doubts about keys that only simulated flights use: they stop no diagnosis."""
+LOOP = "rate loop"
+"""Subject of findings on the settings of the firmware's rate loop."""
+MOST_SETTINGS = 3
+"""Largest number of differing settings that a finding's evidence lists."""
 FOV_DEG = 2.0
 """Fields of view that differ by at most this belong to the same camera [deg]."""
 
@@ -177,6 +181,40 @@ def check_vehicle_name(about: Mapping[str, Any], vehicle: Vehicle | None) -> lis
         return []
     text = f"the log names the vehicle {str(name)!r}, and --vehicle is {vehicle.name!r}"
     return [Finding("note", "vehicle", text)]
+
+
+def check_controller(about: Mapping[str, Any], vehicle: Vehicle | None) -> list[Finding]:
+    """Return a finding where a log's metadata `about` have the settings of a firmware's rate loop.
+
+    They are the entry `controller`: the kind of the loop, and its settings by name, as in the
+    vehicle file. Settings that the vehicle file's loop does not have are ignored.
+    """
+    logged = about.get("controller")
+    if vehicle is None or not isinstance(logged, Mapping):
+        return []
+    kind, here = logged.get("kind"), vehicle.controller
+    if kind != here.kind:
+        text = f"the log's is of kind {kind!r}, that of the vehicle file of kind {here.kind!r}"
+        return [Finding("note", LOOP, text)]
+    known = {name: getattr(here.settings, name, None) for name in logged}
+    pairs = {
+        name: (float(logged[name]), float(value))
+        for name, value in known.items()
+        if value is not None and isinstance(logged[name], int | float)
+    }
+    other = {name: pair for name, pair in pairs.items() if not np.isclose(*pair, rtol=1e-4, atol=0)}
+    if not other:
+        text = f"{len(pairs)} settings of the log are those of the vehicle file"
+        return [Finding("ok", LOOP, text)]
+    texts = [
+        f"{name} is {there:g}, in the vehicle file {own:g}" for name, (there, own) in other.items()
+    ]
+    text = "; ".join(texts[:MOST_SETTINGS])
+    if len(texts) > MOST_SETTINGS:
+        text += f"; and {len(texts) - MOST_SETTINGS} more"
+    fix = ", ".join(f"{name} = {there:g}" for name, (there, _) in other.items())
+    fix = f"{fix} in [controller] of the vehicle file"
+    return [Finding("doubt", LOOP, text, "controller_settings", None, UNSURE, fix)]
 
 
 def check_same_vehicle(logs: Sequence[FlightLog]) -> list[tuple[Finding, str]]:
