@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from suite.experiments.bench.compare import Comparison, Figure, compare_times, i
 from suite.experiments.bench.sysid_baseline import make_task
 from suite.experiments.bench.torch_baseline import Baseline, to_torch
 from suite.experiments.study.speed import best_time, count_operations, multiplying_rate, peak_memory
+from suite.judging.deploy import latency
 from suite.train.gradient import make_gradient
 from suite.train.recipes import named_recipe
 from tests.support.documents import page, reproduce
@@ -75,8 +77,8 @@ def test_both_sides_have_the_same_residuals():
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler: cc, or what CC names")
 def test_every_engine_is_timed_and_the_ratio_is_of_the_times(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    folder, run = str(small_checkpoint(tmp_path)), policy.run
-    monkeypatch.setattr(policy, "run", lambda asked: run(asked, rounds=1))
+    folder = str(small_checkpoint(tmp_path))
+    monkeypatch.setattr(latency, "time_in_turn", partial(latency.time_in_turn, rounds=1))
     assert cli.main(["bench", "policy", "--policy", folder, "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["details"]["policy"] == Path(folder).name
