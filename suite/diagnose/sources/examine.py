@@ -61,6 +61,15 @@ def examine(
     warnings += [
         f"{label}: withdrawn, held-out flights are no better for it" for label in withdrawn
     ]
+    if uncertain := [one for one in found.named if _is_uncertain(found, one)]:
+        labels = ", ".join(one.candidate.label for one in uncertain)
+        warnings.append(
+            f"{labels}: withdrawn, the flights disagree about its size: its interval has the "
+            "vehicle file's value. Are they of one vehicle?"
+        )
+        found = found.refitted([one for one in found.named if one not in uncertain])
+        after = source.gap(found, found.estimate.theta) if found.named else before
+        without = _without_each(source, found)
     # Leave out effects that are too small. Depending on the source, the remaining error is still
     # computed with them (`small_explains`).
     explained = found, (before, after)
@@ -206,6 +215,18 @@ def control(source: Source, found: SearchResult) -> tuple[str, Gap] | None:
         return None
     fitted = found.judged.evidence.fitted(found.start, list(wrong.indices))
     return wrong.label, source.gap(found, fitted.at.theta)
+
+
+def _is_uncertain(found: SearchResult, named: NamedEffect) -> bool:
+    """Return whether the interval of an effect's only number contains the start value.
+
+    The test that named the effect compares stretches, the interval compares flights as well.
+    """
+    if len(named.candidate.indices) > 1:
+        return False  # numbers may be uncertain alone but not together
+    (index,) = named.candidate.indices
+    change = abs(found.estimate.theta[index] - found.start.theta[index])
+    return bool(change <= found.half_widths()[found.indices.index(index)])
 
 
 def _without_each(source: Source, found: SearchResult) -> dict[str, Gap]:

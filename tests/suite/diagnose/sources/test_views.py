@@ -84,6 +84,12 @@ def test_an_inertia_is_named_though_the_trim_of_each_flight_is_larger():
     assert after.energy.sum() < before.energy.sum()
 
 
+def test_flights_of_two_vehicles_give_no_name_whose_interval_has_the_files_value():
+    other = flights(2, 3, 5.0, hidden={"thrust_scale": (0.9,)})
+    names, found = found_in([*flights(2, 1, 5.0), *other])
+    assert not names and any("Are they of one vehicle?" in text for text in found.warnings)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("rate", "duration_s", "fall"), [(0.004, 20.0, 0.0), (0.006, 12.0, 0.08)])
 def test_a_battery_that_sags_is_named_with_its_size(rate, duration_s, fall):
