@@ -12,7 +12,7 @@ import inspect
 import re
 import sys
 from collections.abc import Iterable
-from dataclasses import MISSING, is_dataclass
+from dataclasses import MISSING
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,10 @@ from eval.logs.faults.catalogue import FAULTS
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors import SENSORS
 from eval.sensors.measured_state import Axis, MeasuredState
-from suite.common.options import SILENT, Option, field_texts, options, settings
+from suite.common.options import SILENT, Option, field_texts, options
 from suite.common.usage import EXAMPLES, GROUPS
-from suite.train.recipes import named_recipe
+from suite.train.overrides import settings_to_change
+from suite.train.recipes import named_recipe, with_sensors
 
 HEADS = Path(__file__).with_name("heads")
 """Folder of the text above the generated part of each page."""
@@ -46,7 +47,7 @@ SETTING_GROUPS = {
     "loss": "The loss and the field (`loss`)",
     "episode": "The worlds of a gradient step (`episode`)",
     "optimizer": "The optimiser (`optimizer`)",
-    "": "The whole run",
+    "sensors": "Sensor errors, with `--sensors` (`sensors`)",
 }
 """First part of a setting's name -> heading of its table."""
 
@@ -125,23 +126,13 @@ def python() -> str:
     return "\n".join(parts)
 
 
-def _value(value: Any) -> str:
-    """Return the value of a setting as the text of a cell; for phases it is their number."""
-    is_phases = isinstance(value, tuple) and value and is_dataclass(value[0])
-    return f"{len(value)} of them" if is_phases else cell(value)
-
-
 def training() -> str:
     """Return the page of the settings of a training: a table for each group of settings."""
     groups = dict[str, list[str]]()
-    for setting in settings(named_recipe("race")):
-        path = setting.path
-        # The vehicle of the quadrotor is chosen by --vehicle, not by settings.
-        if not path.startswith("quadrotor.vehicle."):
-            group = path.split(".")[0] if "." in path else ""
-            default, about = _value(setting.default), cell(setting.about)
-            row = f"| `{path}` | {default} | {setting.allowed} | {about} |"
-            groups.setdefault(group, []).append(row)
+    for setting in settings_to_change(with_sensors(named_recipe("race"), "vio")):
+        default, about = cell(setting.default), cell(setting.about)
+        row = f"| `{setting.path}` | {default} | {setting.allowed} | {about} |"
+        groups.setdefault(setting.path.split(".")[0], []).append(row)
     titles = "| setting | in `race`, first phase | allowed | meaning |\n|---|---|---|---|\n"
     parts = [head("settings")]
     for group, title in SETTING_GROUPS.items():

@@ -159,7 +159,7 @@ def action_argument(name: str, action: ActionSpec) -> dict[str, ActionSpec]:
     if action.kind not in getattr(WORLDS.find(name), "actions", ()):
         raise ValueError(
             f"simulator {name!r} supports no actions of kind {action.kind!r}; fly in 'mujoco', or "
-            "give its class `actions` and the argument `action` (docs/worlds.md)"
+            "give its class `actions` and the argument `action` (docs/extend.md)"
         )
     return {"action": action}
 

@@ -81,7 +81,7 @@ def adapt_params(params: Params, old: PolicySpec, new: PolicySpec) -> Params:
         if before != after and entry.name not in (*EXTRAS, "speed", "rate_hz"):
             raise ValueError(
                 f"the policy to start from has spec.{entry.name} {before}, and this run {after}; "
-                "train without a start, or with the value of the policy"
+                "train with the value of the policy (its own --recipe), or without a start"
             )
     lacking = [f"spec.{key}=True" for key in EXTRAS if getattr(old, key) and not getattr(new, key)]
     if lacking:

@@ -11,7 +11,7 @@ import tyro
 
 from suite.commands.tracks import family_text
 from suite.common.console import Console
-from suite.common.options import Command, settings
+from suite.common.options import Command
 from suite.common.usage import first_paragraph
 from tracks.common.names import unknown_name
 
@@ -61,7 +61,9 @@ def list_settings(config: TrainConfig, console: Console) -> list[dict[str, Any]]
 
     The values are those before the phases.
     """
-    all_settings = [one for one in settings(config) if one.path not in ("phases", "seed")]
+    from suite.train.overrides import settings_to_change
+
+    all_settings = settings_to_change(config)
     for setting in all_settings:
         allowed = f", allowed {setting.allowed}" if setting.allowed else ""
         console.say(f"{setting.path} = {setting.default!r}{allowed}\n    {setting.about}")

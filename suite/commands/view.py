@@ -176,7 +176,10 @@ def _choose_trials(config: Config, console: Console) -> _Chosen:
     label = config.policy or next(iter(found), None)
     if label not in found:
         of = f" of {config.policy}" if config.policy else ""
-        raise ValueError(f"--pick {config.pick}: {folder} holds no such trial{of}")
+        raise ValueError(
+            f"--pick {config.pick}: {folder} holds no such trial{of}; leave --pick out to view the "
+            "first ones"
+        )
     if others := ", ".join(each for each in found if each != label):
         console.note(f"shown are trials of {label}; --policy selects another of: {others}")
     manner, number = entries[labels.index(label)]

@@ -197,5 +197,5 @@ def use_device(device: str | None) -> None:
     except (RuntimeError, AssertionError):  # which of them is raised depends on the driver
         raise ValueError(
             f"--device {device}: JAX finds none; leave --device out, or install JAX for your GPU: "
-            "pip install 'jax[cuda12]'"
+            "pip install 'diffracing-suite[cuda]'"
         ) from None

@@ -150,7 +150,8 @@ def evaluate(
         )
     console.say(f"written: {out / 'trials.parquet'}, table.md, summary.json")
     if not all(row.success for row in results if not row.policy.endswith("+monitor")):
-        console.say(f"next: suite view {out} --pick failed shows what went wrong")
+        trust = " --trust" * evaluation.trust
+        console.say(f"next: suite view {out} --pick failed{trust} shows what went wrong")
     return {**stamp(1, evaluation.seed), **summary, "out": str(out)}
 
 

@@ -178,7 +178,7 @@ def resolve(options: Config) -> LoopConfig:
         training = with_iterations(training, options.iterations)
     # The simulation's vehicle, and options that contradict each other.
     simulated = load_vehicle(options.vehicle)
-    _check_changes(options.set, policy, options.iterations, hidden)
+    _check_changes(options.set, policy, options.iterations)
     if options.no_delta and not hidden:
         raise ValueError(
             "--no-delta: without --hidden-vehicle the loop needs the Delta Action Model; leave "
@@ -250,13 +250,9 @@ def _digests(vehicle: Vehicle, sensors: SensorSet, true: Vehicle | None) -> dict
     return digests | ({} if true is None else {"hidden_vehicle": digest_of(true)})
 
 
-def _check_changes(
-    changes: Sequence[str], policy: str | None, iterations: int | None, hidden: bool
-) -> None:
+def _check_changes(changes: Sequence[str], policy: str | None, iterations: int | None) -> None:
     """Refuse options of a first training if there is none, and settings that the loop sets."""
     owned = {"seed": "give --seed"}
-    if hidden:
-        owned["quadrotor.vehicle"] = "give --vehicle"
     if policy is None:
         owned["optimizer.iterations"] = "give --iterations"
     else:

@@ -106,7 +106,7 @@ class SensorsConfig:
     seen: SensorSet
     """The sensor models with the values of the sensors file."""
     magnitude: Annotated[tuple[float, float], Range(0.0, 100.0, ordered=True)] = (0.0, 1.0)
-    """Range of the magnitude."""
+    """Range of the magnitude, a factor on the errors of a model."""
     perfect_share: Share = 0.1
     """Share of the worlds with perfect sensors: every magnitude is 0."""
 

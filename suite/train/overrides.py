@@ -13,8 +13,9 @@ import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TypeVar, get_args, get_type_hints
+from typing import TypeVar
 
+from suite.common.options import Setting, settings
 from suite.train.config import Phase, TrainConfig, check
 from tracks.common.names import unknown_name
 from tracks.input.ranges import check_ranges, is_finite, shown
@@ -49,6 +50,9 @@ ABSENT = {
     "sensors": "sensor models; suite train: add --sensors",
 }
 """Part of the settings that may be None -> text of the error if one of its settings is changed."""
+FROM_FILES = {"quadrotor.vehicle": "--vehicle", "sensors.seen": "--sensors"}
+"""Part of the settings that is the content of a file -> the option that names the file. It is not
+changed by `--set`: the camera of a vehicle file, for example, has no effect on a training."""
 PREFIX = "phases."
 """Prefix of a change that begins in a later phase."""
 
@@ -60,10 +64,26 @@ def _changed(config: T, changes: Iterable[str]) -> T:
         if not separator:
             raise ValueError(f"--set {shown(change)}: write FIELD=VALUE, such as loss.progress=0.4")
         keys = path.strip().split(".")
+        for part, option in FROM_FILES.items():
+            if is_within(path.strip(), part):
+                raise ValueError(
+                    f"--set {shown(change)}: {part} comes from a file; give another file with "
+                    f"{option}"
+                )
         _check_model(config, keys, shown(change))
         config = _with_value(config, keys, text.strip(), shown(change))
         check_ranges(config, f"--set {shown(change)}: ")
     return config
+
+
+def settings_to_change(config: TrainConfig) -> list[Setting]:
+    """Return all settings that `--set` changes in `config`, with their values before the phases."""
+    fixed = ("phases", "seed", *ABSENT)
+    return [
+        one
+        for one in settings(config)
+        if one.path not in fixed and not any(is_within(one.path, part) for part in FROM_FILES)
+    ]
 
 
 def _path(change: str) -> str:
@@ -134,12 +154,6 @@ def _with_value(config: T, path: list[str], text: str, change: str) -> T:
     if dataclasses.is_dataclass(old):
         parts = ", ".join(field.name for field in dataclasses.fields(old))
         raise ValueError(f"--set {change}: {name!r} has parts, set one of {parts}")
-    # For a type such as `float | None`: its parts, float and None.
-    allowed_types = get_args(get_type_hints(type(config))[name])
-    if type(None) in allowed_types and text == "None":
-        return dataclasses.replace(config, **{name: None})
-    if old is None and allowed_types and allowed_types[0] in (int, float, str):
-        old = allowed_types[0]()
     return dataclasses.replace(config, **{name: _value(old, text, change)})
 
 

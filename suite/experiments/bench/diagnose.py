@@ -33,7 +33,9 @@ def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = 3) -> Comparis
         WorkFailed: if a package of `mujoco.sysid` is missing.
     """
     if not sysid_baseline.is_installed():
-        raise WorkFailed("mujoco.sysid lacks some of its packages: pip install 'mujoco[sysid]'")
+        raise WorkFailed(
+            "mujoco.sysid lacks some of its packages: pip install 'diffracing-suite[sysid]'"
+        )
     task = sysid_baseline.make_task(seed, duration_s)
     # Measured rotor speeds are the input of the simulation, as for the baseline.
     model = RolloutModel(

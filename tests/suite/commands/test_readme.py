@@ -15,6 +15,7 @@ import functools
 import importlib
 import inspect
 import io
+import json
 import os
 import re
 import shlex
@@ -27,12 +28,14 @@ import pytest
 import suite
 from policies import shipped
 from policies.formats.policy_file import load_policy_checkpoint
+from policies.spec import PolicySpec
 from suite import cli
 from suite.commands.train import resolve
 from suite.common.usage import EXAMPLES
 from suite.train.recipes import named_recipe, with_model
 from suite.train.run import start_params
 from tests.support.judged_cells import cut_short
+from tracks.common.files import plain
 
 ROOT = Path(__file__).resolve().parents[3]
 ARCHIVE = sorted((ROOT / "docs/archive").glob("*.md"))
@@ -195,6 +198,11 @@ def test_the_card_of_the_default_policy_has_rows_of_the_page_of_its_results():
     rows = re.findall(r"^\| race \|(.*)$", card, re.MULTILINE)
     page = (ROOT / "docs/results/table2.md").read_text(encoding="utf-8")
     assert len(rows) == 12 and all(f"| ours |{row}" in page for row in rows)
+
+
+def test_the_page_of_policies_has_every_key_of_the_spec_with_its_default():
+    (text,) = re.findall(r"```json\n(.*?)```", TEXTS[ROOT / "docs/policies.md"], re.DOTALL)
+    assert json.loads(text)["spec"] == plain(PolicySpec())
 
 
 def test_every_page_installs_optional_packages_in_one_way():

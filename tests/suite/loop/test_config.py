@@ -44,7 +44,7 @@ EXAMPLE = "examples/hidden.toml"
         ("--policy race-paper --set optimizer.iterations=5", "give --finetune-iterations"),
         ("--policy race-paper --set spec.rate_hz=30", "sets spec.rate_hz; a policy keeps"),
         ("--policy race-paper --set phases.1.loss.progress=1", "this run has no phases"),
-        ("--hidden-vehicle {0} --set quadrotor.vehicle.mass=0.9", "mass; give --vehicle"),
+        ("--hidden-vehicle {0} --set quadrotor.vehicle.mass=0.9", "another file with --vehicle"),
         ("--policy race-paper --iterations 5", "--iterations is 5, but with --policy, --hidden"),
         ("--hidden-vehicle reference", "nothing is hidden"),
         ("--simulator mjx", "nothing is hidden"),

@@ -1,6 +1,7 @@
 """Recipes and settings by name, phases of a run, and what no training can be made with."""
 
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -10,11 +11,13 @@ from suite.common.console import Console
 from suite.train import losses
 from suite.train.config import Phase, TrainConfig, check
 from suite.train.overrides import (
+    FROM_FILES,
     at_rate,
     check_owned,
     check_phases,
     phase_configs,
     phase_ends,
+    settings_to_change,
     with_changes,
     without_quadrotor,
 )
@@ -57,8 +60,14 @@ def test_settings_that_would_do_nothing_or_that_the_command_sets_itself_are_refu
         with pytest.raises(ValueError, match=r"is of the point mass.*set one of quadrotor\."):
             with_changes(run, [change])
     assert with_changes(run, ["physics.image_delay=2"]).physics.image_delay == 2
-    with pytest.raises(ValueError, match="'0' does not fit, the setting is like None"):
-        with_changes(run, ["quadrotor.vehicle.controller.settings=0"])
+    # The vehicle's camera, for example, has no effect on a training.
+    for part, option in FROM_FILES.items():
+        with pytest.raises(ValueError, match=f"give another file with {option}"):
+            with_changes(run, [f"{part}.camera.pitch_deg=30"])
+    elsewhere = re.compile(r"seed|phases|sensors|quadrotor$|quadrotor\.vehicle")
+    for config in (run, named_recipe("quick")):
+        paths = [setting.path for setting in settings_to_change(config)]
+        assert paths and not list(filter(elsewhere.match, paths))
     run = named_recipe("paper")
     for change, need, given in (
         ("loss.projection_decay=1", "loss.projection", "3"),
