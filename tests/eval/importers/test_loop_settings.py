@@ -9,7 +9,7 @@ from eval.importers import import_log
 from eval.importers.formats import betaflight, px4
 from eval.importers.options import ImportOptions
 from eval.logs.faults.check import CheckContext, check_log
-from eval.logs.faults.vehicle import LOOP
+from eval.logs.faults.vehicle import LOOP, check_controller
 from eval.quadrotor.loops import betaflight as betaflight_loop
 from eval.quadrotor.loops import px4 as px4_loop
 from tests.support import foreign_logs as made
@@ -68,6 +68,12 @@ def test_a_setting_that_changes_within_the_log_is_not_compared(imported):
     log, findings = imported(vehicle, MC_ROLLRATE_P=0.2, THR_MDL_FAC=0.3)
     assert log.about["controller"] == {"kind": "px4", "THR_MDL_FAC": 0.3}
     assert [finding.status for finding in of_loop(findings)] == ["ok"]
+
+
+@pytest.mark.parametrize("value", [10**400, float("nan"), True, "0.2", None])
+def test_metadata_that_are_no_settings_are_ignored(value):
+    logged = {"kind": "px4", "MC_ROLLRATE_P": value, "__class__": 1.0}
+    assert check_controller({"controller": logged}, with_loop()) == []
 
 
 def test_a_loop_of_another_kind_is_a_note(imported):
