@@ -125,8 +125,9 @@ def _flight_windows(
     # Middle of each physics step before a window, as time before its start.
     ages_s = substeps.dt * (np.arange(delay_steps) + 0.5)
     speed = np.full((len(time_s), 4), np.nan) if log.rotor_speed is None else log.rotor_speed
-    # `log.whole` marks the rows with a complete state and command.
-    decision_rows = np.flatnonzero(decides & log.whole)
+    # Rows with a complete state, command and action.
+    whole = log.whole & np.isfinite(action).all(axis=1)
+    decision_rows = np.flatnonzero(decides)
     if len(decision_rows) < 2:
         return []
     burn_in_count = round(BURN_IN_S / decision_period(time_s[decision_rows], row_s))
@@ -138,7 +139,7 @@ def _flight_windows(
         # The rows of the window, with those whose commands are still delayed at its start.
         used = slice(first - rows_before, first + rows + 1)
         is_steady = np.abs(np.diff(time_s[used]) - row_s) < 0.2 * row_s
-        if not (log.whole[used].all() and is_steady.all()):
+        if not (whole[used].all() and is_steady.all()):
             continue
         # The next window starts at the first decision from this time on.
         next_s = time_s[first] + stride_s

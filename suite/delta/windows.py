@@ -111,6 +111,8 @@ def stack_windows(windows: Sequence[T], logs: Sequence[FlightLog], duration_s: f
 def log_decisions(log: FlightLog) -> tuple[np.ndarray, np.ndarray]:
     """Return a log's actions (T, 3) [m/s^2], and (T,) bool: rows in which the policy decided.
 
+    Only rows with a complete state, command and action count.
+
     Raises:
         ValueError: if the log has no actions.
     """
@@ -124,7 +126,7 @@ def log_decisions(log: FlightLog) -> tuple[np.ndarray, np.ndarray]:
             f"{log.name}: columns action_x, action_y, action_z and policy_step are needed to fit "
             "the Delta Action Model; record flights with suite collect"
         )
-    return log.action_b, log.policy_step
+    return log.action_b, log.policy_step & log.whole & np.isfinite(log.action_b).all(axis=1)
 
 
 def decision_period(time_s: np.ndarray, row_s: float) -> float:
@@ -152,7 +154,7 @@ def decision_rate(logs: Sequence[FlightLog]) -> float:
     """
     rates_hz = []
     for log in logs:
-        rows = np.flatnonzero(log_decisions(log)[1] & log.whole)
+        rows = np.flatnonzero(log_decisions(log)[1])
         row_s = float(np.median(np.diff(log.time_s)))
         rates_hz.append(1.0 / decision_period(log.time_s[rows], row_s))
     if np.isnan(rates_hz).all():
@@ -184,8 +186,8 @@ def are_consecutive(gaps_s: np.ndarray, period_s: float, row_s: float) -> np.nda
 
 def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[PointMassWindows]:
     action, decides = log_decisions(log)
-    # Rows with a decision, with all values, and with a next row for the acceleration.
-    rows = np.flatnonzero(decides & log.whole)
+    # Rows with a decision, and with a next row for the acceleration.
+    rows = np.flatnonzero(decides)
     rows = rows[rows + 1 < len(log.time_s)]
     decision_s, rot_w = log.time_s[rows], quat_to_rot(log.quat_wxyz[rows])
     time_to_next = (log.time_s[rows + 1] - decision_s)[:, None]

@@ -170,12 +170,13 @@ def read(path: Path, options: ImportOptions) -> Recording:
 def _controller(box: Blackbox) -> dict[str, float]:
     """Return the header's settings of the rate loop, named as in the vehicle file."""
     found = {field.name: box.settings(field.name, (nan,))[0] for field in fields(Settings)}
-    # From 4.0 to 4.5, D begins at d_min and grows to the D of the header's PID.
+    # From 4.0 to 4.5, D begins at a d_min below the D of the header's PID, and grows to it.
     none = (nan,) * 3
     least_d, forward = box.settings("d_min", (0.0,) * 3), box.settings("ff_weight", none)
     for axis, name in enumerate(("roll", "pitch", "yaw")):
         p, i, d = box.settings(f"{name}PID", none)
-        found |= {f"p_{name}": p, f"i_{name}": i, f"d_{name}": least_d[axis] or d}
+        d = least_d[axis] if 0.0 < least_d[axis] < d else d
+        found |= {f"p_{name}": p, f"i_{name}": i, f"d_{name}": d}
         found[f"f_{name}"] = forward[axis]
     if box.settings("iterm_relax", (1.0,))[0] == 0.0:
         found["iterm_relax_cutoff"] = 0.0

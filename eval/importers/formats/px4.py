@@ -86,7 +86,9 @@ def read(path: Path, options: ImportOptions) -> Recording:
     about: dict[str, Any] = {
         key: str(info[key]) for key in ("sys_name", "ver_hw", "ver_sw") if key in info
     }
-    loop = {field.name: parameters.get(field.name) for field in fields(Settings)}
+    # A setting that changes within the log has more than one value.
+    changing = {name for _, name, value in log.changed_parameters if value != parameters.get(name)}
+    loop = {f.name: parameters.get(f.name) for f in fields(Settings) if f.name not in changing}
     if loop := {name: float(value) for name, value in loop.items() if is_number(value)}:
         about["controller"] = {"kind": "px4", **loop}
     return Recording(

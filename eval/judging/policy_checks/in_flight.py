@@ -58,7 +58,7 @@ class Outputs:
         self._largest = np.fmax(self._largest, guarded.largest)
         self._faults += np.stack([guarded.bad, guarded.limited, guarded.late], axis=-1)
         if self._is_acceleration:
-            climbs = (state[:, UP_B] * state[:, VEL_B]).sum(-1) > 0.0
+            climbs = ~guarded.late & ((state[:, UP_B] * state[:, VEL_B]).sum(-1) > 0.0)
             self._up += climbs * (state[:, UP_B] * guarded.action_b).sum(-1)
 
     def columns(self, slot: int) -> dict[str, Any]:

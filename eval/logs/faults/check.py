@@ -293,17 +293,20 @@ def rows_of(log: FlightLog) -> dict[str, np.ndarray]:
     Missing values of slower signals are interpolated linearly; commands hold their last value.
     """
     columns, rows = columns_from_log(log), {"time": log.time_s}
-    for group, value in signals_of(columns).items():
+    more = {name: (name,) for name in ("throttle", "baro") if _is_number(columns.get(name))}
+    for group, value in signals_of(columns, {**GROUPS, **more}).items():
         if group == "pos":  # its jumps are one fault, which `check_jumps` names
             is_far = jumps_of(log.time_s, value, in_metres=False) > 0.0
             value = np.where(is_far[:, None], np.nan, value)
         if np.isfinite(value).all(axis=1).sum() > LEAST_ROWS:
             fill = _filled_attitude if group == "quat" else _held if group in HELD else filled
-            rows[group] = fill(log.time_s, value)
-    for name in ("throttle", "baro"):
-        if name in columns and np.asarray(columns[name]).dtype.kind in "fiu":
-            rows[name] = np.asarray(columns[name], dtype=np.float64)[:, None]
+            rows[group] = fill(log.time_s, value.astype(np.float64))
     return rows
+
+
+def _is_number(column: np.ndarray | None) -> bool:
+    """Return whether a log has this column, and it has numbers."""
+    return column is not None and np.asarray(column).dtype.kind in "fiu"
 
 
 def filled(time_s: np.ndarray, value: np.ndarray) -> np.ndarray:

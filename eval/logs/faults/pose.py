@@ -294,14 +294,14 @@ def _force_misfits(
 ) -> dict[tuple[str, float], tuple[float, float]]:
     """Return the misfit of the force and its level for each reading (step, unit) of a position.
 
-    The misfit is the share of the force that is not along body z, without drag. The level is what
-    it is relative to: the larger of horizontal acceleration and tilt times gravity [m/s^2]. `axes`
-    (N, 3, 3) are body axes in the world, `path` velocity and acceleration (N, 3) in the given
-    reading.
+    There is none where path and attitude are known together in too few rows. The misfit is the
+    share of the force that is not along body z, without drag. The level is what it is relative to:
+    the larger of horizontal acceleration and tilt times gravity [m/s^2]. `axes` (N, 3, 3) are body
+    axes in the world, `path` velocity and acceleration (N, 3) in the given reading.
     """
     good = np.isfinite(axes).all(axis=(1, 2)) & np.isfinite(path[1]).all(axis=1)
     if good.sum() < 20:
-        return {(pos, length): (0.0, 0.0) for pos in POSITIONS for length in LENGTHS}
+        return {}
     changes = np.stack([axes_matrix(pos or "x,y,z") for pos in POSITIONS])
     acc_size, found = np.linalg.norm(path[1][good], axis=1), {}
     for length in LENGTHS:

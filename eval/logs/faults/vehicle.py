@@ -12,6 +12,7 @@ from eval.effects.interface import GRAVITY
 from eval.logs.faults.finding import Finding
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
+from tracks.input.ranges import is_number
 
 ARM_M = (0.012, 1.5)
 """Usual distance from the centre to a rotor [m]."""
@@ -196,12 +197,14 @@ def check_controller(about: Mapping[str, Any], vehicle: Vehicle | None) -> list[
     if kind != here.kind:
         text = f"the log's is of kind {kind!r}, that of the vehicle file of kind {here.kind!r}"
         return [Finding("note", LOOP, text)]
-    known = {name: getattr(here.settings, name, None) for name in logged}
+    known = vars(here.settings) if here.settings else {}
     pairs = {
-        name: (float(logged[name]), float(value))
-        for name, value in known.items()
-        if value is not None and isinstance(logged[name], int | float)
+        name: (float(value), float(known[name]))
+        for name, value in logged.items()
+        if name in known and is_number(value)
     }
+    if not pairs:
+        return []
     other = {name: pair for name, pair in pairs.items() if not np.isclose(*pair, rtol=1e-4, atol=0)}
     if not other:
         text = f"{len(pairs)} settings of the log are those of the vehicle file"

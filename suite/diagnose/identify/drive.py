@@ -190,7 +190,12 @@ def driven_vehicle(
     """
     if drive != "pwm":
         return DrivenVehicle(vehicle, drive)
-    command = float(np.nanmedian(np.concatenate([f.signals["pwm"].ravel() for f in flights])))
+    commands = [f.signals["pwm"] for f in flights]
+    commands = [
+        values if f.on_ground is None else values[~f.on_ground]
+        for f, values in zip(flights, commands, strict=True)
+    ]
+    command = float(np.nanmedian(np.concatenate(commands)))
     volts = [f.signals["voltage"] for f in flights if f.has("voltage")]
     exponent = 1.0 if volts else 0.0
     motors = vehicle.motors or MotorMap((0.0, vehicle.rotors.thrust_max), 1.0, exponent)

@@ -14,10 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from eval.effects.interface import GRAVITY
 from eval.importers.rows import held
 from eval.importers.signals import Signal
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import Motion
+from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.flights import leaning, turning_of
 from suite.diagnose.data.inertial import InertialLog, specific_force_w
 from suite.diagnose.data.noise import noise_like
@@ -27,9 +29,10 @@ from suite.diagnose.data.sampling import (
     attitude_at,
     in_hole,
     interpolate,
+    on_every_row,
     own_spacing_s,
 )
-from suite.diagnose.data.view import FlightRows, WeakForm, weak_form
+from suite.diagnose.data.view import FlightRows, WeakForm, near_ground, weak_form
 from tracks.geometry.rotation import rot_to_quat
 
 STEP_S = 0.004
@@ -62,6 +65,8 @@ class FlightGrid(NamedTuple):
     """Signals of which each row has only some columns, such as motors that are read in turn."""
     rotor_spacing_s: float = 0.0
     """Time between the measured rotor speeds [s]; 0 without any."""
+    on_ground: np.ndarray | None = None
+    """(G,) bool, whether the vehicle is on the ground or near it in time; None: never."""
 
     def has(self, *names: str) -> bool:
         """Return whether the flight has all of these signals."""
@@ -71,9 +76,11 @@ class FlightGrid(NamedTuple):
         """Return the weights of the windows of `width_s` with all signals of `needs`.
 
         For `slope` see `weak_form`. No window begins in the first `MEMORY_S`, where commands from
-        before the first row still act.
+        before the first row still act, and none is on the ground.
         """
         good = self.time_s >= MEMORY_S
+        if self.on_ground is not None:
+            good &= ~self.on_ground
         for name in needs:
             values = self.signals[name]
             good &= np.isfinite(values.reshape(len(values), -1)).all(axis=1)
@@ -135,6 +142,29 @@ def grid_of(log: FlightLog) -> FlightGrid:
         signals["voltage"] = uniform_filter1d(volts, VOLTAGE_STEPS, mode="nearest")
     spacing_s = own_spacing_s(time_s, logged["rotor_speed"]) if "rotor_speed" in logged else 0.0
     return FlightGrid(log.name, grid_s, signals, in_turn, spacing_s)
+
+
+def with_ground(
+    flight: FlightGrid, log: FlightLog, vehicle: Vehicle, drive_signal: str
+) -> FlightGrid:
+    """Return `flight`, the grid of `log`, with the times at which `vehicle` is on the ground.
+
+    The thrust is that of `drive_signal`, relative to its usual size in flight: the thrust by the
+    vehicle file may be wrong.
+    """
+    state = on_every_row(log)
+    signal = np.asarray(getattr(state, drive_signal)).reshape(len(log.time_s), -1)
+    effort = (signal**2 if drive_signal == "rotor_speed" else signal).sum(axis=1)
+    known = effort[np.isfinite(effort)]
+    usual = np.median(known[known >= 0.5 * np.quantile(known, 0.95)]) if len(known) else 0.0
+    if not usual > 0.0:
+        return flight
+    # Rotor speeds that give this share of the weight.
+    thrust = effort / usual * vehicle.mass * GRAVITY / 4.0
+    speed = np.sqrt(np.maximum(thrust, 0.0) / vehicle.rotors.thrust_coefficient)
+    near = near_ground(state, vehicle, np.repeat(speed[:, None], 4, axis=1))
+    row = np.searchsorted(log.time_s - log.time_s[0], flight.time_s, side="right") - 1
+    return flight._replace(on_ground=near[row])
 
 
 def _enough(values: np.ndarray) -> bool:

@@ -30,6 +30,7 @@ from suite.diagnose.identify.body import (
     torque_unknowns,
 )
 from suite.diagnose.identify.drive import (
+    DRIVES,
     KNOWN_MOTORS,
     common_drive,
     driven_vehicle,
@@ -38,7 +39,7 @@ from suite.diagnose.identify.drive import (
 from suite.diagnose.identify.entries import entries_of, with_entries, with_reachable_speed
 from suite.diagnose.identify.fit import NONE_KNOWN, Fitted, NoWholeWindow, Unknown
 from suite.diagnose.identify.flapping import flapping_of, perturbed_vehicles
-from suite.diagnose.identify.grid import FlightGrid, grid_of
+from suite.diagnose.identify.grid import FlightGrid, grid_of, with_ground
 from suite.diagnose.identify.loop import fit_commanded, loop_rates, loop_unknowns, rotor_speeds
 from suite.diagnose.identify.numbers import (
     Number,
@@ -95,9 +96,13 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
     """
     # Run the fits. With motor commands the loop comes last and may use the lag of the torque fit,
     # which is better than its own. Otherwise it comes first: the others use its lag.
-    true_logs = [true_log(log, vehicle.effects) for log in logs]
-    flights = [grid_of(log) for log in posed(true_logs)]
-    drive = common_drive(flights)
+    posed_logs = posed([true_log(log, vehicle.effects) for log in logs])
+    grids = [grid_of(log) for log in posed_logs]
+    drive = common_drive(grids)
+    flights = [
+        with_ground(flight, log, vehicle, DRIVES[drive][0])
+        for flight, log in zip(grids, posed_logs, strict=True)
+    ]
     fits = _Fits(flights, with_merged_effects(vehicle, drive in KNOWN_MOTORS), drive, tuple(leave))
     if drive != "pwm":
         fits.fit_loop()

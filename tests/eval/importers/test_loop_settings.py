@@ -9,7 +9,7 @@ from eval.importers import import_log
 from eval.importers.formats import betaflight, px4
 from eval.importers.options import ImportOptions
 from eval.logs.faults.check import CheckContext, check_log
-from eval.logs.faults.vehicle import LOOP
+from eval.logs.faults.vehicle import LOOP, check_controller
 from eval.quadrotor.loops import betaflight as betaflight_loop
 from eval.quadrotor.loops import px4 as px4_loop
 from tests.support import foreign_logs as made
@@ -25,16 +25,22 @@ def with_loop(**settings):
 
 @pytest.fixture
 def imported(tmp_path, monkeypatch):
-    """Import a ULog file with the parameters LOGGED by a vehicle file."""
-    path, load = made.write_ulog(tmp_path / "log.ulg", span=(0, 4)), px4._load
+    """Import a ULog file by a vehicle file, with the parameters LOGGED, and changes of them."""
+    path, load, changes = made.write_ulog(tmp_path / "log.ulg", span=(0, 4)), px4._load, {}
 
     def loaded(path):
         log = load(path)
         log.initial_parameters.update(LOGGED)
+        log.changed_parameters.extend((5_000_000, *each) for each in changes.items())
         return log
 
     monkeypatch.setattr(px4, "_load", loaded)
-    return lambda vehicle: import_log(path, None, ImportOptions(vehicle=vehicle))
+
+    def run(vehicle, **changed):
+        changes.update(changed)
+        return import_log(path, None, ImportOptions(vehicle=vehicle))
+
+    return run
 
 
 def of_loop(findings):
@@ -55,6 +61,19 @@ def test_another_setting_than_the_logs_is_a_doubt_until_the_vehicle_file_has_it(
     corrected = with_loop(MC_ROLLRATE_P=0.12, THR_MDL_FAC=0.3)
     (right,) = of_loop(check_log(log, CheckContext(corrected))[0])
     assert right.status == "ok"
+
+
+def test_a_setting_that_changes_within_the_log_is_not_compared(imported):
+    vehicle = with_loop(MC_ROLLRATE_P=0.2, THR_MDL_FAC=0.3)
+    log, findings = imported(vehicle, MC_ROLLRATE_P=0.2, THR_MDL_FAC=0.3)
+    assert log.about["controller"] == {"kind": "px4", "THR_MDL_FAC": 0.3}
+    assert [finding.status for finding in of_loop(findings)] == ["ok"]
+
+
+@pytest.mark.parametrize("value", [10**400, float("nan"), True, "0.2", None])
+def test_metadata_that_are_no_settings_are_ignored(value):
+    logged = {"kind": "px4", "MC_ROLLRATE_P": value, "__class__": 1.0}
+    assert check_controller({"controller": logged}, with_loop()) == []
 
 
 def test_a_loop_of_another_kind_is_a_note(imported):
@@ -85,6 +104,9 @@ def test_settings_of_betaflights_header_have_the_names_of_the_vehicle_file():
     assert found == {name: getattr(default, name) for name in found}
     box.header |= {"d_min": [0, 0, 0], "iterm_relax": 0}  # without D min, D is the header's
     assert betaflight._controller(box)["d_roll"] == 40.0
+    box.header["d_min"] = [50, 34, 0]  # not below D: without effect
+    found = betaflight._controller(box)
+    assert (found["d_roll"], found["d_pitch"], found["d_yaw"]) == (40.0, 34.0, 0.0)
     assert betaflight._controller(box)["iterm_relax_cutoff"] == 0.0
     box.header = {}
     assert not betaflight._controller(box)

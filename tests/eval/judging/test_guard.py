@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from eval.judging import monitor
 from eval.judging.guard import ActionLimits, guard_action
 from eval.judging.judge import Record
+from eval.judging.policy_checks.in_flight import Outputs
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules
 from policies.observation import encode_depth
@@ -48,6 +49,12 @@ def test_late_answers_are_not_flown():
     late = guard_action(limits, action, last, 0.02, "p")
     assert (late.action_b == last).all() and late.late.all() and not late.bad.any()
     assert not guard_action(limits, action, last, 0.005, "p").late.any()
+    # The mean upward action is over the answers that came in time.
+    outputs, climbing = Outputs(2, limits.action), np.tile([0.0, 0.0, 1.0], (2, 4))
+    outputs.add(guard_action(limits, last, last, 0.0, "p"), climbing)
+    in_time = outputs.columns(0)["action_up"]
+    outputs.add(late, climbing)
+    assert outputs.columns(0)["action_up"] == in_time != 0.0
 
 
 @pytest.mark.parametrize(

@@ -77,6 +77,20 @@ def test_windows_begin_a_stride_apart_and_leave_out_gaps_and_what_is_missing():
     assert len(both.pos_w) == len(alone.pos_w), "a single decision makes no window"
 
 
+@pytest.mark.parametrize("cut", ["point mass", "quadrotor"])
+def test_windows_with_a_missing_action_are_left_out(cut, logs):
+    def windows(log):
+        if cut == "point mass":
+            return module.cut_windows([log], 0.5, 0.1)
+        return cut_quadrotor_windows([log], QuadrotorConfig(TRUE), 0.5, 0.1)[0]
+
+    log, lost = logs[0], np.asarray(logs[0].extra["action_x"]).copy()
+    lost[np.flatnonzero(log.policy_step)[len(lost) // 20]] = np.nan
+    some = windows(replace(log, extra={**log.extra, "action_x": lost}))
+    assert 0 < len(some.pos_w) < len(windows(log).pos_w)
+    assert np.isfinite(some.action_b).all() and np.isfinite(some.burn_in.inputs).all()
+
+
 def test_windows_of_unlike_rates_are_cut_to_what_all_have():
     """A log of every other decision has half as many in a window, and in what came before it."""
     (log,) = flight()

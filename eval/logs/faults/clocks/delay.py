@@ -135,11 +135,7 @@ def check_clock(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding]:
     """
     if not {"quat", "rate"} <= rows.keys():
         return []
-    known_signals = []
-    for name in ("quat", "rate"):
-        known = np.isfinite(rows[name]).all(axis=1)
-        known_signals += [rows["time"][known], rows[name][known]]
-    late = delay_of(*known_signals)
+    late = delay_of(rows["time"], rows["quat"], rows["time"], rows["rate"])
     if late is None:
         text = "the flight turns too little to hold its clocks against each other"
         return unseen("pose clock", text, "clock_offset", "clock_drift")
@@ -230,9 +226,16 @@ def delay_of(
 ) -> Late | None:
     """Return the delay of the attitude `quat` (N, 4) against the gyro `rate` (M, 3).
 
-    The result is None where the flight is too short or the body rates are too small, or where the
-    best delay is the largest that is tried.
+    Samples with a NaN are not used. The result is None where the flight is too short or the body
+    rates are too small, or where the best delay is the largest that is tried.
     """
+    known, turned = (np.isfinite(value).all(axis=1) for value in (quat, rate))
+    quat_time, quat, rate_time, rate = (
+        quat_time[known],
+        quat[known],
+        rate_time[turned],
+        rate[turned],
+    )
     turns = smooth(quat_time, turns_of(quat_time, quat), SPAN_S)
     known = np.isfinite(turns).all(axis=1)
     gyro = smooth(rate_time, rate, 2.0 * SPAN_S)

@@ -76,9 +76,15 @@ class Drive(NamedTuple):
         share = 4.0 if self.command.shape[1] == 1 else 1.0
         return share * np.asarray(motor_thrust(motors, self.command, volts))
 
+    @property
+    def at_limit(self) -> np.ndarray:
+        """(T, C) bool, whether a command is at a limit, as on the ground."""
+        return (self.command < USED[0]) | (self.command > USED[1])
+
     def command_quantile(self, share: float) -> float:
-        """Return a quantile of the commands."""
-        return float(np.quantile(self.command[np.isfinite(self.command)], share))
+        """Return a quantile of the commands that the fit uses."""
+        used = np.isfinite(self.command) & ~self.at_limit
+        return float(np.quantile(self.command[used], share))
 
     @property
     def exponent(self) -> float:
@@ -316,7 +322,7 @@ def _averaged(drive: Drive, motors: MotorMap | None, measured: np.ndarray) -> np
     `fit_force`, so the file's total is averaged twice as well.
     """
     time_s, thrust = drive.time_s, drive.thrust(motors, drive.volts)
-    at_limit = (drive.command < USED[0]) | (drive.command > USED[1])
+    at_limit = drive.at_limit
     if measured.shape[1] > 1:
         return smooth_columns(time_s, np.where(at_limit, np.nan, thrust))
     total = np.where(at_limit.any(axis=1), np.nan, thrust.sum(axis=1))

@@ -15,7 +15,7 @@ from eval.importers.frames import conjugate, rotate
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import WIDTH_S, Rows
 from eval.logs.faults.reading import option
-from eval.logs.faults.relation import forward_mean, rms, smooth, within
+from eval.logs.faults.relation import forward_mean, rms, shift_rows, smooth, within
 from eval.logs.velocity import HALF_WINDOW_S, velocity_from_position
 from eval.vehicles.vehicle import Vehicle, motor_thrust
 
@@ -205,7 +205,7 @@ def _delayed_torques(
         return torques
     mean, turning, mixer = torques
     step = float(np.median(np.diff(rows["time"])))
-    delayed_means = [np.roll(mean, round(lag / step), axis=0) for lag in LAGS_S]
+    delayed_means = [shift_rows(mean, round(lag / step)) for lag in LAGS_S]
     mean = max(delayed_means, key=lambda one: float(np.sum(_correlations(one, turning) ** 2)))
     return mean, turning, mixer
 

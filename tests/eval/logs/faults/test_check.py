@@ -144,6 +144,17 @@ def test_a_barometer_without_samples_around_the_start_is_not_checked(lost):
     assert not check_barometer(rows)
 
 
+def test_a_throttle_that_begins_late_does_not_start_the_motors():
+    log, rng = fly(PLAIN, 0, duration_s=3.0), np.random.default_rng(0)
+    throttle = np.where(np.arange(301) % 3 == 1, 0.4 + 0.02 * rng.normal(size=301), np.nan)
+    sinking = {"throttle": throttle, "baro": log.pos_w[:, 2] - 5.0 * log.time_s}
+    rows = rows_of(replace(log, extra=sinking))
+    assert np.isnan(rows["throttle"][:, 0]).tolist() == [True] + [False] * 300
+    (finding,) = check_barometer(rows)
+    assert finding.status == "not identifiable" and "no row before" in finding.evidence
+    assert "throttle" not in rows_of(replace(log, extra={"throttle": np.full(301, np.nan)}))
+
+
 def test_a_long_pause_of_the_rows_has_a_note():
     log = fly(PLAIN, 0, duration_s=3.0)
     for pause_s, notes in ((4.0, 0), (60.0, 1)):

@@ -304,6 +304,12 @@ def test_the_fault_is_named_and_the_fix_is_the_map_that_was_flown(by, changes, f
         assert gives == pytest.approx([1.5 * u + 4.0 * u**2 for u in (0.4, 0.55)], rel=0.06)
 
 
+def test_a_long_time_on_the_ground_does_not_hide_a_wrong_map():
+    rows, vehicle = flown(), with_motors(thrust=(6.0, 0.0))
+    rows |= {name: rows[name] * (rows["time"] > 22.0)[:, None] for name in ("pwm", "motor")}
+    assert [finding.fault for finding in found(rows, vehicle)] == ["motor_map"]
+
+
 @pytest.mark.parametrize("factor", [0.25, 0.5, 2.0, 4.0])
 def test_a_voltage_far_from_the_nominal_one_of_the_motors_is_in_doubt(factor):
     rows, vehicle = flown(), with_motors()

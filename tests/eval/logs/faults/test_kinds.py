@@ -25,6 +25,7 @@ from eval.logs.faults.clocks.delay import OF_POSE, check_clock, delay_of
 from eval.logs.faults.drive import commands
 from eval.logs.faults.drive.commands import check_controller_rate
 from eval.logs.faults.drive.rate_following import delayed
+from eval.logs.faults.pose import check_pose
 from eval.logs.faults.position import check_height
 from eval.logs.faults.reading import parse_readings, read_rows
 from eval.logs.flight_log import read_flight
@@ -282,6 +283,14 @@ def test_a_force_that_is_unrelated_to_the_path_does_not_show_the_sign_of_z():
         (finding,) = check_height(rows)
         count += finding.status != "not identifiable"
     assert count <= 1
+
+
+def test_a_position_in_few_rows_does_not_confirm_a_wrong_attitude():
+    rows = good(end=60.0)
+    rows["quat"], rows["pos"][120:] = np.roll(rows["quat"], 700, axis=0), np.nan
+    alone = {name: value for name, value in rows.items() if name != "pos"}
+    for (found,) in map(check_pose, (rows, alone)):
+        assert found.status == "doubt" and found.evidence.startswith("its turns are off")
 
 
 def test_a_calm_flight_says_what_it_does_not_show():

@@ -62,6 +62,15 @@ def test_set_points_and_late_signals_are_the_only_finding(log, names, late_s, fa
     assert abs(found.size) == pytest.approx(abs(late_s), abs=0.005)
 
 
+@pytest.mark.parametrize("name", ["quat_wxyz", "rate_b"])
+def test_rows_without_a_value_do_not_hide_that_the_attitude_is_a_set_point(log, name):
+    early = shifted(log, -0.1, ("quat_wxyz",))
+    values = getattr(early, name).copy()
+    values[:30] = np.nan
+    (found,), _ = findings(replace(early, **{name: values}))
+    assert found.fault == "attitude" and found.size == pytest.approx(0.1, abs=0.005)
+
+
 def test_a_late_pose_is_no_fault_if_the_vehicle_file_states_the_delay(log):
     late, stated = shifted(log, 0.1, ("pos_w", "vel_w", "quat_wxyz")), []
     for flight, offset_s in ((late, 0.1), (late, 0.03), (log, 0.1)):

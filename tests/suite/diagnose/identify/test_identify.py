@@ -9,7 +9,7 @@ from scipy.stats import binom
 from suite.diagnose.identify.identify import identify
 from suite.diagnose.identify.numbers import numbers_json
 from tests.support import identified as known
-from tests.support.broken_logs import changed
+from tests.support.broken_logs import changed, on_the_ground
 from tests.support.diagnosis_flights import fly_all
 from tests.support.tools import program
 from tests.support.vehicles import PLAIN, with_effects
@@ -109,6 +109,17 @@ def test_an_inertia_that_is_ten_times_too_large_is_identified():
     found = identify(known.logs("rotors", 0)[3:], begun, leave=("drag", "motors", "lag", "loop"))
     for moment, true in list(zip(found.vehicle.inertia, TRUE["inertia"], strict=True))[:2]:
         assert moment == pytest.approx(true, rel=0.1)
+
+
+@pytest.mark.parametrize("drive", ["rotors", "pwm"])
+def test_time_on_the_ground_does_not_count(drive):
+    (log, *_), leave = known.logs(drive, 0), (*TURNING, "drag")
+    resting = on_the_ground(log, log.duration_s, 3.0)  # for most of the log
+    flies = resting.vel_w.any(axis=1)
+    resting = changed(resting, pwm=lambda values: values * flies[:, None])
+    alone, found = (identify([one], known.start(), leave) for one in (log, resting))
+    assert near_truth(found) == near_truth(alone) and not found.notes
+    assert found.residual_rms["force"] == pytest.approx(alone.residual_rms["force"], rel=0.2)
 
 
 def without(logs, *fields):
