@@ -88,7 +88,8 @@ def observe(
     """
     rot_w = view.rot_w
     vel_b, gate_b = to_local(rot_w, view.vel_w), to_local(rot_w, view.gate_w - view.pos_w)
-    numbers, xp = [vel_b, rot_w[..., 2, :], gate_b, last_action_b], rot_w.__array_namespace__()
+    numbers = [vel_b, rot_w[..., 2, :], gate_b, last_action_b]
+    xp = rot_w.__array_namespace__()
     for key in (key for key in EXTRAS if getattr(spec, key)):
         if key == "speed_input":
             speed_input = xp.full_like(vel_b[..., 0], spec.speed) if speed is None else speed
