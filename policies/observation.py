@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from policies.spec import DepthEncoding, PolicySpec
+from policies.spec import EXTRAS, DepthEncoding, PolicySpec
 from tracks.geometry.rotation import to_local
 from tracks.geometry.scene import Array, Gates
 
@@ -89,11 +89,13 @@ def observe(
     rot_w = view.rot_w
     vel_b, gate_b = to_local(rot_w, view.vel_w), to_local(rot_w, view.gate_w - view.pos_w)
     numbers = [vel_b, rot_w[..., 2, :], gate_b, last_action_b]
-    numbers += [vector(view) for key, vector in EXTRA_VECTORS.items() if getattr(spec, key)]
     xp = rot_w.__array_namespace__()
-    if spec.speed_input:
-        speed_input = xp.full_like(vel_b[..., 0], spec.speed) if speed is None else speed
-        numbers.append(speed_input[..., None])
+    for key in (key for key in EXTRAS if getattr(spec, key)):
+        if key == "speed_input":
+            speed_input = xp.full_like(vel_b[..., 0], spec.speed) if speed is None else speed
+            numbers.append(speed_input[..., None])
+        else:
+            numbers.append(EXTRA_VECTORS[key](view))
     state = xp.concatenate(numbers, axis=-1)
     if view.depth_m is None:
         return Observation(state, None)

@@ -129,6 +129,7 @@ GROUND_EFFECT = Effect(
             typical=(0.03, 0.1),
             required=False,
             fitted=False,
+            whole=True,
         ),
     ),
     thrust=ground_effect_thrust,

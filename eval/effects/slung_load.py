@@ -115,7 +115,7 @@ SLUNG_LOAD = Effect(
             high=lambda vehicle: vehicle.mass,
             typical=(0.02, 0.1),
         ),
-        Parameter("length", "m", neutral=0.5, low=0.05, high=20.0, typical=(0.3, 1.0)),
+        Parameter("length", "m", neutral=0.5, low=0.05, high=20.0, typical=(0.3, 1.0), whole=True),
     ),
     force=force_of,
     start=start_of,

@@ -81,7 +81,9 @@ GUSTS = Effect(
     values=Gusts,
     parameters=(
         Parameter("intensity", "m/s", neutral=0.0, low=0.0, high=10.0, typical=(0.5, 2.0)),
-        Parameter("length", "m", neutral=5.0, low=0.1, high=1000.0, typical=(2.0, 10.0)),
+        Parameter(
+            "length", "m", neutral=5.0, low=0.1, high=1000.0, typical=(2.0, 10.0), whole=True
+        ),
     ),
     wind=gusts_wind,
     gust=gusts_start,

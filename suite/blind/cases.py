@@ -14,6 +14,7 @@ import numpy as np
 from eval.effects import EFFECTS, nameable_effects
 from eval.flights.simulate import SENSORS
 from eval.worlds.rotorpy_vehicle import ROTORPY_EFFECTS
+from suite.blind.continuous.quadrotor import SUPPORTED
 from suite.blind.oracle import vehicle_names
 from suite.blind.outside import KINDS
 from suite.diagnose.plan import SEPARATIONS
@@ -80,7 +81,7 @@ def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:
     for number, kind in enumerate(FULL_COUNTS):
         for index in range(counts[kind]):
             case_seed = (seed, 20_000 + 1_000 * number + index)
-            cases.append(_draw_case(rng, kind, index, case_seed))
+            cases.append(_draw_case(rng, kind, index, case_seed, nameable_effects()))
     return _by_name([cases[index] for index in rng.permutation(len(cases))])
 
 
@@ -114,12 +115,14 @@ def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
 def draw_continuous_cases(seed: int, count: int | None = None) -> dict[str, Case]:
     """Return the continuous-time set.
 
-    It has each single effect once at most, half of them at each of `MULTIPLES`. Arguments and
-    errors are those of `draw_cases`.
+    It has each single effect once at most, half of them at each of `MULTIPLES`. The effects are
+    those that the engine has equations for and a diagnosis may name. Arguments and errors are those
+    of `draw_cases`.
     """
     counts = _counts(count, CONTINUOUS_COUNTS)
     rng = np.random.default_rng([seed, 2])
-    singles = rng.permutation(nameable_effects())
+    effects = [name for name in nameable_effects() if name in SUPPORTED]
+    singles = rng.permutation(effects)
     others = rng.permutation([kind for kind in KINDS if kind != EXCLUDED])
     cases = []
     for number, kind in enumerate(CONTINUOUS_COUNTS):
@@ -130,7 +133,7 @@ def draw_continuous_cases(seed: int, count: int | None = None) -> dict[str, Case
                 hidden = (str(singles[index]),)
                 case = Case(kind, hidden, multiple, *_draw_equipment(rng, hidden), case_seed)
             else:
-                case = _draw_case(rng, kind, index, case_seed)
+                case = _draw_case(rng, kind, index, case_seed, effects)
             if kind == "outside":
                 case = replace(case, hidden=(str(others[index]),))
             cases.append(replace(case, simulator=CONTINUOUS))
@@ -158,15 +161,23 @@ def _by_name(cases: Sequence[Case]) -> dict[str, Case]:
     return {f"case_{number:03d}": case for number, case in enumerate(cases, 1)}
 
 
-def _draw_case(rng: np.random.Generator, kind: str, index: int, case_seed: tuple[int, int]) -> Case:
-    """Return case number `index` of a `kind` other than `single`, on MuJoCo."""
+def _draw_case(
+    rng: np.random.Generator,
+    kind: str,
+    index: int,
+    case_seed: tuple[int, int],
+    effects: Sequence[str],
+) -> Case:
+    """Return case number `index` of a `kind` other than `single`, on MuJoCo.
+
+    A pair is one of `effects`.
+    """
     seed = case_seed[0]
     if kind == "outside":
         name, equipment = list(KINDS)[index % len(KINDS)], _draw_equipment(rng, ())
         return Case(kind, (name,), float(rng.choice([3.0, 6.0])), *equipment, case_seed)
     if kind == "pair":
-        names = nameable_effects()
-        pool = [name for name in names if not (EFFECTS[name].random or EFFECTS[name].slow)]
+        pool = [name for name in effects if not (EFFECTS[name].random or EFFECTS[name].slow)]
         pair = tuple(pool[i] for i in rng.choice(len(pool), 2, replace=False))
         return Case(kind, pair, MULTIPLES[1], *_draw_equipment(rng, pair), case_seed)
     if kind in ("blurred", "separated"):

@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from policies import observation
 from policies.block_policy import BlockPolicy, for_one_row, verify_rows
 from policies.formats import torch_file
 from policies.observation import View, observe, view_of
@@ -50,6 +51,14 @@ def test_how_fast_to_fly_comes_last_as_the_spec_or_each_row_says():
     np.testing.assert_array_equal(own[:, 15], 0.3)
     observed = observe(spec, view, zero, np.array([0.0, 0.9])).state
     np.testing.assert_array_equal(observed[:, 15], [0.0, 0.9])
+
+
+def test_what_is_added_is_in_the_order_of_the_spec_as_in_the_contract(monkeypatch):
+    monkeypatch.setattr(observation, "EXTRAS", {"speed_input": 1, "gate_axis": 3})
+    zero, ahead = np.zeros(3), np.array([1.0, 0.0, 0.0])
+    view = View(zero, np.eye(3), zero, zero, zero, ahead, ahead)
+    spec = PolicySpec(gate_axis=True, speed_input=True, speed=0.3)
+    np.testing.assert_array_equal(observe(spec, view, zero).state[12:], [0.3, 1.0, 0.0, 0.0])
 
 
 def test_the_papers_twelve_numbers():

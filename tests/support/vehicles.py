@@ -62,7 +62,7 @@ def drawn_effects(rng, vehicle=PLAIN):
             low = parameter.low(vehicle) if callable(parameter.low) else parameter.low
             size = rng.uniform(*parameter.typical, size=parameter.size or None)
             sign = rng.choice([-1.0, 1.0], size=parameter.size or None) if low < base else 1.0
-            value = size if parameter.name in ("length", "rotor_radius") else base + sign * size
+            value = size if parameter.whole else base + sign * size
             values.append(tuple(value.tolist()) if parameter.size else float(value))
         drawn[name] = tuple(values)
     return with_effects(vehicle, **drawn)

@@ -23,6 +23,8 @@ CONSTANTS = (
 """Effects that change a constant of the vehicle or its environment."""
 LOG_FAULTS = ("lever_arm", "attitude_offset", "gyro_bias", "accelerometer_bias", "clock_offset")
 """Effects that change only the log."""
+SUPPORTED = frozenset((*CONSTANTS, *LOG_FAULTS, *THRUSTS, *FORCES, *TORQUES, *WINDS))
+"""Effects that have an equation in this engine."""
 
 
 class NominalConstants(NamedTuple):
@@ -80,12 +82,11 @@ def quadrotor_of(vehicle: Vehicle) -> Quadrotor:
         ValueError: for an effect without an equation in this engine.
     """
     effects = dict(vehicle.effects)
-    supported = {*CONSTANTS, *LOG_FAULTS, *THRUSTS, *FORCES, *TORQUES, *WINDS}
     for name in effects:
-        if name not in supported:
+        if name not in SUPPORTED:
             raise ValueError(
                 f"effects.{name}: the continuous engine has no equation for it; allowed: "
-                f"{', '.join(sorted(supported))}"
+                f"{', '.join(sorted(SUPPORTED))}"
             )
 
     def value(effect: str, parameter: str, default: Any) -> Any:

@@ -20,6 +20,7 @@ from suite.blind.continuous.timing import draw_conditions
 from suite.blind.outside import KINDS as OUTSIDE
 from suite.blind.outside import changed_values, draw_change
 from tests.support.blind import SINGLE
+from tests.support.faults import IMU_FAULT, with_imu_fault
 from tests.support.ways import BARE, bare_flights
 from tracks.common.files import plain
 
@@ -47,6 +48,12 @@ def test_the_continuous_set_has_its_numbers_and_each_single_effect_once():
     assert Counter(case.multiple for case in singles) == {m: 11 for m in MULTIPLES}
     assert {case.simulator for case in cases.values()} == {"continuous"}
     assert not any("hysteresis" in case.hidden for case in cases.values())
+
+
+def test_the_continuous_set_hides_no_effect_that_its_engine_lacks(monkeypatch):
+    cases = draw_continuous_cases(3)
+    with_imu_fault(monkeypatch)
+    assert IMU_FAULT.name in nameable_effects() and draw_continuous_cases(3) == cases
 
 
 @pytest.mark.parametrize("simulator", DRAWERS)

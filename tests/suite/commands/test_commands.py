@@ -67,6 +67,12 @@ def test_effects_command_lists_and_describes(capfd):
     assert effects["linear_drag"]["parameters"]["coefficient"]["unit"] == "1/s"
     assert run("effects linear_drag") == 0
     assert "coefficient x 3 [1/s]" in capfd.readouterr().out
+    # A scale varies about 1; a length has no neutral value to vary about.
+    assert run("effects thrust_scale") == 0
+    assert "usually 0.05 to 0.15 away from 1;" in capfd.readouterr().out
+    for effect, usual in (("gusts", "2 to 10"), ("slung_load", "0.3 to 1")):
+        assert run(f"effects {effect}") == 0
+        assert f"length [m]: usually {usual}; allowed" in capfd.readouterr().out
     assert "Did you mean 'linear_drag'?" in refused(capfd, "effects linear_darg")
 
 

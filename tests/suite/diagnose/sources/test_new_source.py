@@ -164,6 +164,16 @@ def test_a_random_wind_that_the_file_has_is_not_named_again(monkeypatch, own, la
     assert kept == (0.8 if label == "named" else 0.85)
 
 
+@pytest.mark.parametrize(("size", "views"), [(0.8, ["air"]), (0.0, ["air", "water"])])
+def test_no_gap_lists_all_views_that_were_examined(monkeypatch, size, views):
+    (air,) = sources(size).sources
+    (water,) = sources(0.0).sources
+    given = SourceSet((air, replace(water, name="water")), ("flight 4",), "the weather")
+    monkeypatch.setitem(SOURCES, "air", lambda _: given)
+    found = diagnosis_json(diagnose([], PLAIN, by="air"))
+    assert (found["verdict"], found["views"]) == ("named" if size else "no_gap", views)
+
+
 @pytest.mark.parametrize(("size", "label"), [(0.8, "named"), (0.0, "no_gap")])
 def test_a_new_source_goes_through_the_whole_diagnosis(monkeypatch, size, label):
     monkeypatch.setitem(SOURCES, "air", lambda given: sources(size))
