@@ -150,7 +150,7 @@ def parse_sensors(table: Mapping[str, Any]) -> SensorSet:
                 raise entry.error("kind", sensor.name, "each model once")
             values_of[sensor.name] = _values(sensor, entry)
     models = {name: values_of[name] for name in SENSORS if name in values_of}
-    return SensorSet(top.text("name"), MappingProxyType(models))
+    return SensorSet(top.text("name", "custom"), MappingProxyType(models))
 
 
 def _values(sensor: Sensor, table: Table) -> Any:

@@ -45,6 +45,13 @@ def test_what_cannot_be_is_refused_by_name(text, words, tmp_path):
     assert str(path) in str(error.value)
 
 
+def test_a_file_needs_no_name(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(f"schema = 1\n{STEREO}noise = 0.1\n")
+    sensors = sensors_file.load_sensors(path)
+    assert sensors == sensors_file.sensor_set({"stereo": {"noise": 0.1}}, name="custom")
+
+
 def test_unknown_names_say_what_there_is():
     with pytest.raises(ValueError, match="unknown sensors .or file. 'vioo'. Did you mean 'vio'"):
         sensors_file.load_sensors("vioo")
