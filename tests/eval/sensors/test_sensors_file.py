@@ -3,6 +3,7 @@
 import pytest
 
 from eval.sensors import SENSORS, sensors_file
+from tracks.common.provenance import stamp, stamp_text
 
 STEREO = '[[depth]]\nkind = "stereo"\n'
 
@@ -13,6 +14,7 @@ def test_a_shipped_file_reads_back_equal_and_grows_within_its_limits(name, tmp_p
     assert sensors.name == name
     sensors_file.save_sensors(sensors, tmp_path / "again.toml", "a comment\x1b")
     assert sensors_file.load_sensors(tmp_path / "again.toml") == sensors
+    assert f"# {stamp_text(stamp(1, None))}\n" in (tmp_path / "again.toml").read_text()
     assert sensors_file.scale_sensors(sensors, 0.0) == sensors_file.PERFECT
     for model, values in sensors_file.scale_sensors(sensors, 1e6).models.items():
         sensor, own = SENSORS[model], sensors.models[model]
