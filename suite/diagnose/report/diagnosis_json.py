@@ -39,7 +39,8 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "seconds": diagnosis.seconds,
         "warnings": diagnosis.warnings,
         "gap": gap_json(diagnosis),
-        "views": [one.source.name for one in diagnosis.findings if one.names] or [main.source.name],
+        # Without a name, the verdict rests on all views.
+        "views": [one.source.name for one in diagnosis.findings if one.names or not named],
         "control": control
         and {
             "effect": control[0],
