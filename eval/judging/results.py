@@ -15,7 +15,7 @@ from typing import Any, TextIO
 
 from eval.worlds.trial import TrialResult, TrialSpec
 from tracks.common.files import naming, plain, replacing_file, to_json, write_json, write_text
-from tracks.common.provenance import differences, first_changes, stamp
+from tracks.common.provenance import differences, first_changes, stamp, stamp_text
 from tracks.input.reading import LOG_BYTES, check_file, parse_json, read_bytes
 
 SCHEMA = 1
@@ -40,8 +40,7 @@ def write_results(
     """
     header = stamp(SCHEMA, seed)
     write_trials(Path(folder) / "trials.parquet", results, header)
-    lines = [f"{key}: {value}" for key, value in header.items()]
-    write_text(Path(folder) / "table.md", f"{table_markdown}\n<!-- {'; '.join(lines)} -->\n")
+    write_text(Path(folder) / "table.md", f"{table_markdown}\n<!-- {stamp_text(header)} -->\n")
     write_json(Path(folder) / "summary.json", {**header, **summary})
 
 

@@ -80,14 +80,16 @@ def write_columns(path: Path, columns: Mapping[str, np.ndarray], text: str) -> P
     """Write `columns` and the JSON `text` to a temporary file, then rename it to `path`.
 
     Raises:
-        FlightLogError: where the ending of `path` is neither `.parquet` nor `.csv`.
+        FlightLogError: where the ending of `path` is neither `.parquet` nor `.csv`, or a CSV has a
+            column `flight`.
         OSError: where the file cannot be written; nothing is left under its name.
     """
     kind = path.suffix.lower()
     if kind not in (".parquet", ".csv"):
         raise FlightLogError(path, "the ending must be .parquet or .csv")
-    if METADATA in columns:
-        raise FlightLogError(path, "this name is kept for the metadata", METADATA)
+    if kind == ".csv" and METADATA in columns:
+        reason = "CSV keeps this name for the metadata; rename it, or write Parquet"
+        raise FlightLogError(path, reason, METADATA)
     table = pa.table({name: pa.array(values) for name, values in columns.items()})
     with replacing_file(path) as temporary:
         if kind == ".parquet":
@@ -189,7 +191,9 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]
     if not table.num_rows:
         raise FlightLogError(path, "a header, but no whole rows")
     columns = _arrays(table, path)
-    text = columns.pop(METADATA, np.array([None]))[0]
+    # A column of numbers with the name of the metadata is one of the log's own.
+    is_metadata = METADATA in columns and table[METADATA].type in (pa.string(), pa.null())
+    text = columns.pop(METADATA)[0] if is_metadata else None
     return columns, text if isinstance(text, str) else None, warnings
 
 

@@ -19,8 +19,14 @@ from eval.quadrotor.loops import KINDS, NOMINAL
 from eval.vehicles.vehicle import CollisionBox, Controller, MotorMap, Rotors, Vector, Vehicle
 from eval.vehicles.vehicle_check import check_vehicle
 from tracks.common.files import write_text
-from tracks.common.names import printable
-from tracks.common.toml_table import REQUIRED, Table, load_shipped, shipped_names, to_toml
+from tracks.common.toml_table import (
+    REQUIRED,
+    Table,
+    load_shipped,
+    shipped_names,
+    to_toml,
+    toml_head,
+)
 from tracks.geometry.camera import Camera
 from tracks.input.ranges import as_path, check_type
 
@@ -88,7 +94,7 @@ def save_vehicle(vehicle: Vehicle, path: str | os.PathLike[str], comment: str = 
     """Write `vehicle` as a file, from which `load_vehicle` reads an equal vehicle.
 
     The vehicle is checked first, as when a file is read. The file begins with the lines of
-    `comment`.
+    `comment`, and with the versions that wrote it.
 
     Raises:
         ValueError: for a vehicle that the check refuses.
@@ -97,8 +103,7 @@ def save_vehicle(vehicle: Vehicle, path: str | os.PathLike[str], comment: str = 
     check_type("comment", comment, (str,), "a text")
     table = vehicle_table(vehicle)
     parse_vehicle(table)
-    head = "".join(f"# {printable(line)}\n" for line in comment.splitlines())
-    write_text(as_path("path", path), head + to_toml(table))
+    write_text(as_path("path", path), toml_head(comment, SCHEMA) + to_toml(table))
 
 
 def vehicle_table(vehicle: Vehicle) -> dict[str, Any]:

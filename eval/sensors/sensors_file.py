@@ -17,8 +17,7 @@ from typing import Any
 from eval.sensors import SENSORS, scale_model
 from eval.sensors.interface import STAGES, Ages, Sensor
 from tracks.common.files import write_text
-from tracks.common.names import printable
-from tracks.common.toml_table import Table, load_shipped, shipped_names, to_toml
+from tracks.common.toml_table import Table, load_shipped, shipped_names, to_toml, toml_head
 
 SCHEMA = 1
 """Version of the file format."""
@@ -150,7 +149,7 @@ def parse_sensors(table: Mapping[str, Any]) -> SensorSet:
                 raise entry.error("kind", sensor.name, "each model once")
             values_of[sensor.name] = _values(sensor, entry)
     models = {name: values_of[name] for name in SENSORS if name in values_of}
-    return SensorSet(top.text("name"), MappingProxyType(models))
+    return SensorSet(top.text("name", "custom"), MappingProxyType(models))
 
 
 def _values(sensor: Sensor, table: Table) -> Any:
@@ -178,12 +177,12 @@ def _table(name: str, models: Mapping[str, Mapping[str, float]]) -> dict[str, An
 def save_sensors(sensors: SensorSet, path: str | os.PathLike[str], comment: str = "") -> None:
     """Write `sensors` as a file that `load_sensors` reads back equal; after an error, no file.
 
-    The sensors are checked like a file. The file begins with the lines of `comment`.
+    The sensors are checked like a file. The file begins with the lines of `comment`,
+    and with the versions that wrote it.
 
     Raises:
         ValueError: for sensors that `load_sensors` would reject.
     """
     table = sensors_table(sensors)
     parse_sensors(table)
-    head = "".join(f"# {printable(line)}\n" for line in comment.splitlines())
-    write_text(path, head + to_toml(table))
+    write_text(path, toml_head(comment, SCHEMA) + to_toml(table))

@@ -57,8 +57,9 @@ class PolicyMetadata(NamedTuple):
 
 
 def labels(spec: PolicySpec, name: str, seed: int | None) -> dict[str, str]:
-    """Return the metadata texts for a policy's file, by their keys."""
-    return {KEY: embed(spec, name, seed), contract.KEY: contract.contract_of(spec).text}
+    """Return the metadata texts for the file of one of the suite's policies, by their keys."""
+    text = contract.contract_of(spec, (spec.hidden_size,)).text
+    return {KEY: embed(spec, name, seed), contract.KEY: text}
 
 
 def embed(spec: PolicySpec, name: str, seed: int | None) -> str:
@@ -66,7 +67,7 @@ def embed(spec: PolicySpec, name: str, seed: int | None) -> str:
     entries = {
         "name": name,
         "spec": dataclasses.asdict(spec),
-        contract.KEY: contract.contract_of(spec).to_json(),
+        contract.KEY: contract.contract_of(spec, (spec.hidden_size,)).to_json(),
     }
     return to_json({**stamp(SCHEMA, seed), **entries})
 

@@ -25,7 +25,7 @@ from suite.blind.run import FAILED, TIMED
 from suite.diagnose.estimate.parameters import effects_in
 from tracks.common.files import write_json, write_text
 from tracks.common.grid import markdown, table
-from tracks.common.provenance import stamp
+from tracks.common.provenance import stamp, stamp_text
 
 SCHEMA = 1
 """Version of table.json."""
@@ -265,9 +265,10 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
             *(f"{note}\n" for note in notes if note),
         ]
     )
-    write_text(out / "table.md", text)
+    header = stamp(SCHEMA, None)
+    write_text(out / "table.md", f"{text}\n<!-- {stamp_text(header)} -->\n")
     summary = {
-        **stamp(SCHEMA, None),
+        **header,
         "shares": counted,
         "seconds_median": median(times) if times else None,
         "not_run": missing,

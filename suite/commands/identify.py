@@ -10,7 +10,7 @@ import tyro
 
 from suite.common.console import Console
 from suite.common.options import Advanced, Command
-from tracks.common.files import check_no_input
+from tracks.common.files import check_no_input, check_place
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     out = _out_path(config)
     if out.suffix.lower() != ".toml":
         raise ValueError(f"--out is {str(out)!r}; its ending must be .toml")
+    check_place(out)
     if config.sensors:
         from suite.diagnose.sensors.identify import identify_sensors, say_held_out
 

@@ -10,7 +10,7 @@ import tyro
 
 from suite.common.console import Console
 from suite.common.options import Advanced, Command
-from tracks.common.files import check_no_input
+from tracks.common.files import check_no_input, check_place
 from tracks.input.ranges import Range
 
 
@@ -122,3 +122,4 @@ def _check(config: Config) -> None:
     if config.pose_map is not None and config.pose is None:
         raise ValueError("--pose-map describes the file of --pose, which is not given")
     check_no_input(config.out, [config.file, config.pose])
+    check_place(config.out)

@@ -11,7 +11,10 @@ from pathlib import Path
 from string import Template
 
 from tracks.common.grid import Grid, html_table
+from tracks.common.provenance import stamp, stamp_text
 
+SCHEMA = 1
+"""Version of the page's layout."""
 TEMPLATE = Path(__file__).with_name("report.html")
 """HTML page with places for the contents of a report, and the style sheet."""
 OPTION = re.compile(r"--[a-z][a-z-]*")
@@ -77,15 +80,19 @@ class Report:
     sections: Sequence[Section]
 
 
-def html(report: Report) -> str:
-    """Return `report` as an HTML page."""
+def html(report: Report, seed: int | None = None) -> str:
+    """Return `report` as an HTML page, which also has the versions and the run's `seed`."""
     facts = "".join(
         f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>"
         for name, value in report.facts.items()
     )
     body = "\n".join(_section(section) for section in report.sections)
     return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
-        title=escape(report.title), lead=escape(report.lead), facts=facts, body=body
+        title=escape(report.title),
+        generator=escape(stamp_text(stamp(SCHEMA, seed))),
+        lead=escape(report.lead),
+        facts=facts,
+        body=body,
     )
 
 

@@ -22,7 +22,10 @@ from suite.delta.windows import cut_windows, decision_rate
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from tracks.common.files import plain, write_json, write_text
 from tracks.common.grid import Grid, markdown, table_of
+from tracks.common.provenance import stamp, stamp_text
 
+SCHEMA = 1
+"""Version of delta.json."""
 PLANT_STEPS_S, POINT_STEPS_S = 4e5, 1.5e5
 """Simulated steps a second of the quadrotor and of the point mass in a fit, from which the duration
 of a fit is estimated."""
@@ -150,9 +153,11 @@ def fit_delta(
     write_run_record(out, request, config.seed)
     stored = {**plain(config), **description, "rate_hz": rate_hz}
     save_arrays(out / "delta", result.params, kind=DELTA, seed=config.seed, extra={"fit": stored})
-    summary = plain(record)
+    header = stamp(SCHEMA, config.seed)
+    summary = {**header, **plain(record)}
     write_json(out / "delta.json", summary)
-    write_text(out / "table.md", markdown(errors_grid(summary)))
+    table = markdown(errors_grid(summary))
+    write_text(out / "table.md", f"{table}\n<!-- {stamp_text(header)} -->\n")
     return result
 
 

@@ -94,7 +94,8 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     header = f"{vehicle.name} with the effects that suite diagnose named: {names}"
     save_vehicle(diagnosis.vehicle, out / "vehicle.toml", header)
     toml = (out / "vehicle.toml").read_text(encoding="utf-8")
-    write_text(out / "report.html", html(page(diagnosis, result, toml, files, rollouts)))
+    report = page(diagnosis, result, toml, files, rollouts)
+    write_text(out / "report.html", html(report, config.seed))
     for warning in result["warnings"][shown_count:]:
         console.note(f"warning: {warning}")
     # Remove what only an earlier diagnosis in this folder has written.

@@ -55,7 +55,8 @@ def check_policy(
     findings = policy_findings(policy, trials, console)
     for finding in findings:
         console.say(f"{finding.status}: {finding.evidence}; {finding.fix}")
-    contract = contract_of(policy.spec).to_json()
+    memory = getattr(policy, "hidden_shape", None)
+    contract = contract_of(policy.spec, () if memory == (0,) else memory).to_json()
     records = [finding._asdict() for finding in findings]
     return policy, {"policy": policy.name, "contract": contract, "findings": records}
 

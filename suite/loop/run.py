@@ -25,7 +25,7 @@ from suite.loop.variants import COLOURS, Findings
 from suite.loop.work import LoopRun, plan
 from tracks.common.files import plain, to_json, write_json, write_text
 from tracks.common.grid import markdown, rich_table, table
-from tracks.common.provenance import VERSION, git_commit, stamp
+from tracks.common.provenance import VERSION, git_commit, stamp, stamp_text
 from tracks.common.work import Workers
 
 FILES = ("table.md", "report.html", "recording.rrd")
@@ -76,13 +76,12 @@ def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any
         caveat += f" The stages were done by {len(commits)} versions of the code: {listed}."
     # Write table.md, loop.json and report.html.
     header = stamp(1, config.seed)
-    comment = "; ".join(f"{key}: {value}" for key, value in header.items())
     texts = [
         findings.verdict,
         *map(markdown, grids),
         caveat,
         *findings.errors,
-        f"<!-- {comment} -->\n",
+        f"<!-- {stamp_text(header)} -->\n",
     ]
     write_text(out / "table.md", "\n\n".join(text.strip("\n") for text in texts) + "\n")
     answer = {
@@ -98,7 +97,9 @@ def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any
     }
     write_json(out / "loop.json", answer)
     results_parts = [chart, *grids, caveat]
-    write_text(out / "report.html", html(_report(run, findings, results_parts, seconds)))
+    write_text(
+        out / "report.html", html(_report(run, findings, results_parts, seconds), config.seed)
+    )
     # Print the same tables, the verdict and where the files are.
     for grid in grids:
         console.show(rich_table(grid))

@@ -81,6 +81,7 @@ def replacing_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         OSError: where the disk is full or `path` cannot be written; `path` is then untouched.
     """
     final = Path(path)
+    _refuse_folder(final)
     final.parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix=_prefix(final), suffix=PART, dir=final.parent))
     temporary = folder / final.name
@@ -170,9 +171,14 @@ def check_place(path: str | os.PathLike[str]) -> None:
     """
     final = Path(path)
     with folder_while_used(final.parent):
-        if final.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(final))
+        _refuse_folder(final)
         os.rmdir(tempfile.mkdtemp(prefix=_prefix(final), suffix=PART, dir=final.parent))
+
+
+def _refuse_folder(final: Path) -> None:
+    """Refuse a folder in place of a file; the error of a rename names the temporary path."""
+    if final.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(final))
 
 
 def check_no_input(

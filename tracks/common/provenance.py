@@ -53,6 +53,11 @@ def stamp(schema: int, seed: int | None) -> dict[str, Any]:
     return {"schema": schema, "suite_version": VERSION, "git_commit": git_commit(), "seed": seed}
 
 
+def stamp_text(header: Mapping[str, Any]) -> str:
+    """Return the keys of `stamp` as one line, for a comment in a text file."""
+    return "; ".join(f"{key}: {value}" for key, value in header.items())
+
+
 def differences(stored: Any, new: Any, name: str = "") -> list[str]:
     """Return the differences of two plain values (as in JSON), as "name is X there, Y here".
 

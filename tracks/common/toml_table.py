@@ -17,6 +17,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 from tracks.common.names import closest, printable, unknown_name
+from tracks.common.provenance import stamp, stamp_text
 from tracks.input import reading
 from tracks.input.ranges import as_path, is_number, shown
 
@@ -300,6 +301,12 @@ def _limits(above: float, least: float, most: float) -> str:
     low = "" if least == -math.inf else f" from {least:g}"
     low = low if above == -math.inf else f" above {above:g}"
     return low + ("" if most == math.inf else f" {'to' if low else 'up to'} {most:g}")
+
+
+def toml_head(comment: str, schema: int) -> str:
+    """Return TOML comments for the start of a file: the lines of `comment`, and provenance."""
+    lines = [*comment.splitlines(), stamp_text(stamp(schema, None))]
+    return "".join(f"# {printable(line)}\n" for line in lines)
 
 
 def to_toml(table: Mapping[str, Any], prefix: str = "") -> str:

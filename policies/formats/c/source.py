@@ -147,7 +147,7 @@ def _values(
         "OBSERVATION": _observation(spec),
         "STATE_SIZE": spec.state_size,
         "ACTION": _ACTIONS[spec.action.kind].replace("$WHAT", spec.action.motors),
-        "CONTRACT": contract_of(spec).digest,
+        "CONTRACT": contract_of(spec, (spec.hidden_size,)).digest,
         "ACTION_SIZE": spec.action.size,
         "HEIGHT": camera.height,
         "WIDTH": camera.width,

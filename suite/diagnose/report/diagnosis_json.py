@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from eval.effects import EFFECTS
-from suite.diagnose.diagnose import Diagnosis, deciding
+from suite.diagnose.diagnose import Diagnosis
 from suite.diagnose.estimate.parameters import ParameterSpace, effects_in
 from suite.diagnose.plan import advice
 from suite.diagnose.report.summary import headline, short_name
@@ -24,9 +24,6 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     swings = (one.remaining.swing for one in diagnosis.findings)
     swing = next(filter(None, swings), None)
     named = [effect for _, effect in diagnosis.named]
-    # That there is no gap is the answer of all views; another verdict may be that of some.
-    findings = diagnosis.findings
-    decisive = findings if diagnosis.verdict.label == "no_gap" else deciding(findings)
     pairs = [(effect.candidate.name, rival) for effect in named for rival in effect.rivals]
     entries: dict[str, Any] = {
         "verdict": diagnosis.verdict.label,
@@ -42,8 +39,8 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "seconds": diagnosis.seconds,
         "warnings": diagnosis.warnings,
         "gap": gap_json(diagnosis),
-        "views": [one.source.name for one in findings if one.names]
-        or [one.source.name for one in decisive],
+        # Without a name, the verdict rests on all views.
+        "views": [one.source.name for one in diagnosis.findings if one.names or not named],
         "control": control
         and {
             "effect": control[0],

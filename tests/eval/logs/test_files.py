@@ -69,6 +69,17 @@ def test_unknown_columns_of_any_type_and_metadata_are_kept(tmp_path, kind):
     assert foreign.gate is None
 
 
+def test_a_column_of_numbers_with_the_name_of_the_metadata_is_kept(tmp_path):
+    table = columns() | {"flight": np.arange(150)}
+    for kind in KINDS:
+        log = read_flight(write_table(tmp_path / f"in.{kind}", table))
+        assert log.extra["flight"].tolist() == list(range(150)) and log.about == {}
+    again = read_flight(write_flight(tmp_path / "out.parquet", log))
+    assert again.extra["flight"].tolist() == list(range(150)) and again.about["schema"] == 1
+    with pytest.raises(FlightLogError, match="column flight: CSV keeps this name"):
+        write_flight(tmp_path / "out.csv", log)
+
+
 def test_files_that_are_no_logs_are_refused(tmp_path):
     good = write_table(tmp_path / "good.parquet", columns()).read_bytes()
     text = write_table(tmp_path / "good.csv", columns()).read_text()

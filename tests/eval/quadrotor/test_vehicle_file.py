@@ -13,6 +13,7 @@ from eval.quadrotor.model import BODY, CAMERA, COLLIDES, compile_quadrotor, roto
 from eval.vehicles.vehicle import MotorMap, command_of_thrust, motor_speed, motor_thrust
 from eval.vehicles.vehicle_check import check_vehicle
 from tests.support.vehicles import PLAIN, drawn_effects, with_effects
+from tracks.common.provenance import stamp, stamp_text
 from tracks.common.toml_table import to_toml
 from tracks.geometry.camera import optical_axis_b
 
@@ -43,6 +44,7 @@ def test_every_effect_survives_a_round_trip(tmp_path):
         comment = "first\nsecond \x1b[31m\x0c\x00\x7f"
         vehicle_file.save_vehicle(vehicle, tmp_path / "v.toml", comment)
         assert vehicle_file.load_vehicle(tmp_path / "v.toml") == vehicle
+    assert f"# {stamp_text(stamp(1, None))}\n" in (tmp_path / "v.toml").read_text()
 
 
 def test_arrays_are_written_as_numbers(tmp_path):

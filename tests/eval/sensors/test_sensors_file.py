@@ -3,6 +3,7 @@
 import pytest
 
 from eval.sensors import SENSORS, sensors_file
+from tracks.common.provenance import stamp, stamp_text
 
 STEREO = '[[depth]]\nkind = "stereo"\n'
 
@@ -13,6 +14,7 @@ def test_a_shipped_file_reads_back_equal_and_grows_within_its_limits(name, tmp_p
     assert sensors.name == name
     sensors_file.save_sensors(sensors, tmp_path / "again.toml", "a comment\x1b")
     assert sensors_file.load_sensors(tmp_path / "again.toml") == sensors
+    assert f"# {stamp_text(stamp(1, None))}\n" in (tmp_path / "again.toml").read_text()
     assert sensors_file.scale_sensors(sensors, 0.0) == sensors_file.PERFECT
     for model, values in sensors_file.scale_sensors(sensors, 1e6).models.items():
         sensor, own = SENSORS[model], sensors.models[model]
@@ -43,6 +45,13 @@ def test_what_cannot_be_is_refused_by_name(text, words, tmp_path):
     with pytest.raises(sensors_file.SensorsFileError, match=words) as error:
         sensors_file.load_sensors(path)
     assert str(path) in str(error.value)
+
+
+def test_a_file_needs_no_name(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(f"schema = 1\n{STEREO}noise = 0.1\n")
+    sensors = sensors_file.load_sensors(path)
+    assert sensors == sensors_file.sensor_set({"stereo": {"noise": 0.1}}, name="custom")
 
 
 def test_unknown_names_say_what_there_is():

@@ -199,6 +199,10 @@ def test_files_that_are_read_are_not_written_over(tmp_path, monkeypatch, capsys)
     assert contents == {path: path.read_bytes() for path in tmp_path.iterdir()}
     said = refused(capsys, f"identify {FOLDER} --vehicle {vehicle} --out v.json")
     assert "must be .toml" in said
+    (folder := tmp_path / "folder.toml").mkdir()
+    for line in (f"identify {FOLDER} --vehicle racer5 --out", "import no.csv --out"):
+        folder = folder.rename(folder.with_suffix(".csv" if "import" in line else ".toml"))
+        assert f"is a directory: {folder}" in refused(capsys, line, folder)
 
 
 def test_the_command_copies_all_a_diagnosis_needs(tmp_path, capsys):

@@ -40,6 +40,7 @@ from suite.experiments.study.training import training_origin
 from suite.judging.requests import Collection, Evaluation
 from suite.judging.trials import parse_levels, parse_tracks
 from tracks.common.grid import Cell, Grid
+from tracks.common.provenance import stamp, stamp_text
 from tracks.common.work import core_shares, usable_cores
 from tracks.geometry.scene import Boxes, Counts, Gates, Rods, Scene, Spheres, pad
 
@@ -58,8 +59,9 @@ def test_a_page_holds_everything_and_escapes_what_is_text():
         Details("log", "1 & 2"),
     ]  # fmt: skip
     report = Report("A & B", "It flew.", {"seed": "3"}, [Section("Part", parts)])
-    page = html(report)
+    page = html(report, 7)
     assert "<title>A &amp; B</title>" in page and "<p>x &lt; y</p>" in page
+    assert f'content="{stamp_text(stamp(1, 7))}"' in page
     assert "<dt>seed</dt><dd>3</dd>" in page and "<h2>Part</h2>" in page
     assert '<td class="good">3.1</td>' in page and '<tr class="sum"><td>&lt;all&gt;</td>' in page
     assert "data:image/png;base64," + base64.b64encode(b"a png").decode() in page

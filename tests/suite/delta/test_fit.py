@@ -30,6 +30,7 @@ from tests.support.point_mass_flights import fly
 from tests.support.vehicles import with_lag
 from tracks.common.files import plain
 from tracks.common.grid import markdown
+from tracks.common.provenance import stamp, stamp_text
 
 PHYSICS = PointMassConfig(drag=(0.3, 0.3), drag_up=(0.3, 0.3), action_delay=(0.5, 0.5))
 CONFIG = FitConfig(horizon_s=0.6, stride_s=0.3, iterations=100, batch=32, rate=1e-2, held_out=0.5)
@@ -70,8 +71,10 @@ def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(tmp_path, monke
     accept = ["thrust_command_unit"]  # the thrust commands are only there because a log needs some
     flights = read_checked([tmp_path], CheckContext(), accept)
     result = fit_delta(CONFIG, PHYSICS, flights, tmp_path / "out", console)
-    kept = json.loads((tmp_path / "out" / "delta.json").read_text())["findings"]
-    assert accept[0] in [one["fault"] for one in kept]
+    kept = json.loads((tmp_path / "out" / "delta.json").read_text())
+    assert accept[0] in [one["fault"] for one in kept["findings"]]
+    header = stamp(1, CONFIG.seed)
+    assert {key: kept[key] for key in header} == header
     without, identified, with_delta = result.errors.values()
     assert result.identified is not None and without.position_m > 0.1
     assert with_delta.position_m < 0.3 * without.position_m
@@ -85,7 +88,8 @@ def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(tmp_path, monke
     jax.tree.map(np.testing.assert_array_equal, stored, result.params)
     said = (tmp_path / "out" / "table.md").read_text()
     grid = errors_grid({"horizon_s": 0.6, **plain(result.errors)})
-    assert said == markdown(grid) and "| point mass with Delta Action Model |" in said
+    assert said == f"{markdown(grid)}\n<!-- {stamp_text(header)} -->\n"
+    assert "| point mass with Delta Action Model |" in said
     with pytest.raises(ValueError, match=r"\(seed is 0 there, 7 here\); give another --out"):
         fit_delta(replace(CONFIG, seed=7), PHYSICS, flights, tmp_path / "out", console)
 

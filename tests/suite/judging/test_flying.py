@@ -395,4 +395,4 @@ def test_check_reports_the_contract_and_an_unscaled_file_that_says_nothing(tmp_p
     assert faults[0] == "no_contract" and "action_scale" in faults
     assert "30 Hz" in answer["findings"][0]["evidence"]
     assert "78.4 x 63.8 deg, range 10 m" in answer["findings"][0]["evidence"]
-    assert answer["contract"]["digest"] == contract_of(PolicySpec()).digest
+    assert answer["contract"]["digest"] == contract_of(PolicySpec(), ()).digest

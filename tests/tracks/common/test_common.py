@@ -295,6 +295,9 @@ def test_a_place_is_tried_before_the_work_and_left_as_it_was(tmp_path):
         with pytest.raises(OSError):
             files.check_place(bad)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    with pytest.raises(IsADirectoryError) as error, files.replacing_file(tmp_path):
+        pass
+    assert error.value.filename == str(tmp_path)
 
 
 def test_a_file_that_is_read_is_refused_as_one_to_write_by_whatever_name(tmp_path):

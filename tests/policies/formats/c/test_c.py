@@ -1,6 +1,7 @@
 """The exported C: what it looks like, that it compiles without a word, and what it answers."""
 
 import errno
+import json
 import shlex
 import shutil
 import subprocess
@@ -17,6 +18,7 @@ from policies.formats.c.compiler import find_compiler
 from policies.formats.c.forward import Observed
 from policies.formats.c.project import FILES, c_project, native_actions, random_observations
 from policies.formats.policy_file import load_policy_checkpoint, save_policy
+from policies.formats.spec_json import KEY, labels
 from policies.policy import load_policy
 from policies.spec import NoAnswer, PolicyError
 from tests.support.policy_files import SPEC, action_of, lively
@@ -53,6 +55,16 @@ def exports(tmp_path_factory, checkpoint):
         place = written(project, tmp_path_factory.mktemp(name))
         made[name] = SimpleNamespace(folder=place, checkpoint=stored, project=project)
     return made
+
+
+@pytest.mark.parametrize("name", ["float32", "odd", "odd8"])
+def test_the_contract_of_an_export_is_that_of_the_checkpoint(exports, name):
+    stored = exports[name].checkpoint
+    contract = stored.config["contract"]
+    header = exports[name].project.files["policy.h"]
+    assert f'#define POLICY_CONTRACT_SHA256 "{contract["digest"]}"' in header
+    texts = labels(stored.spec, name, stored.seed)
+    assert json.loads(texts["contract"]) == json.loads(texts[KEY])["contract"] == contract
 
 
 def answers(policy, observed):

@@ -12,7 +12,7 @@ from suite.common.console import Console
 from suite.common.report import html
 from suite.diagnose import run
 from suite.diagnose.config import Config
-from suite.diagnose.diagnose import diagnose
+from suite.diagnose.diagnose import Verdict, diagnose
 from suite.diagnose.estimate.parameters import Candidate, make_space
 from suite.diagnose.evidence.view_means import centred
 from suite.diagnose.identify.run import is_identified
@@ -76,6 +76,10 @@ def test_each_view_names_its_own_effect_and_the_page_has_its_headline_first(by_v
     assert drag["view"] == "force" and 0.0 < drag["gap_removed"] <= 1.0 and low < 0.4 < high
     assert effects and all(effect["view"] == "torque" for effect in effects.values())
     assert set(found["gap"]["channels"]["force"]) == {"x", "y", "z"}
+    findings = tuple(replace(one, names=()) for one in by_views.findings)
+    nameless = replace(by_views, findings=findings, verdict=Verdict("no_gap"))
+    for diagnosis in (by_views, nameless):
+        assert as_json.diagnosis_json(diagnosis)["views"] == ["force", "torque"]
     answer = summary.answer(found)
     assert found["headline"].startswith(answer) and "linear_drag" in answer
     text = html(page(by_views, found, "mass = 1", {"vehicle.toml"}))
