@@ -24,9 +24,9 @@ from eval.logs.faults.catalogue import FAULTS
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors import SENSORS
 from eval.sensors.measured_state import Axis, MeasuredState
+from suite.commands.list import settings_to_change
 from suite.common.options import SILENT, Option, field_texts, options
 from suite.common.usage import EXAMPLES, GROUPS
-from suite.train.overrides import settings_to_change
 from suite.train.recipes import named_recipe, with_sensors
 
 HEADS = Path(__file__).with_name("heads")

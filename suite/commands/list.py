@@ -11,7 +11,7 @@ import tyro
 
 from suite.commands.tracks import family_text
 from suite.common.console import Console
-from suite.common.options import Command
+from suite.common.options import Command, Setting, settings
 from suite.common.usage import first_paragraph
 from tracks.common.names import unknown_name
 
@@ -56,13 +56,23 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     return {config.kind: descriptions}
 
 
+def settings_to_change(config: TrainConfig) -> list[Setting]:
+    """Return all settings that `--set` changes in `config`, with their values before the phases."""
+    from suite.train.overrides import ABSENT, FROM_FILES, is_within
+
+    fixed = ("phases", "seed", *ABSENT)
+    return [
+        one
+        for one in settings(config)
+        if one.path not in fixed and not any(is_within(one.path, part) for part in FROM_FILES)
+    ]
+
+
 def list_settings(config: TrainConfig, console: Console) -> list[dict[str, Any]]:
     """Print every setting of a training with its value, range and meaning, and return them.
 
     The values are those before the phases.
     """
-    from suite.train.overrides import settings_to_change
-
     all_settings = settings_to_change(config)
     for setting in all_settings:
         allowed = f", allowed {setting.allowed}" if setting.allowed else ""

@@ -15,7 +15,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
-from suite.common.options import Setting, settings
 from suite.train.config import Phase, TrainConfig, check
 from tracks.common.names import unknown_name
 from tracks.input.ranges import check_ranges, is_finite, shown
@@ -74,16 +73,6 @@ def _changed(config: T, changes: Iterable[str]) -> T:
         config = _with_value(config, keys, text.strip(), shown(change))
         check_ranges(config, f"--set {shown(change)}: ")
     return config
-
-
-def settings_to_change(config: TrainConfig) -> list[Setting]:
-    """Return all settings that `--set` changes in `config`, with their values before the phases."""
-    fixed = ("phases", "seed", *ABSENT)
-    return [
-        one
-        for one in settings(config)
-        if one.path not in fixed and not any(is_within(one.path, part) for part in FROM_FILES)
-    ]
 
 
 def _path(change: str) -> str:

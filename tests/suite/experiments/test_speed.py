@@ -120,7 +120,7 @@ def test_without_a_compiler_or_packages_it_says_what_to_install(monkeypatch):
     with pytest.raises(WorkFailed, match="no C compiler"):
         policy.run()
     monkeypatch.setattr(sysid_baseline, "is_installed", lambda: False)
-    with pytest.raises(WorkFailed, match=r"pip install 'mujoco\[sysid\]'"):
+    with pytest.raises(WorkFailed, match=r"pip install 'diffracing-suite\[sysid\]'"):
         diagnose.run()
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from suite.commands.list import settings_to_change
 from suite.commands.train import Config, resolve
 from suite.common.console import Console
 from suite.train import losses
@@ -17,7 +18,6 @@ from suite.train.overrides import (
     check_phases,
     phase_configs,
     phase_ends,
-    settings_to_change,
     with_changes,
     without_quadrotor,
 )
