@@ -1,6 +1,7 @@
 """Readings of a log, and findings that an import stored in it."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +28,8 @@ from suite.common.console import Console
 from tests.support.diagnosis_flights import fly
 from tests.support.imported import flight
 from tests.support.vehicles import PLAIN
+
+ROOT = Path(__file__).resolve().parents[4]
 
 
 def flight_at_rest(time_s):
@@ -289,3 +292,8 @@ def test_a_log_that_is_too_slow_to_check_has_no_clean_bill(tmp_path, capsys):
     said = "".join(capsys.readouterr())
     assert "not checked" in said and "no fault found" not in said
     assert "nothing is written without --fix" in said
+
+
+def test_the_page_has_every_fault_by_its_symptom():
+    page = (ROOT / "docs/check.md").read_text(encoding="utf-8")
+    assert [name for name in FAULTS if f"`{name}`" not in page] == ["file"]  # a message of its own
