@@ -229,13 +229,10 @@ def delay_of(
     Samples with a NaN are not used. The result is None where the flight is too short or the body
     rates are too small, or where the best delay is the largest that is tried.
     """
-    known, turned = (np.isfinite(value).all(axis=1) for value in (quat, rate))
-    quat_time, quat, rate_time, rate = (
-        quat_time[known],
-        quat[known],
-        rate_time[turned],
-        rate[turned],
-    )
+    known = np.isfinite(quat).all(axis=1)
+    quat_time, quat = quat_time[known], quat[known]
+    known = np.isfinite(rate).all(axis=1)
+    rate_time, rate = rate_time[known], rate[known]
     turns = smooth(quat_time, turns_of(quat_time, quat), SPAN_S)
     known = np.isfinite(turns).all(axis=1)
     gyro = smooth(rate_time, rate, 2.0 * SPAN_S)
