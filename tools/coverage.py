@@ -227,7 +227,8 @@ def measure(count: int, seed: int, cases: Sequence[str], out: str) -> dict[tuple
         done += 1
         for index, case in enumerate(CASES):
             if case in cases:
-                rng = np.random.default_rng((seed, number, index))
+                # From 1: for numpy (seed, number, 0) is (seed, number), which drew the fleet.
+                rng = np.random.default_rng((seed, number, index + 1))
                 for key, pull in pulls(*fleet, case, rng).items():
                     rows[case, key].append((number, *pull))
         print(f"{done}: {time.monotonic() - start_s:.0f} s", file=sys.stderr, flush=True)

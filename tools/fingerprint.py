@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -37,6 +38,8 @@ MJX_POLICIES = ("race-paper", "race")
 """Policies that also fly in MJX, which takes longer."""
 STAMPS = ("version", "commit", "git_commit", "schema", "created", "seconds", "out")
 """Keys that may differ between two versions of the code with equal results."""
+FOLDERS = re.compile(r"[^\s'\"(]*/(?=[^/\s]*\.[a-z])")
+"""The folders of a file in a text: they differ between two runs; units such as m/s stay."""
 
 
 def suite(*args: str | Path) -> None:
@@ -79,11 +82,11 @@ def json_digest(path: Path, ignored: Container[str] = STAMPS) -> str:
     """Return the digest of a JSON or JSON Lines file without the keys `ignored`."""
 
     def without_stamps(value: Any) -> Any:
-        """Return contents of a JSON file without the keys `ignored`; of a path only the name."""
+        """Return contents of a JSON file without `ignored`, and of files only the name."""
         if isinstance(value, dict):
             return {k: without_stamps(v) for k, v in value.items() if k not in ignored}
-        if isinstance(value, str) and "/" in value:  # a path in the folder of the run
-            return value.rsplit("/", 1)[1]
+        if isinstance(value, str):
+            return FOLDERS.sub("", value)
         return [without_stamps(v) for v in value] if isinstance(value, list) else value
 
     text = path.read_text()

@@ -66,6 +66,7 @@ def _facts(effect: Effect) -> dict[str, Any]:
                 "unit": p.unit,
                 "components": p.size or 1,
                 "typical": p.typical,
+                "typical_is": "a value" if p.whole else "a difference from neutral",
                 "low": None if callable(p.low) else p.low,
                 "high": None if callable(p.high) else p.high,
                 "required": p.required,

@@ -73,6 +73,9 @@ def test_effects_command_lists_and_describes(capfd):
     for effect, usual in (("gusts", "2 to 10"), ("slung_load", "0.3 to 1")):
         assert run(f"effects {effect}") == 0
         assert f"length [m]: usually {usual}; allowed" in capfd.readouterr().out
+        assert effects[effect]["parameters"]["length"]["typical_is"] == "a value"
+    scale = effects["thrust_scale"]["parameters"]["scale"]
+    assert scale["typical_is"] == "a difference from neutral"
     assert "Did you mean 'linear_drag'?" in refused(capfd, "effects linear_darg")
 
 
