@@ -198,6 +198,11 @@ def _fly_real_vehicle(
             reason = f"handed over before the first set point: {companion.over}"
         elif companion.wrong_image_size:
             reason += f" ({companion.wrong_image_size})"
+        elif ignored := link.strangers + wire.foreign + wire.broken:
+            reason += (
+                f" ({ignored} messages were ignored: damaged, not of MAVLink system {VEHICLE}, or "
+                "not signed with the key of --signing-key)"
+            )
         raise WorkFailed(f"{address}: {reason}; see docs/fly.md, 'When it hands over'")
     console.say(f"handed over: {companion.over}; log: {file or 'none'}")
     if link.strangers:

@@ -264,6 +264,8 @@ def test_a_real_vehicle_needs_the_operators_word(capsys, tmp_path, monkeypatch):
     for fly_nowhere, words in (
         (lambda companion, link: None,
          "no vehicle sent a state (ODOMETRY) and a depth image within 30 s"),
+        (lambda companion, link: setattr(link, "strangers", 5),
+         "within 30 s (5 messages were ignored: damaged, not of MAVLink system 1, or not signed"),
         (outside, "before the first set point: outside the box at 0.0, 0.0, -3.0 m"),
     ):  # fmt: skip
         monkeypatch.setattr(fly, "fly_link", fly_nowhere)
