@@ -39,7 +39,7 @@ from policies.spec import ActionSpec, PolicySpec, check_spec
 from tracks.common.names import unknown_name
 from tracks.families import LEVELS, check_family, make_track
 from tracks.formats.custom import load_track
-from tracks.input.ranges import PATH, Range, check_number, check_type
+from tracks.input.ranges import PATH, SEED_MOST, Range, check_number, check_type
 from tracks.track import Track
 
 SEEDS = 2**31
@@ -152,10 +152,10 @@ def levels_of(config: RaceConfig) -> tuple[int, int]:
 
 
 def check_track_seed(seed: Any) -> None:
-    """Refuse a seed of the track that is neither None nor a whole number from 0."""
-    allowed = "a whole number from 0, or None"
+    """Refuse a seed of the track that is neither None nor a seed that the judge can fly."""
+    allowed = f"a whole number from 0 to {SEED_MOST}, or None"
     check_type("track_seed", seed, (Integral, NoneType), allowed)
-    if seed is not None and seed < 0:
+    if seed is not None and not 0 <= seed <= SEED_MOST:
         raise ValueError(f"track_seed is {seed!r}, allowed is {allowed}")
 
 
@@ -327,12 +327,11 @@ class Races:
         `output` (N, size) are actions with components from -1 to 1.
         """
         output = np.asarray(output, float)
-        finite = np.isfinite(output).all(-1)
         flying = self.ended == FLYING
         guarded = guard_action(self._limits, output, self._action, 0.0, "of the environment's user")
         warn_of(unscaled(guarded.largest))
-        self._bad |= flying & ~finite
-        flying &= finite
+        self._bad |= flying & guarded.bad
+        flying &= ~guarded.bad
         gates_before, to_go_before, time_before_s = self.gates, self.to_go, self.time_s
         clipped = np.clip(np.nan_to_num(output), -1.0, 1.0)
         change = np.sqrt(((clipped - self._output) ** 2).sum(-1)) * flying

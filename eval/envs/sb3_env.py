@@ -80,6 +80,7 @@ class RaceVecEnv(VecEnv):
             if ended[slot]:
                 info["terminal_observation"] = as_space(self._space, infos["final_obs"][slot])
                 info["TimeLimit.truncated"] = bool(truncated[slot])
+                self.reset_infos[slot] = _info_of(infos, slot)
             slot_infos.append(info)
         observation = as_space(self._space, observation, self.num_envs)
         return observation, reward.astype(np.float32), ended, slot_infos

@@ -65,7 +65,8 @@ def load_c(path: Path, trust: bool = False) -> CPolicy:
 
     Raises:
         PolicyError: without trust, without a compiler, or where it does not compile, its sizes do
-            not fit, the same inputs give different outputs, or a call does not end in time.
+            not fit, the same inputs give different outputs, also after `policy_reset`, or a call
+            does not end in time.
     """
     file = path / "policy.c" if path.is_dir() else path
     if not trust:
@@ -88,22 +89,29 @@ def load_c(path: Path, trust: bool = False) -> CPolicy:
         )
     name = (json.loads(text).get("name") if text else None) or file.stem
     policy = CPolicy(f"{name}.c", spec, library, loaded, state_bytes, metadata.notes)
-    _refuse_global_state(policy, file)
+    _refuse_other_memory(policy, file)
     return policy
 
 
-def _refuse_global_state(policy: CPolicy, file: Path) -> None:
-    """Refuse code for which equal inputs in several rows give different outputs."""
+def _refuse_other_memory(policy: CPolicy, file: Path) -> None:
+    """Refuse code with memory outside the `policy_state`, or that `policy_reset` does not clear."""
     rng = np.random.default_rng(0)
     spec, copies = policy.spec, 3
-    hidden, fresh = policy.start(copies), np.ones(copies, bool)
-    for _ in range(3):
-        state = np.repeat(rng.normal(size=(1, spec.state_size)), copies, 0)
-        image = np.repeat(rng.normal(size=(1, *spec.image_shape)), copies, 0)
-        action, hidden = policy.act(hidden, state, image, fresh)
+    hidden = policy.start(copies)
+    states = np.repeat(rng.normal(size=(3, 1, spec.state_size)), copies, 1)
+    images = np.repeat(rng.normal(size=(3, 1, *spec.image_shape)), copies, 1)
+    answers = []
+    for step in (0, 1, 2, 0):  # the second flight begins with the inputs of the first
+        fresh = np.full(copies, step == 0)
+        action, hidden = policy.act(hidden, states[step], images[step], fresh)
         if any(row.tobytes() != action[0].tobytes() for row in action):
             raise PolicyError(
                 f"{file}: the same inputs gave two answers; keep all memory of the policy in "
                 "policy_state"
             )
-        fresh = np.zeros(copies, bool)
+        answers.append(action)
+    if answers[0].tobytes() != answers[-1].tobytes():
+        raise PolicyError(
+            f"{file}: after policy_reset its answer still depends on the flight before; set every "
+            "field of policy_state there"
+        )

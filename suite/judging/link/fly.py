@@ -86,7 +86,8 @@ def fly_over_link(
 
     Raises:
         ValueError: for invalid options or a policy that commands motors, before the first flight.
-        WorkFailed: if pymavlink is missing, or no vehicle answers.
+        WorkFailed: if pymavlink is missing, no vehicle answers, or the simulated vehicle's process
+            dies; fly.json then has the flights before.
     """
     dialect()
     trial_set = read_trial_set(evaluation, repeated=True)
@@ -125,7 +126,7 @@ def fly_over_link(
         [] if link else [result.success for result in fly_trials(loaded, evaluation, trial_set)]
     )
     out.mkdir(parents=True, exist_ok=True)
-    interrupt = None
+    stopped = None
     if link:
         results = _fly_real_vehicle(flying, trial_set, link, limits, out, console, key)
     else:
@@ -133,8 +134,8 @@ def fly_over_link(
         try:
             for flight in fly_simulated(flying, trial_set, rules, limits, out, console):
                 flights.append(flight)
-        except KeyboardInterrupt as error:
-            interrupt = error
+        except (KeyboardInterrupt, WorkFailed) as error:
+            stopped = error
         results = {**totals(flights, limits), "judge_successes": sum(judged[: len(flights)])}
         results["flights"] = [flight.row for flight in flights]
         _show_results(results, flights, console)
@@ -144,8 +145,8 @@ def fly_over_link(
     answer = {**stamp(1, evaluation.seed), **inputs, **results}
     write_json(out / FLY, answer)
     write_run_record(out, settings, evaluation.seed)
-    if interrupt is not None:
-        raise interrupt
+    if stopped is not None:
+        raise stopped
     return {**answer, "out": str(out)}
 
 
@@ -197,6 +198,11 @@ def _fly_real_vehicle(
             reason = f"handed over before the first set point: {companion.over}"
         elif companion.wrong_image_size:
             reason += f" ({companion.wrong_image_size})"
+        elif ignored := link.strangers + wire.foreign + wire.broken:
+            reason += (
+                f" ({ignored} messages were ignored: damaged, not of MAVLink system {VEHICLE}, or "
+                "not signed with the key of --signing-key)"
+            )
         raise WorkFailed(f"{address}: {reason}; see docs/fly.md, 'When it hands over'")
     console.say(f"handed over: {companion.over}; log: {file or 'none'}")
     if link.strangers:

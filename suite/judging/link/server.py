@@ -5,8 +5,9 @@ from __future__ import annotations
 import multiprocessing
 import signal
 import time
+from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from eval.worlds.trial import TrialResult
 from suite.common.errors import WorkFailed
@@ -45,8 +46,12 @@ class VehicleProcess:
         remote.close()
 
     def start(self, request: FlightRequest) -> None:
-        """Start a flight."""
-        self._pipe.send(request)
+        """Start a flight.
+
+        Raises:
+            WorkFailed: if the process has died.
+        """
+        self._exchange(lambda: self._pipe.send(request))
 
     def result(self, wait_s: float = 0.0) -> VehicleResult | None:
         """Wait for at most `wait_s` [s]; return the flight's result, or None while it runs.
@@ -54,15 +59,23 @@ class VehicleProcess:
         Raises:
             WorkFailed: if the process has died.
         """
-        try:
-            return self._pipe.recv() if self._pipe.poll(wait_s) else None
-        except EOFError:
-            raise WorkFailed("the simulated vehicle's process died; run again") from None
+        return self._exchange(lambda: self._pipe.recv() if self._pipe.poll(wait_s) else None)
 
     def stop(self) -> VehicleResult | None:
-        """Stop the flight and return its result."""
-        self._pipe.send("stop")
+        """Stop the flight and return its result.
+
+        Raises:
+            WorkFailed: if the process has died.
+        """
+        self._exchange(lambda: self._pipe.send("stop"))
         return self.result(WAIT_S)
+
+    def _exchange(self, transfer: Callable[[], Any]) -> Any:
+        """Return what `transfer` returns, which uses the pipe."""
+        try:
+            return transfer()
+        except (EOFError, OSError):
+            raise WorkFailed("the simulated vehicle's process died; run again") from None
 
     def close(self) -> None:
         """End the process."""

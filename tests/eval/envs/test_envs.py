@@ -341,6 +341,7 @@ def test_its_vector_environment_is_ours():
         last = infos[k]["terminal_observation"]
         assert all(np.array_equal(last[key], alone[k][key]) for key in last)
         assert infos[k]["TimeLimit.truncated"] and infos[k]["ended_by"] == "timeout"
+        assert many.reset_infos[k]["track_seed"] != infos[k]["track_seed"]
     assert many.get_attr("contract")[0] == singles[0].unwrapped.contract
     many.set_options({"track_seed": 12})
     for fixed in (True, False):  # options hold for one reset

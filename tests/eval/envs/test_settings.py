@@ -179,6 +179,8 @@ def test_any_sequence_of_seeds_is_taken(seed):
         (lambda env: env.reset(options={"trackseed": 5}), "Did you mean 'track_seed'"),
         (lambda env: env.reset(options={"track_seed": 5.7}), "track_seed is 5.7, allowed is a"),
         (lambda env: type(env)(track_seed=5.7), "track_seed is 5.7, allowed is a whole number"),
+        (lambda env: env.reset(options={"track_seed": 2**32}), "is 4294967296, allowed is a whole"),
+        (lambda env: type(env)(track_seed=2**70), "allowed is a whole number from 0 to 4294967295"),
         (lambda env: type(env)(render_mode="rgb_array"), "render_mode is 'rgb_array', .* None"),
         (lambda env: RaceEnv(render_mode="human"), "'human', allowed is None or 'rgb_array'"),
         (

@@ -255,7 +255,7 @@ def test_a_name_with_signs_that_c_reads_otherwise_comes_back(exports, tmp_path):
 FOREIGN = """
 #include "policy.h"
 static int steps;
-void policy_reset(policy_state *state) {{ state->seen = 0.0f; }}
+void policy_reset(policy_state *state) {{ {reset} }}
 void policy_step(policy_state *state, const float *observation, const float *image, float *action)
 {{
     state->seen += observation[0] + image[0] * 0.0f;
@@ -273,8 +273,8 @@ void policy_step(policy_state *, const float *, const float *, float *);
 """
 
 
-def foreign(folder, answer, size=12):
-    (folder / "policy.c").write_text(FOREIGN.format(answer=answer))
+def foreign(folder, answer, size=12, reset="state->seen = 0.0f;"):
+    (folder / "policy.c").write_text(FOREIGN.format(answer=answer, reset=reset))
     (folder / "policy.h").write_text(DOOR.replace("{size}", str(size)))
     return load_c(folder, trust=True)
 
@@ -288,6 +288,11 @@ def test_any_c_with_this_door_flies_but_none_with_a_memory_of_its_own(tmp_path):
     for size in ("15", "12\n#define POLICY_ACTION_SIZE 4"):
         with pytest.raises(PolicyError, match="expected by its POLICY_JSON"):
             foreign(tmp_path, "state->seen", size)
+
+
+def test_c_whose_reset_leaves_memory_is_refused(tmp_path):
+    with pytest.raises(PolicyError, match="after policy_reset its answer still depends on the"):
+        foreign(tmp_path, "state->seen", reset="(void)state;")
 
 
 def test_c_without_its_sizes_is_refused_with_their_names(tmp_path):

@@ -1,6 +1,7 @@
 """The link: what travels, when the companion hands over, and a flight with both ends."""
 
 import json
+import multiprocessing
 import shutil
 from dataclasses import replace
 
@@ -15,6 +16,7 @@ from policies.block_policy import BlockPolicy
 from policies.policy import load_policy
 from policies.spec import ActionSpec, DepthEncoding, Note, PolicySpec
 from suite.common.console import Console
+from suite.common.errors import WorkFailed
 from suite.judging.link import fly, server
 from suite.judging.link.companion import Companion, Row
 from suite.judging.link.flights import Flight, delays, fly_link, totals, warm_up, write_log
@@ -262,6 +264,8 @@ def test_a_real_vehicle_needs_the_operators_word(capsys, tmp_path, monkeypatch):
     for fly_nowhere, words in (
         (lambda companion, link: None,
          "no vehicle sent a state (ODOMETRY) and a depth image within 30 s"),
+        (lambda companion, link: setattr(link, "strangers", 5),
+         "within 30 s (5 messages were ignored: damaged, not of MAVLink system 1, or not signed"),
         (outside, "before the first set point: outside the box at 0.0, 0.0, -3.0 m"),
     ):  # fmt: skip
         monkeypatch.setattr(fly, "fly_link", fly_nowhere)
@@ -303,19 +307,32 @@ def printed(capsys):
     return " ".join("".join(capsys.readouterr()).split())
 
 
+@pytest.mark.parametrize("call", ["start", "result", "stop"])
+def test_a_vehicles_process_that_died_is_reported_whenever_it_is_used(call):
+    vehicle = object.__new__(server.VehicleProcess)
+    vehicle._pipe, remote = multiprocessing.Pipe()
+    vehicle._pipe.send("unread")
+    remote.close()
+    with pytest.raises(WorkFailed, match="the simulated vehicle's process died"):
+        getattr(vehicle, call)(*["a request"] * (call == "start"))
+
+
 def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first(
     capsys, tmp_path, monkeypatch
 ):
     row = {"success": True, "handed_over": None, "seed": 0}
     row |= dict.fromkeys(("vehicle_slips", "late_actions", "missed_decisions"), 0)
+    stops = iter([WorkFailed("it died"), KeyboardInterrupt()])
 
     def interrupted(policy, course, *_):
         assert policy.block == 1
         yield Flight(row, [])
-        raise KeyboardInterrupt
+        raise next(stops)
 
     monkeypatch.setattr(fly, "fly_simulated", interrupted)
     asked = "fly --policy race --trials 2 --time-limit-s 0.2 --out"
+    assert run(asked, tmp_path / "died") == 1
+    assert json.loads((tmp_path / "died" / "fly.json").read_text())["trials"] == 1
     assert run(asked, tmp_path / "a") == 130
     answer = json.loads((tmp_path / "a" / "fly.json").read_text())
     assert (answer["trials"], answer["successes"], answer["judge_successes"]) == (1, 1, 0)
