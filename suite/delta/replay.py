@@ -131,8 +131,13 @@ def check_corrects(
     decisions in the training [Hz]. The network makes one step per decision.
 
     Raises:
-        ValueError: if model, rate or parameters differ.
+        ValueError: if model, rate or parameters differ, or `fit` lacks one of them.
     """
+    if missing := {"model", "rate_hz", "plant"} - fit.keys():
+        raise ValueError(
+            f"--delta {checkpoint}: its config.json lacks {', '.join(sorted(missing))} of the fit, "
+            "so the dynamics that it corrects are unknown; fit again with suite delta"
+        )
     training = describe_dynamics(dynamics)
     if fit["model"] != training["model"]:
         raise ValueError(
