@@ -23,6 +23,7 @@ from suite.loop.compare import CAVEAT, PolicyResult, cell_grid, overall_grid, po
 from suite.loop.config import LoopConfig, loop_by_content
 from suite.loop.variants import COLOURS, Findings
 from suite.loop.work import LoopRun, plan
+from suite.train.overrides import warmup_warnings
 from tracks.common.files import plain, to_json, write_json, write_text
 from tracks.common.grid import markdown, rich_table, table
 from tracks.common.provenance import VERSION, git_commit, stamp, stamp_text
@@ -53,6 +54,12 @@ def run_loop(
         loop = hidden_effect.LOOP if config.delta else hidden_effect.WITHOUT_DELTA
     run = LoopRun(loop, config, Path(out), console, workers)
     claim(run.out, loop_by_content(config), config.seed)
+    trainings = {"the fine-tunings": config.tuning}
+    if config.policy is None:
+        trainings["the training"] = config.training
+    for name, training in trainings.items():
+        for warning in warmup_warnings(training):
+            console.note(f"warning: {name}: {warning}")
     seconds = run_stages(run.out, plan(run), console, f"the loop, to {run.out}")
     return _report_results(run, seconds)
 
@@ -103,8 +110,7 @@ def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any
     # Print the same tables, the verdict and where the files are.
     for grid in grids:
         console.show(rich_table(grid))
-    errors = [] if loop.hidden else [text.strip("\n") for text in findings.errors]
-    console.say("\n\n".join([caveat, *errors, findings.verdict]) + "\n")
+    console.say(f"{caveat}\n\n{findings.verdict}\n")
     console.say(f"table:     {out / 'table.md'}")
     console.say(f"report:    {out / 'report.html'}")
     if loop.hidden:

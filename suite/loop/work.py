@@ -28,7 +28,7 @@ from suite.common.errors import WorkFailed
 from suite.common.running.remote import Job
 from suite.common.stages import Estimate, Stage, is_done
 from suite.common.work import do_jobs
-from suite.delta.run import fit_delta, fitting_estimate
+from suite.delta.run import errors_grid, fit_delta, fitting_estimate
 from suite.judging.collect import collect
 from suite.judging.evaluate import evaluate
 from suite.judging.flying import checkpoint_folder, flying_estimate, workers_for
@@ -42,6 +42,7 @@ from suite.loop.variants import DeltaModel, Loop, Variant
 from suite.train import run as training
 from suite.train.config import TrainConfig
 from tracks.common.files import replacing_folder, write_json
+from tracks.common.grid import markdown
 from tracks.common.work import Workers
 
 DIAGNOSED_S = 80.0
@@ -267,7 +268,8 @@ def _fit_stage(run: LoopRun, model: DeltaModel) -> Stage:
             ) from error
 
     def show_result(folder: Path) -> None:
-        for line in (folder / "table.md").read_text(encoding="utf-8").splitlines():
+        fitted = json.loads((folder / "delta.json").read_text(encoding="utf-8"))
+        for line in markdown(errors_grid(fitted)).splitlines():
             run.console.note(f"    {line}")
 
     tuning = run.config.tuning
