@@ -32,7 +32,8 @@ from suite.delta.replay import PointMassModel, check_corrects, describe_dynamics
 from suite.delta.run import errors_grid, fit_delta, long_enough, split
 from suite.delta.windows import cut_windows, log_decisions
 from suite.train.config import PointMassConfig, QuadrotorConfig
-from suite.train.recipes import race, race_paper
+from suite.train.overrides import with_changes
+from suite.train.recipes import quick, race, race_paper
 from tests.support.commands import run
 from tests.support.point_mass_flights import fly
 from tests.support.vehicles import with_lag
@@ -278,3 +279,13 @@ def test_other_dynamics_or_another_rate_are_refused(fitted, flown, rate_hz, word
 def test_a_model_that_does_not_name_its_dynamics_is_refused():
     with pytest.raises(ValueError, match="lacks plant, rate_hz of the fit"):
         check_corrects({"model": "point"}, RACE, 15.0, Path("runs/delta"))
+
+
+def test_what_is_advised_for_another_rate_is_accepted():
+    """A new rate keeps the delay in seconds, but the model was fitted to one in decisions."""
+    recipe = quick()
+    fit = json.loads(json.dumps(plain({"rate_hz": 30.02, **describe_dynamics(recipe.physics)})))
+    with pytest.raises(ValueError, match="--set") as refused:
+        check_corrects(fit, recipe.physics, recipe.spec.rate_hz, Path("runs/delta"))
+    advised = with_changes(recipe, str(refused.value).partition("--set ")[2].split())
+    check_corrects(fit, advised.physics, advised.spec.rate_hz, Path("runs/delta"))
