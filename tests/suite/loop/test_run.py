@@ -270,6 +270,7 @@ def test_where_nothing_is_named_the_loop_ends(hidden, tmp_path, monkeypatch, roo
     stub = Stub(monkeypatch, effects=())
     assert cli.main([*HIDDEN, "--out", str(out)]) == 1
     said = capfd.readouterr().err
+    assert "2 of 2 flights last 1.5 s or longer; 2 of them are diagnosed" in said
     assert "has the verdict unknown and names nothing to correct" in said and "--flights" in said
     assert not stub.trained and not (out / "loop.json").exists()
 
