@@ -19,7 +19,7 @@ from suite.train.overrides import (
     check_owned,
     check_phases,
     phase_configs,
-    phase_ends,
+    warmup_warnings,
     with_changes,
 )
 from suite.train.recipes import finetune, named_recipe, with_model, with_sensors
@@ -148,14 +148,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         )
     if text := narrow_view(resolved.spec.camera.fov_deg):
         console.note(f"warning: the policy: {text}; spec.camera.fov_deg is in degrees, not radians")
-    ends = phase_ends(resolved)
-    for phase, begin, end in zip(phase_configs(resolved), (0, *ends[:-1]), ends, strict=True):
-        if end - begin <= phase.optimizer.warmup:
-            console.note(
-                f"warning: {end - begin} gradient steps are not more than the warm-up "
-                f"(optimizer.warmup {phase.optimizer.warmup}), so the learning rate stays below "
-                "its peak"
-            )
+    for warning in warmup_warnings(resolved):
+        console.note(f"warning: {warning}")
     params, delta = None, None
     if config.init_from is not None:
         # The trained policy goes to out/policy, which must not be the one to start from.
@@ -175,7 +169,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         stored = load_delta(config.delta)
         for phase in phase_configs(resolved):
             dynamics = phase.quadrotor or phase.physics
-            check_corrects(stored.config["fit"], dynamics, phase.spec.rate_hz, config.delta)
+            check_corrects(stored.config.get("fit", {}), dynamics, phase.spec.rate_hz, config.delta)
         delta = jax.tree.map(jax.numpy.asarray, stored.arrays)
     mirror = tensorboard(config.out) if config.tensorboard and not member.number else None
     outcome = train(resolved, config.out, console, params, delta, mirror=mirror)

@@ -7,7 +7,7 @@ The commanded yaw rate is the recorded one, because an action does not set the h
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -78,15 +78,16 @@ def cut_quadrotor_windows(
     duration_s: float,
     stride_s: float,
     row_s: float | None = None,
+    warn: Callable[[str], None] = lambda text: None,
 ) -> tuple[QuadrotorWindows, Substeps]:
     """Return windows of all flights, and the physics steps of one row.
 
-    A window is left out if a value is missing or a row is not `row_s` long (within 20 %). Windows
-    are `duration_s` long, and start about `stride_s` apart [s]. The default of `row_s` [s] is
-    `row_period` of these logs.
+    A window is left out if a value is missing or a row is not `row_s` long (within 20 %), and
+    `warn` is called with a text about each flight without a window. Windows are `duration_s` long,
+    and start about `stride_s` apart [s]. The default of `row_s` [s] is `row_period` of these logs.
 
     Raises:
-        ValueError: if a log has no actions, or all flights are shorter than a window.
+        ValueError: if a log has no actions, or no flight has a window.
     """
     for log in logs:
         log_decisions(log)
@@ -102,11 +103,9 @@ def cut_quadrotor_windows(
     plant = plant_of(config, {}, substeps.dt, varies=False)
     delay_steps = plant.delay_weight.shape[-1]
     windows = [
-        window
-        for log in logs
-        for window in _flight_windows(log, substeps, delay_steps, row_s, duration_s, stride_s)
+        _flight_windows(log, substeps, delay_steps, row_s, duration_s, stride_s) for log in logs
     ]
-    return stack_windows(windows, logs, duration_s), substeps
+    return stack_windows(windows, logs, duration_s, warn), substeps
 
 
 def _flight_windows(

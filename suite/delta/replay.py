@@ -131,8 +131,13 @@ def check_corrects(
     decisions in the training [Hz]. The network makes one step per decision.
 
     Raises:
-        ValueError: if model, rate or parameters differ.
+        ValueError: if model, rate or parameters differ, or `fit` lacks one of them.
     """
+    if missing := {"model", "rate_hz", "plant"} - fit.keys():
+        raise ValueError(
+            f"--delta {checkpoint}: its config.json lacks {', '.join(sorted(missing))} of the fit, "
+            "so the dynamics that it corrects are unknown; fit again with suite delta"
+        )
     training = describe_dynamics(dynamics)
     if fit["model"] != training["model"]:
         raise ValueError(
@@ -141,11 +146,15 @@ def check_corrects(
         )
     rate = fit["rate_hz"]
     if abs(rate - rate_hz) > RATE_SHARE * rate_hz:
+        changes = f"spec.rate_hz={round(rate)}"
+        if isinstance(dynamics, PointMassConfig):
+            # Its delay is in decisions: another rate would change it, and so the corrected model.
+            changes += " physics.action_delay={:g},{:g}".format(*dynamics.action_delay)
         raise ValueError(
             f"--delta {checkpoint} was fitted to flights with {rate:.3g} decisions a second, and "
             f"this run has {rate_hz:g}: its memory is updated at each decision; fit again to "
             f"flights of a policy of {rate_hz:g} Hz, or give --finetune if the recipe's last phase "
-            f"has {round(rate)} Hz, or --set spec.rate_hz={round(rate)}"
+            f"has {round(rate)} Hz, or --set {changes}"
         )
     if fit["plant"] == training["plant"]:
         return

@@ -14,6 +14,7 @@ from eval.logs.flight_log import FlightLog
 from policies.formats.checkpoint import save_arrays
 from policies.formats.policy_file import DELTA
 from suite.common.console import Console
+from suite.common.errors import WorkFailed
 from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.stages import Estimate, announce, refuse_other_options
 from suite.delta.fit import DeltaFit, FitConfig, fit_network, fit_point_mass
@@ -100,14 +101,19 @@ def fit_delta(
     Raises:
         ValueError: for flights that are too few or too short, or lack a column, and if `out` has a
             fit with other options.
+        WorkFailed: if an error on the held-out flights is not finite.
     """
     request = request or config
     refuse_other_run(out, request)
     refuse_other_options(out, request)
     # Hold some of the flights out.
     logs, short = long_enough(flights.logs, config.horizon_s)
+
+    def warn(text: str) -> None:
+        console.note(f"warning: {text}")
+
     for warning in [*flights.warnings, *short]:
-        console.note(f"warning: {warning}")
+        warn(warning)
     groups = split(logs, config.held_out, config.seed)
     description = describe_dynamics(dynamics)
     # Cut both groups into windows, and select the fit through the given dynamics.
@@ -119,7 +125,7 @@ def fit_delta(
 
         row_s = row_period(logs)
         cuts = [
-            cut_quadrotor_windows(group, dynamics, config.horizon_s, config.stride_s, row_s)
+            cut_quadrotor_windows(group, dynamics, config.horizon_s, config.stride_s, row_s, warn)
             for group in groups
         ]
         fit_windows, held_out = (windows for windows, _ in cuts)
@@ -128,7 +134,7 @@ def fit_delta(
         run_fit = partial(fit_network, config, partial(replay_quadrotor, dynamics, substeps))
     else:
         fit_windows, held_out = (
-            cut_windows(group, config.horizon_s, config.stride_s) for group in groups
+            cut_windows(group, config.horizon_s, config.stride_s, warn) for group in groups
         )
         title, steps = "fitting the Delta Action Model", 1
         run_fit = partial(fit_point_mass, config, dynamics)
@@ -138,6 +144,11 @@ def fit_delta(
     announce(console, title, fitting_estimate(config, steps, description["model"] == QUAD))
     with console.progress("fitting", config.iterations) as show:
         result = run_fit(fit_windows, held_out, show)  # pyrefly: ignore[bad-argument-type]
+    if not np.isfinite(list(result.errors.values())).all():
+        raise WorkFailed(
+            "the fit diverged: an error on the held-out flights is not finite, so no model is "
+            "written; give another --seed, or check the vehicle file and the flights"
+        )
     # Write the record, the checkpoint and the tables.
     record = {
         "model": description["model"],

@@ -8,7 +8,7 @@ gates.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -23,6 +23,8 @@ from tracks.geometry.scene import Array
 T = TypeVar("T")
 RATE_SHARE = 0.05
 """Largest relative difference of decision rates that count as equal."""
+COMPLETE = "has all values, decisions and rows"
+"""What is necessary for a window, for messages."""
 HISTORY = 2
 """Number of decisions before a window whose commands may still act in it, because of the delay."""
 
@@ -63,36 +65,50 @@ def _heading(rot_w: np.ndarray) -> np.ndarray:
     return np.where(size > 1e-3, forward / np.maximum(size, 1e-3), [1.0, 0.0, 0.0])
 
 
-def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -> PointMassWindows:
+def cut_windows(
+    logs: Sequence[FlightLog],
+    duration_s: float,
+    stride_s: float,
+    warn: Callable[[str], None] = lambda text: None,
+) -> PointMassWindows:
     """Return windows of `duration_s`, about one per `stride_s` of every flight.
 
-    A window with a missing value is left out. The acceleration at the start is the change of the
-    measured velocity from the first row to the next, divided by the time between them.
+    A window with a missing value is left out, and `warn` is called with a text about each flight
+    without a window. The acceleration at the start is the change of the measured velocity from the
+    first row to the next, divided by the time between them.
 
     Raises:
-        ValueError: if a log has no actions, or all flights are shorter than a window.
+        ValueError: if a log has no actions, or no flight has a window.
     """
-    windows = [window for log in logs for window in _flight_windows(log, duration_s, stride_s)]
-    return stack_windows(windows, logs, duration_s)
+    windows = [_flight_windows(log, duration_s, stride_s) for log in logs]
+    return stack_windows(windows, logs, duration_s, warn)
 
 
-def stack_windows(windows: Sequence[T], logs: Sequence[FlightLog], duration_s: float) -> T:
-    """Return the windows of `logs` along a new first axis, as 32-bit numbers.
+def stack_windows(
+    by_flight: Sequence[Sequence[T]],
+    logs: Sequence[FlightLog],
+    duration_s: float,
+    warn: Callable[[str], None],
+) -> T:
+    """Return the windows of each of `logs` along a new first axis, as 32-bit numbers.
 
     They are truncated to the number of decisions that all have, and so are their burn-ins, since
-    flights with slightly shorter periods have more decisions in the same time.
+    flights with slightly shorter periods have more decisions in the same time. `warn` is called
+    with a text about each flight without a window.
 
     Raises:
-        ValueError: if there are none, since all flights are shorter than `duration_s` [s].
+        ValueError: if no flight has a window of `duration_s` [s].
     """
-    if not windows:
+    items: Sequence[Any] = [window for windows in by_flight for window in windows]
+    if not items:
         names = ", ".join(log.name for log in logs[:3])
         raise ValueError(
-            f"no window of {duration_s} s in {len(logs)} flights ({names}, ...); record longer "
-            "flights with suite collect"
+            f"no window of {duration_s} s in {len(logs)} flights ({names}, ...) {COMPLETE}; record "
+            "longer flights with suite collect"
         )
-
-    items: Sequence[Any] = windows
+    for log, windows in zip(logs, by_flight, strict=True):
+        if not windows:
+            warn(f"{log.name}: not used, no window of {duration_s} s {COMPLETE}")
     count = min(len(item.burn_in.seen) for item in items)
     items = [
         item._replace(burn_in=BurnIn(*(array[len(array) - count :] for array in item.burn_in)))

@@ -25,7 +25,6 @@ from suite.loop.options import Config
 from suite.train.config import TrainConfig, check
 from suite.train.overrides import at_rate, check_owned, check_phases, phase_configs, with_changes
 from suite.train.recipes import (
-    RECIPES,
     finetune,
     named_recipe,
     with_iterations,
@@ -171,7 +170,7 @@ def resolve(options: Config) -> LoopConfig:
     simulator, hidden_vehicle = options.simulator, options.hidden_vehicle
     hidden = hidden_vehicle is not None or simulator != EXACT_SIMULATORS[0]
     policy = default_policy() if hidden and options.policy is None else options.policy
-    recipe = given(options.recipe, policy if policy in RECIPES else "race")
+    recipe = given(options.recipe, policy if policy in shipped.names() else "race")
     training = replace(named_recipe(recipe), seed=options.seed)
     size = HIDDEN_SIZE if hidden else SIZES.get(recipe, SIZES[""])
     if options.iterations is not None:

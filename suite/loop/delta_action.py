@@ -20,6 +20,7 @@ from suite.delta.run import errors_by_name, errors_grid
 from suite.loop.compare import BEFORE, PolicyResult, points, significance
 from suite.loop.config import LoopConfig
 from suite.loop.variants import COLOURS, DeltaModel, Findings, Loop, ShownPolicy, Variant
+from tracks.common.grid import markdown
 
 WITHOUT, WITH = "without", "with"
 LABELS = {BEFORE: "before", WITHOUT: "tuned without delta", WITH: "tuned with delta"}
@@ -35,7 +36,7 @@ def summarise(config: LoopConfig, out: Path, policies: Sequence[PolicyResult]) -
     fitted = json.loads((out / "delta" / "delta.json").read_text(encoding="utf-8"))
     return Findings(
         verdict=verdict(policies, config.trials * config.cells),
-        errors=[(out / "delta" / "table.md").read_text(encoding="utf-8")],
+        errors=[markdown(errors_grid(fitted))],
         numbers={"delta": {key: value for key, value in fitted.items() if key != "curve"}},
         facts={"vehicle": config.vehicle},
         sections=[_delta_section(fitted), _training_section(out, config)],
@@ -65,8 +66,8 @@ def _delta_section(fitted: Mapping) -> Section:
         "Delta Action Model on held-out flights",
         [
             f"Recorded actions are flown again in the {corrected} for {horizon:g} s. "
-            f"{held} flights ({windows['held_out']} windows) are held out: no fit used them. "
-            f"The fit used {windows['fit']} windows of the other flights.",
+            f"No fit used the {windows['held_out']} windows of the held-out flights ({held}). The "
+            f"fit used {windows['fit']} windows of the other flights.",
             errors_grid(fitted),
             Picture(delta_chart(fitted), f"Mean distance from the record after {horizon:g} s."),
         ],
@@ -110,9 +111,9 @@ def _training_section(out: Path, config: LoopConfig) -> Section:
     if config.policy:
         first = f"From {config.policy}: "
     text = (
-        f"{first}{config.tuning.optimizer.iterations} of fine-tuning, without and with the frozen "
-        "Delta Action Model. Each policy was trained in other dynamics, on random tracks, so the "
-        "levels of the two fine-tunings are not comparable."
+        f"{first}{config.tuning.optimizer.iterations} iterations of fine-tuning, without and with "
+        "the frozen Delta Action Model. Each policy was trained in other dynamics, on random "
+        "tracks, so the levels of the two fine-tunings are not comparable."
     )
     return Section("Training", [text, Picture(chart, "Thin: each iteration. Thick: means.")])
 
@@ -128,7 +129,7 @@ LOOP = Loop(
     models=(DeltaModel("delta", "fitting the Delta Action Model to the flights"),),
     shown=(
         ShownPolicy(BEFORE, "before", "Flights before fine-tuning"),
-        ShownPolicy(WITH, "tuned with delta", "Flights, fine-tuned with delta"),
+        ShownPolicy(WITH, "tuned with delta", "Flights after fine-tuning with delta"),
     ),
     labels=LABELS,
     references=REFERENCES,

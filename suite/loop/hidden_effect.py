@@ -30,7 +30,7 @@ from suite.loop.config import EXACT_SIMULATORS, LoopConfig
 from suite.loop.variants import COLOURS, DeltaModel, Findings, Loop, ShownPolicy, Variant
 from suite.loop.work import named_effects, read_diagnosis
 from tracks.common.files import to_json
-from tracks.common.grid import Grid, markdown, table
+from tracks.common.grid import markdown, table
 
 NOMINAL, CONTROL, DELTA, NAMED, BOTH = "nominal", "control", "delta", "named", "both"
 LABELS = {
@@ -61,12 +61,19 @@ JUDGED = "judging the one fine-tuned {}, on the same seeds"
 def summarise(config: LoopConfig, out: Path, policies: Sequence[PolicyResult]) -> Findings:
     """Return the results of the finished loop in `out`."""
     diagnosis, trials = read_diagnosis(out), config.trials * config.cells
-    errors = _errors_grids(out) if config.delta else []
+    fits = _fits(out) if config.delta else {}
+    errors = [
+        errors_grid(fit, f"Delta Action Model of the {MODELS[name]} quadrotor")
+        for name, fit in fits.items()
+    ]
     keys = ("verdict", "effects", "gap", "unexplained")
     return Findings(
         verdict=verdict(policies, diagnosis, trials, vehicle_phrase(config)),
         errors=[*map(markdown, errors)],
-        numbers={"diagnosis": {key: diagnosis[key] for key in keys}},
+        numbers={
+            "diagnosis": {key: diagnosis[key] for key in keys},
+            **({"delta": fits} if fits else {}),
+        },
         facts={
             "simulation's vehicle": config.vehicle,
             "hidden vehicle": config.true_vehicle,
@@ -178,14 +185,13 @@ def hidden_effects(simulated: Vehicle, true: Vehicle) -> str:
     return "; ".join(texts)
 
 
-def _errors_grids(out: Path) -> list[Grid]:
-    return [
-        errors_grid(
-            json.loads((out / f"delta-{name}" / "delta.json").read_text(encoding="utf-8")),
-            f"Delta Action Model of the {quadrotor} quadrotor",
-        )
-        for name, quadrotor in MODELS.items()
-    ]
+def _fits(out: Path) -> dict[str, dict[str, Any]]:
+    """Return the contents of delta.json of each Delta Action Model, without the learning curve."""
+    fits = {}
+    for name in MODELS:
+        fits[name] = json.loads((out / f"delta-{name}" / "delta.json").read_text(encoding="utf-8"))
+        fits[name].pop("curve", None)
+    return fits
 
 
 def _training_section(out: Path, config: LoopConfig) -> Section:
@@ -195,7 +201,7 @@ def _training_section(out: Path, config: LoopConfig) -> Section:
     chart = curves_chart(curves, COLOURS[2:])
     text = (
         f"{config.tuning.optimizer.iterations} iterations each, from {config.policy}. Each policy "
-        "was trained with another vehicle, so the levels of the curves are not comparable."
+        "was trained in other dynamics, so the levels of the curves are not comparable."
     )
     return Section("Fine-tuning", [text, Picture(chart, "Thin: each step. Thick: means.")])
 
@@ -249,7 +255,9 @@ LOOP = Loop(
     shown=(
         ShownPolicy(BEFORE, "before fine-tuning", "Flights before fine-tuning"),
         ShownPolicy(
-            NAMED, "fine-tuned with the named effect", "Flights fine-tuned with the named effect"
+            NAMED,
+            "fine-tuned with the named effect",
+            "Flights after fine-tuning with the named effect",
         ),
     ),
     labels=LABELS,

@@ -17,13 +17,15 @@ from suite.common.charts import dots, legend, png, titled
 from suite.common.console import Console, duration
 from suite.common.report import Details, Links, Part, Picture, Report, Section, html
 from suite.common.stages import claim, run_stages, stage_commits
+from suite.judging.flying import checkpoint_folder
 from suite.judging.trials import parse_tracks
 from suite.loop import delta_action, hidden_effect
 from suite.loop.compare import CAVEAT, PolicyResult, cell_grid, overall_grid, policy_results
 from suite.loop.config import LoopConfig, loop_by_content
 from suite.loop.variants import COLOURS, Findings
 from suite.loop.work import LoopRun, plan
-from tracks.common.files import plain, to_json, write_json, write_text
+from suite.train.overrides import warmup_warnings
+from tracks.common.files import check_no_input, plain, to_json, write_json, write_text
 from tracks.common.grid import markdown, rich_table, table
 from tracks.common.provenance import VERSION, git_commit, stamp, stamp_text
 from tracks.common.work import Workers
@@ -44,7 +46,8 @@ def run_loop(
         The contents of loop.json, and `out`.
 
     Raises:
-        ValueError: if `out` has a run of another configuration.
+        ValueError: if `out` has a run of another configuration, is in the folder of the policy, or
+            has a vehicle's file where the diagnosis writes.
         WorkFailed: if a training diverges, the flights cannot be used, or the diagnosis names
             nothing to correct.
     """
@@ -52,9 +55,32 @@ def run_loop(
     if config.hidden_vehicle is not None:
         loop = hidden_effect.LOOP if config.delta else hidden_effect.WITHOUT_DELTA
     run = LoopRun(loop, config, Path(out), console, workers)
+    _refuse_inputs_in(run.out, config)
     claim(run.out, loop_by_content(config), config.seed)
+    trainings = {"the fine-tunings": config.tuning}
+    if config.policy is None:
+        trainings["the training"] = config.training
+    for name, training in trainings.items():
+        for warning in warmup_warnings(training):
+            console.note(f"warning: {name}: {warning}")
     seconds = run_stages(run.out, plan(run), console, f"the loop, to {run.out}")
     return _report_results(run, seconds)
+
+
+def _refuse_inputs_in(out: Path, config: LoopConfig) -> None:
+    """Refuse an `out` in which the loop would copy the policy into itself or overwrite a vehicle.
+
+    Raises:
+        ValueError: naming the folder or the file.
+    """
+    if config.policy is not None:
+        folder, place = checkpoint_folder(config.policy).resolve(), out.resolve()
+        if folder in (place, *place.parents):
+            raise ValueError(
+                f"--out {out} is in the folder of the policy {config.policy}; give another --out"
+            )
+    vehicles = [config.vehicle, config.hidden_vehicle]
+    check_no_input(out / "diagnosis" / "vehicle.toml", vehicles)
 
 
 def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any]:
@@ -103,8 +129,7 @@ def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any
     # Print the same tables, the verdict and where the files are.
     for grid in grids:
         console.show(rich_table(grid))
-    errors = [] if loop.hidden else [text.strip("\n") for text in findings.errors]
-    console.say("\n\n".join([caveat, *errors, findings.verdict]) + "\n")
+    console.say(f"{caveat}\n\n{findings.verdict}\n")
     console.say(f"table:     {out / 'table.md'}")
     console.say(f"report:    {out / 'report.html'}")
     if loop.hidden:

@@ -28,7 +28,7 @@ from suite.common.errors import WorkFailed
 from suite.common.running.remote import Job
 from suite.common.stages import Estimate, Stage, is_done
 from suite.common.work import do_jobs
-from suite.delta.run import fit_delta, fitting_estimate
+from suite.delta.run import errors_grid, fit_delta, fitting_estimate
 from suite.judging.collect import collect
 from suite.judging.evaluate import evaluate
 from suite.judging.flying import checkpoint_folder, flying_estimate, workers_for
@@ -37,11 +37,12 @@ from suite.judging.requests import Collection, Evaluation
 from suite.judging.trials import parse_levels
 from suite.loop.compare import BEFORE
 from suite.loop.config import EXACT_SIMULATORS, LoopConfig
-from suite.loop.measured import add_measurement_noise, first_files
+from suite.loop.measured import SHORTEST_S, add_measurement_noise, first_files
 from suite.loop.variants import DeltaModel, Loop, Variant
 from suite.train import run as training
 from suite.train.config import TrainConfig
 from tracks.common.files import replacing_folder, write_json
+from tracks.common.grid import markdown
 from tracks.common.work import Workers
 
 DIAGNOSED_S = 80.0
@@ -186,6 +187,8 @@ def _recording_stage(run: LoopRun) -> Stage:
 
 
 def _measuring_stage(run: LoopRun) -> Stage:
+    recorded = run.config.flights * run.config.cells
+
     def work(folder: Path) -> None:
         try:
             files = add_measurement_noise(run.out / "flights", folder, run.config.seed)
@@ -196,9 +199,18 @@ def _measuring_stage(run: LoopRun) -> Stage:
         names = [file.name for file in first_files(files, DIAGNOSED_S)]
         write_json(folder / "diagnosed.json", {"files": names})
 
+    def show_result(folder: Path) -> None:
+        used, diagnosed = (
+            len(json.loads((folder / name).read_text(encoding="utf-8"))["files"])
+            for name in ("measured.json", "diagnosed.json")
+        )
+        run.console.note(
+            f"    {used} of {recorded} flights last {SHORTEST_S:g} s or longer; {diagnosed} of "
+            "them are diagnosed"
+        )
+
     title = "adding measurement noise, and cutting the flights before contact"
-    estimate = Estimate(1 + 0.05 * run.config.flights * run.config.cells, 0)
-    return Stage("measured", title, estimate, work)
+    return Stage("measured", title, Estimate(1 + 0.05 * recorded, 0), work, show_result)
 
 
 def _diagnosis_stage(run: LoopRun) -> Stage:
@@ -267,7 +279,8 @@ def _fit_stage(run: LoopRun, model: DeltaModel) -> Stage:
             ) from error
 
     def show_result(folder: Path) -> None:
-        for line in (folder / "table.md").read_text(encoding="utf-8").splitlines():
+        fitted = json.loads((folder / "delta.json").read_text(encoding="utf-8"))
+        for line in markdown(errors_grid(fitted)).splitlines():
             run.console.note(f"    {line}")
 
     tuning = run.config.tuning

@@ -180,6 +180,18 @@ def phase_ends(config: TrainConfig) -> tuple[int, ...]:
     return tuple(ends)
 
 
+def warmup_warnings(config: TrainConfig) -> list[str]:
+    """Return a warning for each phase that ends before its learning rate reaches the peak."""
+    ends = phase_ends(config)
+    counts = (end - begin for begin, end in zip((0, *ends), ends, strict=False))
+    return [
+        f"{count} gradient steps are not more than the warm-up (optimizer.warmup "
+        f"{phase.optimizer.warmup}), so the learning rate stays below its peak"
+        for phase, count in zip(phase_configs(config), counts, strict=True)
+        if count <= phase.optimizer.warmup
+    ]
+
+
 def phase_configs(config: TrainConfig) -> tuple[TrainConfig, ...]:
     """Return the settings of each phase, as if the phase were a whole run.
 

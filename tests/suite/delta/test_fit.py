@@ -12,19 +12,28 @@ import pytest
 
 from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.check import CheckContext
-from eval.logs.faults.checked import read_checked
+from eval.logs.faults.checked import CheckedFlights, read_checked
 from eval.logs.faults.finding import Finding
 from eval.logs.flight_log import flight_files, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies.formats.policy_file import load_delta
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
-from suite.delta.fit import FitConfig, _descend, _loss, identify, window_errors
+from suite.delta.fit import (
+    DeltaFit,
+    FitConfig,
+    ReplayErrors,
+    _descend,
+    _loss,
+    identify,
+    window_errors,
+)
 from suite.delta.replay import PointMassModel, check_corrects, describe_dynamics, nominal_model
 from suite.delta.run import errors_grid, fit_delta, long_enough, split
 from suite.delta.windows import cut_windows, log_decisions
 from suite.train.config import PointMassConfig, QuadrotorConfig
-from suite.train.recipes import race, race_paper
+from suite.train.overrides import with_changes
+from suite.train.recipes import quick, race, race_paper
 from tests.support.commands import run
 from tests.support.point_mass_flights import fly
 from tests.support.vehicles import with_lag
@@ -223,6 +232,19 @@ def test_what_cannot_be_split_is_refused_and_flights_shorter_than_a_window_are_l
     assert long_enough([logs[0], crash], 1.0) == ([logs[0], crash], [])
 
 
+def test_a_fit_that_diverges_fails_and_writes_nothing(logs, tmp_path, monkeypatch):
+    """A checkpoint that is not finite would be found at the next command only."""
+
+    def diverged(*_):
+        errors = {"point_mass": ReplayErrors(0.2, 0.2), "delta_action": ReplayErrors(0.2, np.nan)}
+        return DeltaFit({}, errors, [])
+
+    monkeypatch.setattr("suite.delta.run.fit_point_mass", diverged)
+    with pytest.raises(WorkFailed, match="the fit diverged"):
+        fit_delta(CONFIG, PHYSICS, CheckedFlights(logs), tmp_path / "out", Console())
+    assert not (tmp_path / "out").exists()
+
+
 def corrects(fitted, flown, rate_hz=15.0):
     """Check a run's dynamics against those that a checkpoint of 15 Hz has, as JSON has them."""
     kept = json.loads(json.dumps(plain({"rate_hz": 15.03, **describe_dynamics(fitted)})))
@@ -252,3 +274,18 @@ def test_other_ranges_with_the_same_middle_and_another_name_of_the_vehicle_do_no
 def test_other_dynamics_or_another_rate_are_refused(fitted, flown, rate_hz, words):
     with pytest.raises(ValueError, match=words):
         corrects(fitted, flown, rate_hz)
+
+
+def test_a_model_that_does_not_name_its_dynamics_is_refused():
+    with pytest.raises(ValueError, match="lacks plant, rate_hz of the fit"):
+        check_corrects({"model": "point"}, RACE, 15.0, Path("runs/delta"))
+
+
+def test_what_is_advised_for_another_rate_is_accepted():
+    """A new rate keeps the delay in seconds, but the model was fitted to one in decisions."""
+    recipe = quick()
+    fit = json.loads(json.dumps(plain({"rate_hz": 30.02, **describe_dynamics(recipe.physics)})))
+    with pytest.raises(ValueError, match="--set") as refused:
+        check_corrects(fit, recipe.physics, recipe.spec.rate_hz, Path("runs/delta"))
+    advised = with_changes(recipe, str(refused.value).partition("--set ")[2].split())
+    check_corrects(fit, advised.physics, advised.spec.rate_hz, Path("runs/delta"))

@@ -73,8 +73,11 @@ def test_windows_begin_a_stride_apart_and_leave_out_gaps_and_what_is_missing():
     assert len(found.time_step) and found.time_step.max() < 0.05
     once = 1.0 * (np.arange(len(log.time_s)) == 10)
     single = replace(log, extra={**log.extra, "policy_step": once})
-    alone, both = module.cut_windows([log], 0.5, 0.3), module.cut_windows([log, single], 0.5, 0.3)
+    words: list[str] = []
+    alone = module.cut_windows([log], 0.5, 0.3, words.append)
+    both = module.cut_windows([log, single], 0.5, 0.3, words.append)
     assert len(both.pos_w) == len(alone.pos_w), "a single decision makes no window"
+    assert words == [f"{single.name}: not used, no window of 0.5 s {module.COMPLETE}"]
 
 
 @pytest.mark.parametrize("cut", ["point mass", "quadrotor"])
@@ -330,8 +333,11 @@ def test_windows_of_two_parts_have_one_grid(logs):
     config = QuadrotorConfig(TRUE)
     row_s = row_period([*logs[1:], slow])
     assert row_s == pytest.approx(0.01)
-    with pytest.raises(ValueError, match="no window of 0.5 s"):
+    with pytest.raises(ValueError, match="no window of 0.5 s .* has all values"):
         cut_quadrotor_windows([slow], config, 0.5, 0.3, row_s)
+    words: list[str] = []
+    cut_quadrotor_windows([*logs[1:], slow], config, 0.5, 0.3, row_s, words.append)
+    assert len(words) == 1 and words[0].startswith(f"{slow.name}: not used")
     with pytest.raises(ValueError, match="action_x.*suite collect"):
         cut_quadrotor_windows([replace(logs[0], extra={})], config, 0.5, 0.3)
     assert len(cut_quadrotor_windows([slow], config, 0.5, 0.3)[0].pos_w) > 0

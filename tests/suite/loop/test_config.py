@@ -58,6 +58,23 @@ def test_what_cannot_be_used_is_refused_before_any_writing(line, words, tmp_path
     assert not list(tmp_path.iterdir())
 
 
+def test_inputs_in_the_folder_of_the_loop_are_neither_copied_into_themselves_nor_overwritten(
+    tmp_path, root, capsys
+):
+    policy = tmp_path / "mine"
+    shutil.copytree(shipped.locate("race-paper"), policy)
+    before = sorted(policy.iterdir())
+    for out in (policy, policy / "loop"):
+        words = commands.refused(capsys, f"loop --policy {policy} --out", out)
+        assert f"is in the folder of the policy {policy}" in words
+    file = tmp_path / "out" / "diagnosis" / "vehicle.toml"
+    file.parent.mkdir(parents=True)
+    shutil.copy(root / EXAMPLE, file)
+    words = commands.refused(capsys, f"loop --hidden-vehicle {file} --out", tmp_path / "out")
+    assert f"{file} is also an input and would be overwritten" in words
+    assert sorted(policy.iterdir()) == before and not (tmp_path / "out" / "run.json").exists()
+
+
 def test_a_copy_hides_nothing_and_a_load_on_a_line_may_be_hidden_only(tmp_path, root):
     copy = tmp_path / "copy.toml"
     text = (root / "eval" / "vehicles" / "racer5.toml").read_text(encoding="utf-8")
@@ -91,6 +108,16 @@ def test_sizes_are_the_recipes_options_go_first_and_a_policy_has_its_own_recipe(
         assert resolve(policy=policy) == resolve(policy=policy, recipe=policy or "race")
         hidden, own = {"policy": policy, "hidden_vehicle": EXAMPLE}, policy or shipped.DEFAULT
         assert resolve(**hidden) == resolve(**hidden, recipe=own)
+
+
+def test_a_policys_folder_with_the_name_of_a_recipe_has_the_recipe_of_any_other(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    for name in ("quick", "mine"):
+        shutil.copytree(shipped.locate("race-paper"), name)
+    quick, mine = resolve(policy="quick"), resolve(policy="mine")
+    assert quick.trials == mine.trials == 50 and quick.tuning == mine.tuning
 
 
 def test_settings_are_of_the_fine_tuning_and_its_rate_where_a_policy_is_given():

@@ -84,7 +84,7 @@ def finished(out, stages, pictures):
     assert list(found["stage_seconds"]) == stages
     assert all((out / name / "stage.json").is_file() for name in stages)
     table, page = (out / "table.md").read_text(), (out / "report.html").read_text()
-    assert found["verdict"] in table
+    assert found["verdict"] in table and table.count("<!--") == 1
     assert page.count("data:image/png;base64,") == pictures
     assert "<script" not in page and "http" not in page
     assert all((out / line.split('"')[0]).is_file() for line in page.split('href="')[1:])
@@ -113,8 +113,12 @@ def test_a_finished_loop_is_only_told_again_and_another_one_refused(whole, monke
     small = Small(monkeypatch)
     before = (out / "table.md").read_text()
     assert cli.main([*TRAIN, "--out", str(out), "--json"]) == 0
-    said = json.loads(capfd.readouterr().out)
+    printed = capfd.readouterr()
+    said = json.loads(printed.out)
     assert said["verdict"] in before and (out / "table.md").read_text() == before
+    for name, count in (("fine-tunings", 2), ("training", 3)):
+        assert f"the {name}: {count} gradient steps are not more than the warm-up" in printed.err
+    assert "| point mass with Delta Action Model |" in printed.err and "<!--" not in printed.err
     other = " ".join(TRAIN).replace("--trials 2", "--trials 5").split()
     assert cli.main([*other, "--out", str(out)]) == 2
     said = capfd.readouterr().err
@@ -212,6 +216,7 @@ def test_a_loop_with_a_hidden_effect_leaves_tables_report_and_recording(hidden):
     assert [one["name"] for one in found["standings"]] == list(LABELS)
     assert found["diagnosis"]["effects"][0]["name"] == "com_offset"
     assert "com_offset (or torque_trim)" in found["verdict"]
+    assert [fit["without"]["position_m"] for fit in found["delta"].values()] == [0.1, 0.1]
     assert all(f"| {label} |" in table for label in LABELS.values())
     assert "com_offset (offset [0.012, 0.0, 0.0] m)." in page
     rows = page.replace("\n", "")
@@ -227,6 +232,7 @@ def test_without_the_delta_none_is_fitted_and_two_policies_are_tuned(tmp_path, m
     stages = ["tuned-control", "tuned-named", "eval-control", "eval-named", "replays"]
     found, *_ = finished(tmp_path, [*DIAGNOSED, *stages], 4)
     assert [one["name"] for one in found["standings"]] == ["nominal", "before", "control", "named"]
+    assert "delta" not in found
     assert not stub.fitted and not any(with_delta for _, with_delta, _ in stub.trained)
 
 
@@ -264,6 +270,7 @@ def test_where_nothing_is_named_the_loop_ends(hidden, tmp_path, monkeypatch, roo
     stub = Stub(monkeypatch, effects=())
     assert cli.main([*HIDDEN, "--out", str(out)]) == 1
     said = capfd.readouterr().err
+    assert "2 of 2 flights last 1.5 s or longer; 2 of them are diagnosed" in said
     assert "has the verdict unknown and names nothing to correct" in said and "--flights" in said
     assert not stub.trained and not (out / "loop.json").exists()
 
