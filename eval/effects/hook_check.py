@@ -71,9 +71,12 @@ def hook_problem(effect: Effect) -> str | None:
     hooks = [name for name in CALLS if getattr(effect, name) is not None]
     if not hooks and effect.late is None:
         return f"without a hook it does nothing; give one of {', '.join(CALLS)}"
+    import jax  # imported here, because only effects of other programs need it
+
     for name in hooks:
         try:
-            with np.errstate(all="ignore"):
+            # The first use of an effect may be inside a function that JAX traces.
+            with np.errstate(all="ignore"), jax.ensure_compile_time_eval():
                 problem = _problem_of(effect, name)
         except Exception as error:  # a hook may raise anything
             problem = f"fails with {type(error).__name__}: {(str(error) or '?').splitlines()[0]}"
@@ -87,7 +90,7 @@ def hook_problem(effect: Effect) -> str | None:
 
 def _problem_of(effect: Effect, name: str) -> str | None:
     """Return what is wrong with one hook, or None."""
-    import jax  # imported here, because only effects of other programs need it
+    import jax
 
     hook = getattr(effect, name)
     tangent = jax.jit(lambda *given: jax.jvp(hook, given, jax.tree.map(jax.numpy.ones_like, given)))

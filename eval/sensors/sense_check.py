@@ -40,8 +40,11 @@ def sensor_problem(sensor: Sensor) -> str | None:
             )
     if not sensor.sense:
         return None
+    import jax  # imported here, because only models of other programs need it
+
     try:
-        with np.errstate(all="ignore"):
+        # The first use of a model may be inside a function that JAX traces.
+        with np.errstate(all="ignore"), jax.ensure_compile_time_eval():
             problem = _problem_of(sensor)
     except Exception as error:  # a model may raise anything
         problem = f"fails with {type(error).__name__}: {(str(error) or '?').splitlines()[0]}"
@@ -55,7 +58,7 @@ def sensor_problem(sensor: Sensor) -> str | None:
 
 def _problem_of(sensor: Sensor) -> str | None:
     """Return what is wrong with the results of `start` and `sense`, or None."""
-    import jax  # imported here, because only models of other programs need it
+    import jax
 
     def seen_by(values: Any, trial: Any, *views_and_draws: tuple[View, Any]) -> tuple[Any, list]:
         """Return the memory at the start, and what the model shows of each view."""

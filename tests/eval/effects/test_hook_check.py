@@ -4,6 +4,7 @@ from dataclasses import replace
 from itertools import count
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import pytest
 
@@ -44,6 +45,16 @@ def write(values, flow):
 @pytest.mark.parametrize("name", EFFECTS)
 def test_the_suites_effects_pass(name):
     assert parameter_problem(EFFECTS[name]) is hook_problem(EFFECTS[name]) is None
+
+
+def test_an_effect_may_be_checked_while_jax_traces_a_function():
+    problems = []
+
+    def traced(number):
+        problems.append(hook_problem(SPRING))
+        return number + 1.0
+
+    assert jax.jit(traced)(1.0) == 2.0 and problems == [None]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from dataclasses import replace
 from itertools import count
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import pytest
 
@@ -56,6 +57,16 @@ def write(values, memory, seen, moment):
 @pytest.mark.parametrize("name", SENSORS)
 def test_the_suites_models_pass(name):
     assert sensor_problem(SENSORS[name]) is None
+
+
+def test_a_model_may_be_checked_while_jax_traces_a_function():
+    problems = []
+
+    def traced(number):
+        problems.append(sensor_problem(SHAKE))
+        return number + 1.0
+
+    assert jax.jit(traced)(1.0) == 2.0 and problems == [None]
 
 
 @pytest.mark.parametrize(
