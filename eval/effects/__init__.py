@@ -45,7 +45,10 @@ def _registration_error(name: str, effect: Any) -> str | None:
             f"its values ({effect.values.__name__}) have the fields {list(fields)} and its "
             f"parameters the names {list(names)}; both must be the same, in the same order"
         )
-    return None
+    # Imported here, because only effects of other programs need it.
+    from eval.effects.hook_check import hook_problem, parameter_problem
+
+    return parameter_problem(effect) or hook_problem(effect)
 
 
 _BUILT_IN = (

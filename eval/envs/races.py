@@ -27,7 +27,7 @@ from eval.envs.race import (
 from eval.judging.guard import ActionLimits, check_rate, first_action, guard_action, limits_of
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds.engine import course_notes, warn_of
+from eval.worlds.engine import course_notes, family_notes, warn_of
 from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.slots import layout_of
 from eval.worlds.trial import ENDINGS, FLYING, Rules, TrialSpec, check_rules, steps_to_next
@@ -227,10 +227,8 @@ class Races:
         for name in config.rewards:
             if name not in REWARDS:
                 raise unknown_name("reward term", name, REWARDS)
-        self._file_track: Track | None = None
-        if self._track.endswith(".toml"):
-            self._file_track = load_track(self._track)
-        else:
+        self._file_track = load_track(self._track) if self._track.endswith(".toml") else None
+        if not self._file_track:
             check_family(self._track)
         vehicle = self._vehicle = resolved_vehicle(config, np.random.default_rng(0))
         self.spec = resolved_spec(config, vehicle)
@@ -241,6 +239,8 @@ class Races:
             said = f"{self._track}: a track from a file has no levels and seeds: "
             warn_of(course_notes(self._track, self._file_track, vehicle))
             warn_of(f"{said}{name} does not change it" for name in ignored if ignored[name])
+        else:
+            warn_of(family_notes(self._track, levels_of(config)[0], 0, vehicle))
         self.contract: Contract = contract_of(self.spec)
         layout = layout_of([self._file_track] if self._file_track else [])
         self._world = MujocoWorld(

@@ -46,6 +46,7 @@ def import_log(
     from eval.importers.assemble import assemble
     from eval.importers.formats import FORMATS, detect
     from eval.importers.options import ImportOptions
+    from eval.importers.signals import check_recording
 
     options = options or ImportOptions()
     file = Path(path)
@@ -63,4 +64,6 @@ def import_log(
             f"{file} is read as {name!r}, which has one source of the pose: leave --source "
             f"{reader_options.source} out"
         )
-    return ImportedLog(*assemble(reader.read(file, reader_options), name, options))
+    recording = reader.read(file, reader_options)
+    check_recording(recording, name)
+    return ImportedLog(*assemble(recording, name, options))

@@ -21,10 +21,9 @@ from eval.importers.cleaning import (
     without_repeats,
 )
 from eval.importers.commands import SHARE, order_motors, rates_wanted, thrust_command
-from eval.importers.mapping import KEPT
 from eval.importers.options import ImportOptions
 from eval.importers.rows import GAP_S, GAP_STEPS, row_times, rows_at, sampled_rows, slowest
-from eval.importers.signals import NEEDED, Recording, Signal, median_step, with_readings
+from eval.importers.signals import KEPT, NEEDED, Recording, Signal, median_step, with_readings
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
 from eval.logs.faults.check import DRIVE, POSE, CheckContext, run_checks
 from eval.logs.faults.clocks.delay import OF_POSE

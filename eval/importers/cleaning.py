@@ -12,9 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from eval.importers.frames import rates_between
-from eval.importers.mapping import KEPT
 from eval.importers.rows import continuous
-from eval.importers.signals import MAD_TO_SD, Recording, Signal, median_step
+from eval.importers.signals import KEPT, MAD_TO_SD, Recording, Signal, median_step
 from eval.logs.faults.clocks.delay import LATE_S, LEAST_S, OF_POSE, SURE, delay_of
 from eval.logs.faults.clocks.rotation import rotation_findings
 from eval.logs.faults.clocks.stamps import MEASURED, even_stamps, finding_of, measured_in

@@ -15,9 +15,8 @@ from itertools import permutations
 import numpy as np
 
 from eval.importers.frames import conjugate, multiply, rotation_vector
-from eval.importers.mapping import KEPT
 from eval.importers.options import ImportOptions
-from eval.importers.signals import MAD_TO_SD
+from eval.importers.signals import KEPT, MAD_TO_SD
 from eval.logs.faults.drive.motors import SHIPPED_ORDER
 from eval.logs.faults.finding import Finding
 from eval.quadrotor.loops import command_of_throttle

@@ -19,7 +19,7 @@ from eval.importers.frames import attitude, body_vector, conjugate, from_euler, 
 from eval.importers.mapping_file import MIXERS, Column, LogMap
 from eval.importers.options import ImportOptions
 from eval.importers.rows import continuous, measured, turn_axes
-from eval.importers.signals import Part, Recording, Signal, collect, make_signal
+from eval.importers.signals import KEPT, Part, Recording, Signal, collect, make_signal
 from eval.logs.columns import ESTIMATE, GROUPS, FlightLogError
 from eval.logs.faults.drive.commands import clip_commands, is_share
 from eval.logs.faults.finding import Finding
@@ -30,8 +30,6 @@ from eval.logs.faults.vectors import GOOD
 
 Find = Callable[[tuple[str, ...]], Part | None]
 """Function that returns the times and values of named columns, or None where one is missing."""
-KEPT = "kept:"
-"""Prefix of the name of a column that is kept unchanged."""
 ESTIMATED = ("pos", "quat", "vel")
 """Signals that may come as motion capture and as on-board estimate."""
 ANGLES = ("roll", "pitch", "yaw")

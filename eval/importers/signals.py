@@ -14,10 +14,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.logs.columns import LARGEST, FlightLogError
+from eval.logs.columns import GROUPS, LARGEST, FlightLogError
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.reading import QUATS, Readings, option, read_as, seconds
+from tracks.common.names import unknown_name
 
+KEPT = "kept:"
+"""Prefix of the name of a column that is kept unchanged."""
+WIDTHS = {name: len(columns) for name, columns in GROUPS.items() if name != "time"} | {
+    "throttle": 1,
+    "cmd_quat": 4,
+}
+"""Name of a signal -> number of its columns."""
 NEEDED = ("pos", "quat", "rate")
 """Signals that a flight log must have; a partial log lacks some of them."""
 BACKWARDS_MAX = 0.05
@@ -108,6 +116,24 @@ def make_signal(
     note = f"{backwards} samples of {name!r} whose time does not increase are left out"
     finding = Finding("note", "time", note) if backwards else None
     return Signal(time_s[forward], value[forward]), finding
+
+
+def check_recording(recording: Any, format: str) -> None:
+    """Refuse a result of a format's `read` whose signals would be ignored or misread.
+
+    Raises:
+        ValueError: for another type than a `Recording`, an unknown signal, or a wrong shape.
+    """
+    if not isinstance(recording, Recording):
+        raise ValueError(f"format {format!r} reads a {type(recording).__name__}, not a Recording")
+    for name, samples in recording.signals.items():
+        if name.startswith(KEPT):
+            continue
+        if name not in WIDTHS:
+            raise unknown_name(f"signal of the format {format!r}", name, [*WIDTHS, f"{KEPT}NAME"])
+        wanted, shape = (len(samples.time_s), WIDTHS[name]), np.shape(samples.value)
+        if shape != wanted:
+            raise ValueError(f"format {format!r} reads {name!r} of shape {shape}, not {wanted}")
 
 
 def collect(parts: Mapping[str, Part], file: str) -> tuple[dict[str, Signal], tuple[Finding, ...]]:

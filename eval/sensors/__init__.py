@@ -43,7 +43,10 @@ def _registration_error(name: str, sensor: Any) -> str | None:
             f"its values ({sensor.values.__name__}) have the fields {list(fields)} and its "
             f"parameters the names {list(names)}; both must be the same, and `grows` of them"
         )
-    return None
+    # Imported here, because only models of other programs need it.
+    from eval.sensors.sense_check import sensor_problem
+
+    return sensor_problem(sensor)
 
 
 _BUILT_IN = (

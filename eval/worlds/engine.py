@@ -21,12 +21,14 @@ from eval.worlds.trial import (
     judge_state,
     start_progress,
 )
+from tracks.families import SHIPPED, make_track
 from tracks.formats.mujoco_scene import add_scene, solid_name
 from tracks.formats.plausibility import track_notes
 from tracks.geometry.camera import Camera, cast_rays_b, nearest
 from tracks.geometry.rotation import to_world
 from tracks.geometry.scene import Counts, Gates, counts
 from tracks.track import Track
+from tracks.track_check import check_track
 
 BODY = 1
 """Index of the quadrotor's body in a model; the world body has index 0."""
@@ -157,8 +159,10 @@ def course_notes(name: str, track: Track, vehicle: Vehicle) -> list[str]:
     """Return notes on what is probably a mistake in a track from a file that `vehicle` flies.
 
     Raises:
-        ValueError: if the vehicle is in contact at the start, with the start and the touched solid.
+        ValueError: for an impossible track (`tracks.track_check`), or if the vehicle is in contact
+            at the start, with the start and the touched solid.
     """
+    check_track(track)
     model = compile_model(track, vehicle, 1.0 / vehicle.controller.frequency, counts(track.scene))
     data = mujoco.MjData(model)
     data.qpos[:] = start_state(track)
@@ -169,6 +173,21 @@ def course_notes(name: str, track: Track, vehicle: Vehicle) -> list[str]:
             f"{name}: at start.position {np.round(track.start_pos_w, 3).tolist()} the body of "
             f"{vehicle.name!r} ({sides} m) touches {contact_name(model, data)}; move the start away"
         )
+    return track_doubts(name, track, vehicle)
+
+
+def family_notes(family: str, level: int, seed: int, vehicle: Vehicle) -> list[str]:
+    """Return notes on what is probably a mistake in a family that the suite does not ship.
+
+    One track of the family is examined, which `vehicle` flies.
+    """
+    if family in SHIPPED:
+        return []
+    return track_doubts(family, make_track(family, level, seed), vehicle)
+
+
+def track_doubts(name: str, track: Track, vehicle: Vehicle) -> list[str]:
+    """Return notes on what is probably a mistake in a track, and on gates too small to fly."""
     return [*track_notes(name, track), *opening_notes(name, track, vehicle)]
 
 

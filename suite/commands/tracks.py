@@ -40,21 +40,17 @@ def run(config: Config, console: Console) -> dict[str, Any]:
                 "tracks zigzag, or leave them out to list the families"
             )
         return _list_families(console)
+    from eval.quadrotor.vehicle_file import load_vehicle
     from eval.view.picture import write_grid, write_picture
+    from eval.worlds.engine import family_notes, track_doubts
     from tracks.families import FAMILIES, check_family, make_track
 
     pictures = []
     if is_track_file(config.track):
-        from eval.quadrotor.vehicle_file import load_vehicle
-        from eval.worlds.engine import opening_notes
         from tracks.formats.custom import load_track
-        from tracks.formats.plausibility import track_notes
 
         tracks = [load_track(Path(config.track))]
-        notes = track_notes(config.track, tracks[0])
-        notes += opening_notes(config.track, tracks[0], load_vehicle("racer5"))
-        for note in notes:
-            console.note(note)
+        notes = track_doubts(config.track, tracks[0], load_vehicle("racer5"))
         if config.difficulty != Config.difficulty:
             console.note(NO_LEVELS)
         if seed_given:
@@ -66,6 +62,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         check_family(config.track)
         levels = parse_levels(config.difficulty)
         tracks = [make_track(config.track, level, config.seed) for level in levels]
+        notes = family_notes(config.track, levels[0], config.seed, load_vehicle("racer5"))
+    for note in notes:
+        console.note(note)
     for track in tracks:
         picture = config.out / f"{Path(config.track).stem}-{track.level}-{track.seed}.png"
         write_picture(picture, track)

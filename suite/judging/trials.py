@@ -138,7 +138,7 @@ def read_trial_set(
     from eval.sensors import SENSORS
     from eval.sensors.sensors_file import load_sensors
     from eval.worlds import differences, world_class
-    from eval.worlds.engine import course_notes
+    from eval.worlds.engine import course_notes, family_notes
     from tracks.formats.custom import load_track
 
     world_class(options.simulator)
@@ -176,6 +176,8 @@ def read_trial_set(
         notes += [f"{name}: {NO_LEVELS}" for name in tracks]
     for name, custom in tracks.items():
         notes += course_notes(name, custom, vehicle)
+    for name in (name for name in names if name not in tracks):
+        notes += family_notes(name, levels[0], options.seed, vehicle)
     trials = trial_list(names, levels, options.trials, options.seed, once)
     simulator_differences = differences(options.simulator, vehicle)
     return TrialSet(trials, tracks, vehicle, sensors, simulator_differences, notes)

@@ -169,7 +169,10 @@ class Registry(Mapping[str, T]):
         return self._entries
 
     def _checked(self, name: str, value: Any, origin: str) -> Any:
-        problem = self._check(name, value)
+        try:
+            problem = self._check(name, value)
+        except Exception as error:  # an attribute of another package may be anything
+            problem = f"cannot be checked ({type(error).__name__}: {error})"
         if problem:
             raise ValueError(f"{self._kind} {name!r} ({origin}): {problem}")
         return value

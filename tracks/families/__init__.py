@@ -9,6 +9,7 @@ a random generator. Another package adds one with an entry point of the group
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from numbers import Integral
 
 import numpy as np
@@ -19,6 +20,7 @@ from tracks.families.layout import GATE_COUNT, Layout
 from tracks.geometry.scene import Counts, counts
 from tracks.input.ranges import check_type
 from tracks.track import Track
+from tracks.track_check import check_track
 
 FAMILIES: Registry[Callable[[float, np.random.Generator], Layout]] = Registry(
     "track family",
@@ -34,6 +36,8 @@ FAMILIES: Registry[Callable[[float, np.random.Generator], Layout]] = Registry(
 """Name of a family -> function that draws its tracks."""
 JUDGED = ("zigzag", "circular", "ellipse")
 """The families on which policies are evaluated; they are trained on `random`."""
+SHIPPED = (*JUDGED, "random")
+"""The families of the suite; the tracks of others are checked."""
 LEVELS = range(10)
 """Difficulty levels, 0 (easy) to 9 (hard)."""
 MAX_COUNTS = Counts(boxes=70, cylinders=15, capsules=12, spheres=12)
@@ -49,8 +53,9 @@ def make_track(family: str, level: int, seed: int) -> Track:
     The level is 0 (easy) to 9 (hard); the difficulty is (level + U(0, 1)) / 10.
 
     Raises:
-        ValueError: where the family is unknown or does not return a Layout, the level is out of
-            range, the seed is negative, or the track has more solids than `MAX_COUNTS`.
+        ValueError: where the family is unknown, does not return a Layout, or draws random numbers
+            without the generator; the level is out of range or the seed negative; the track has
+            more solids than `MAX_COUNTS`, or is not possible (`tracks.track_check`).
     """
     check_family(family)
     levels, seeds = "a whole number from 0 to 9", "a whole number, 0 or more"
@@ -70,7 +75,10 @@ def make_track(family: str, level: int, seed: int) -> Track:
             "tracks.families.layout.build makes one"
         )
     track = Track(family, level, seed, d, *layout)
-    _check_size(track)
+    if family not in SHIPPED:
+        check_track(track)
+        _check_size(track)
+        _check_repeats(family)
     return track
 
 
@@ -93,6 +101,18 @@ def random_track(
 def check_family(family: str) -> None:
     """Raise a ValueError with the closest name where `family` is unknown."""
     FAMILIES.find(family)
+
+
+@cache
+def _check_repeats(family: str) -> None:
+    """Refuse a family that draws two different tracks from equal random generators."""
+    one, other = (FAMILIES[family](0.5, np.random.default_rng(0)).scene for _ in range(2))
+    pairs = zip(one[:5], other[:5], strict=True)
+    if not all(np.array_equal(a, b) for parts in pairs for a, b in zip(*parts, strict=True)):
+        raise ValueError(
+            f"track family {family!r} draws two different tracks from one seed; draw all random "
+            "numbers from its argument rng, and keep nothing between calls"
+        )
 
 
 def _check_size(track: Track) -> None:

@@ -75,7 +75,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "vehicle_inertia": ("the inertia is another vehicle's or in another unit", ""),
     "vehicle_thrust": ("thrust-to-weight is implausible", ""),
     "vehicle_torque": ("torque over thrust of a rotor is implausible", ""),
-    "vehicle_gain": ("gains of the rate loop are in another unit", ""),
+    "vehicle_gain": ("gains or limits of the rate loop are in another unit", ""),
     "vehicle_mixed": ("the logs are of several vehicles", ""),
     "camera_fov": ("the policy saw with another camera", ""),
     "file": ("the file is damaged, or of another kind", "log again"),

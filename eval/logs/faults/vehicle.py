@@ -33,6 +33,8 @@ GAINS = {
 """Kind of a firmware's rate loop -> its P gains about roll and pitch."""
 BODY_M, BODY_PER_ARM = 1.5, (0.1, 3.0)
 """Largest usual half size of the body [m], and its usual ratio to the arm."""
+RATE_MOST = 50.0
+"""Largest plausible limit of a body rate [rad/s], 2900 deg/s; racers have up to 35."""
 FOV_LEAST_DEG = 10.0
 """If both fields of view are smaller than this [deg], they are probably in radians."""
 MOTOR_PER_ROTOR = (0.2, 5.0)
@@ -117,7 +119,7 @@ def vehicle_doubts(vehicle: Vehicle) -> list[str]:
 
 
 def _of_simulation(vehicle: Vehicle, arm: float) -> list[Finding]:
-    """Return findings on the body, camera, motors and firmware gains; `arm` is in m."""
+    """Return findings on body, limits, camera, motors and firmware gains; `arm` is in m."""
     found = []
     size = max(vehicle.body.half_size)
     if size > BODY_M:
@@ -126,6 +128,10 @@ def _of_simulation(vehicle: Vehicle, arm: float) -> list[Finding]:
         units = [str(k) for k in (100, 1000) if low <= size / k / arm <= high]
         fix = "body.half_size in m" + (f": divide by {' or '.join(units)}" if units else "")
         found.append(Finding("doubt", "vehicle", text, "vehicle_arms", size, UNSURE, fix))
+    if (fastest := max(vehicle.controller.rate_max)) > RATE_MOST:
+        text = f"controller.rate_max is {fastest:g} rad/s, {np.rad2deg(fastest):.0f} deg/s"
+        fix = "controller.rate_max in rad/s, not deg/s"
+        found.append(Finding("doubt", "vehicle", text, "vehicle_gain", fastest, UNSURE, fix))
     fov_deg = vehicle.camera.fov_deg
     if text := narrow_view(fov_deg):
         fix = "camera.fov_deg in degrees, not radians"

@@ -1,10 +1,13 @@
 """Cells that hold no sample (placeholders, outliers, repeats): left out before the checks."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from eval.importers import import_log
 from eval.importers.cleaning import without_repeats
+from eval.importers.formats import FORMATS
 from eval.importers.formats.table import unwrapped
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, Signal, collect
@@ -140,3 +143,29 @@ def test_a_thrust_without_gravity_cuts_no_flight_and_gets_its_gravity(tmp_path):
     assert found.fix == "--read cmd_thrust=plus-gravity" and len(log.time_s) == 800
     assert "no signal shows when the motors run" in text(findings, "ground")
     np.testing.assert_allclose(log.thrust_cmd, thrust[:, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("signals", "said"),
+    [
+        ({"gyro": np.zeros((9, 3))}, "unknown signal of the format 'mine' 'gyro'"),
+        ({"motors": np.zeros((9, 4))}, "Did you mean 'motor'"),
+        ({"pos": np.zeros((9, 2))}, r"'pos' of shape \(9, 2\), not \(9, 3\)"),
+        ({"voltage": np.zeros(9)}, r"'voltage' of shape \(9,\), not \(9, 1\)"),
+        (None, "reads a NoneType, not a Recording"),
+    ],
+)
+def test_signals_of_another_packages_format_that_would_be_ignored_are_refused(
+    tmp_path, monkeypatch, signals, said
+):
+    recording = signals and Recording(
+        "file", {name: Signal(np.arange(9.0), value) for name, value in signals.items()}
+    )
+    mine = SimpleNamespace(
+        SUMMARY="", detect=lambda head, options: True, read=lambda path, options: recording
+    )
+    for held in ("_entries", "_values"):
+        monkeypatch.setitem(getattr(FORMATS, held), "mine", mine)
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(ValueError, match=said):
+        import_log(tmp_path / "file", "mine")

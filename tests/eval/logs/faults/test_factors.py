@@ -26,6 +26,7 @@ SCALED = Controller(
     PLAIN.controller.rate_gain, 500.0, kind="betaflight",
     settings=KINDS["betaflight"].Settings(p_roll=0.45),
 )  # fmt: skip
+DEGREES = replace(PLAIN.controller, rate_max=(180.0, 180.0, 90.0))
 """A firmware's loop with a gain in another unit."""
 HOVER = np.sqrt(PLAIN.mass * 9.81 / (4 * PLAIN.rotors.thrust_coefficient))
 
@@ -112,13 +113,11 @@ def test_an_inertia_that_the_turns_exclude_is_doubted(factor, named):
     )
 
 
-@pytest.mark.parametrize(
-    ("unit", "inertia", "divisor"),
-    [(100, 1, "100"), (1000, 1, "1000"), (1000, 0.05, "100 or 1000")],
-)
-def test_arms_in_cm_or_mm_are_converted_by_the_divisor_that_fits_the_inertia(
-    unit, inertia, divisor
-):
+ARMS = [(100, 1, "100"), (1000, 1, "1000"), (1000, 0.05, "100 or 1000")]
+
+
+@pytest.mark.parametrize(("unit", "inertia", "divisor"), ARMS)
+def test_arms_in_cm_or_mm_are_converted_by_what_fits_the_inertia(unit, inertia, divisor):
     hubs = tuple((unit * x, unit * y, unit * z) for x, y, z in PLAIN.rotors.position)
     moments = tuple(inertia * moment for moment in PLAIN.inertia)
     wrong = replace(PLAIN, inertia=moments, rotors=replace(PLAIN.rotors, position=hubs))
@@ -149,6 +148,7 @@ def test_numbers_copied_from_a_firmware_are_doubted(torque, gain, fault, fix):
         ({"camera": replace(PLAIN.camera, fov_deg=(1.37, 1.11))}, "camera_fov", "not radians"),
         ({"motors": MotorMap((0.0, 100.0), 16.0)}, "motor_map", "in N, of one motor"),
         ({"controller": SCALED}, "vehicle_gain", "the firmware's own tool"),
+        ({"controller": DEGREES}, "vehicle_gain", "in rad/s, not deg/s"),
     ],
 )
 def test_values_of_simulated_flights_are_doubted_and_stop_no_diagnosis(changes, fault, fix):
