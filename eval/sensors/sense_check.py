@@ -6,6 +6,7 @@ outside of its memory would change results without an error.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,7 @@ def sensor_problem(sensor: Sensor) -> str | None:
     try:
         # The first use of a model may be inside a function that JAX traces.
         with np.errstate(all="ignore"), jax.ensure_compile_time_eval():
-            problem = _problem_of(sensor)
+            problem = _problem_of(sensor, sensor.sense)
     except Exception as error:  # a model may raise anything
         problem = f"fails with {type(error).__name__}: {(str(error) or '?').splitlines()[0]}"
     if problem:
@@ -56,7 +57,7 @@ def sensor_problem(sensor: Sensor) -> str | None:
     return None
 
 
-def _problem_of(sensor: Sensor) -> str | None:
+def _problem_of(sensor: Sensor, sense: Callable[..., tuple[View, Any]]) -> str | None:
     """Return what is wrong with the results of `start` and `sense`, or None."""
     import jax
 
@@ -68,7 +69,7 @@ def _problem_of(sensor: Sensor) -> str | None:
         )
         shown = []
         for truth, draws in views_and_draws:
-            seen, memory = sensor.sense(values, memory, truth, Moment(truth, draws, DT_S, CAMERA))
+            seen, memory = sense(values, memory, truth, Moment(truth, draws, DT_S, CAMERA))
             shown.append((seen, memory))
         return start, shown
 
