@@ -18,6 +18,7 @@ import numpy as np
 
 from eval.effects.log_faults import pose_delay
 from eval.logs.flight_log import FlightLog
+from eval.quadrotor.continuous import Flight
 from eval.quadrotor.plant import assemble
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.noise import Linearisation, Noise, measured_noise, residual_as_noise
@@ -42,7 +43,7 @@ from suite.diagnose.evidence.linearise import (
     linearised,
     slopes_along,
 )
-from suite.diagnose.evidence.rollout import Flown, at_knots, difference, fly_windows
+from suite.diagnose.evidence.rollout import at_knots, difference, fly_windows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 ACC_ROW = 9
@@ -253,7 +254,7 @@ class RolloutModel:
         """Return measured - simulated (W, N, 19) at the estimate `at`."""
         return self.linearise(at, windows, []).residual
 
-    def respond(self, at: Estimate, windows: FlightWindows) -> tuple[Linearisation, Flown]:
+    def respond(self, at: Estimate, windows: FlightWindows) -> tuple[Linearisation, Flight]:
         """Return residuals and slopes along disturbances, and the states (W, KNOTS, ...) at knots.
 
         These are a force [m/s^2] and torque [rad/s^2] in body axes at one of the knots each.
@@ -292,7 +293,7 @@ def compiled(
 
     def fly(
         given: VehicleArrays, theta: Any, offset: Any, windows: FlightWindows, push: Any = None
-    ) -> tuple[Any, Flown]:
+    ) -> tuple[Any, Flight]:
         values = effects_at(layout, given.base, theta)
         plant = assemble(given.nominal, given.constants, values, LONGEST_S, 0.0, given.loop)
         flown = fly_windows(plant, values, rotor_input, voltage, integrator, offset, windows, push)
@@ -300,7 +301,7 @@ def compiled(
 
     def respond(
         given: VehicleArrays, theta: Any, offset: Any, windows: FlightWindows
-    ) -> tuple[Any, Any, Flown]:
+    ) -> tuple[Any, Any, Flight]:
         none = jnp.zeros((BATCH, KNOTS, 6))
 
         def along(direction: Any) -> Any:

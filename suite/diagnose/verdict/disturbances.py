@@ -24,12 +24,12 @@ from scipy.stats import chi2
 from eval.effects import EFFECTS
 from eval.effects.interface import GRAVITY
 from eval.effects.wind import CONSTANT_WIND, GUSTS, VERTICAL, ConstantWind, Gusts
+from eval.quadrotor.continuous import Flight
 from eval.quadrotor.plant import Motion, assemble
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
 from suite.diagnose.data.view import SmoothedFlight
 from suite.diagnose.data.windows import KNOTS
 from suite.diagnose.evidence.evidence import flights_agree
-from suite.diagnose.evidence.rollout import Flown
 from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.verdict.actuators import LEAST_P, TestedEffect
@@ -248,12 +248,12 @@ def _range_of(tried: np.ndarray, is_likely: np.ndarray) -> list[float] | None:
     return [float(tried[is_likely][0]), float(tried[is_likely][-1])]
 
 
-def _wind_transmission(model: RolloutModel, theta: np.ndarray, knot: Flown) -> np.ndarray:
+def _wind_transmission(model: RolloutModel, theta: np.ndarray, knot: Flight) -> np.ndarray:
     """Return the accelerations per m/s of wind along world axes, (W, 6 KNOTS, 3 KNOTS)."""
     given = model.given
     values = {n: v for n, v in model.space.effects(theta).items() if EFFECTS[n].by_state}
     steady_w = np.asarray(values[CONSTANT_WIND.name].velocity)
-    motion = Motion(*(np.asarray(field) for field in knot.track))
+    motion = Motion(*(np.asarray(field) for field in knot.motion))
     count = len(motion.pos_w)
     state = PlantState(np.asarray(knot.rotor_speed), np.zeros(0), {})
     zeros = np.zeros(motion.pos_w.shape[:2])
@@ -273,12 +273,12 @@ def _wind_transmission(model: RolloutModel, theta: np.ndarray, knot: Flown) -> n
     return transmission.reshape(count, KNOTS * 6, KNOTS * 3)
 
 
-def _wind_root(knot: Flown, length_m: float) -> np.ndarray:
+def _wind_root(knot: Flight, length_m: float) -> np.ndarray:
     """Return a root (W, 3 KNOTS, 3 KNOTS) of the covariance of a wind of intensity 1 m/s.
 
     The correlation decays exponentially with the distance flown over the length scale `length_m`.
     """
-    speed = np.maximum(np.sqrt((np.asarray(knot.track.vel_w) ** 2).sum(axis=-1)), 1.0)
+    speed = np.maximum(np.sqrt((np.asarray(knot.motion.vel_w) ** 2).sum(axis=-1)), 1.0)
     step = 0.5 * (speed[:, 1:] + speed[:, :-1]) / (KNOTS - 1) / length_m
     distance = np.concatenate([np.zeros((len(speed), 1)), np.cumsum(step, axis=1)], axis=1)
     correlation = np.exp(-np.abs(distance[:, :, None] - distance[:, None, :]))
