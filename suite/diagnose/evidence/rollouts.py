@@ -69,11 +69,6 @@ class RolloutEvidence(Evidence):
         """The parameters of all effects in the catalogue."""
         return self.model.space
 
-    @property
-    def flights_differ_p(self) -> float:
-        """1 if the model is wrong, as its error is the same all along a flight; else 0."""
-        return 1.0 if self.misfit_is_noise else 0.0
-
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
         """Return the block at `at`, with slopes along `indices`; see `Evidence`."""
         linear = self.model.linearise(at, self.trusted, indices)
@@ -196,7 +191,9 @@ def rollout_evidence(
     near = linear._replace(windows=trusted(linear.windows, linear.residual, limits))
     noise = noise or measured_noise(near, limits)
     whitening = make_whitening(near, noise, limits)
-    evidence = RolloutEvidence(model, linear.windows, near.windows, noise, whitening, limits=limits)
+    evidence = RolloutEvidence(
+        model, linear.windows, near.windows, noise, whitening, limits=limits, misfit_is_noise=False
+    )
     indices = range(model.size) if along is None else along
     return evidence, block_of(whitening, linear, indices)
 
