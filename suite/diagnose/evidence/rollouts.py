@@ -151,7 +151,7 @@ def rollouts_along(
     windows, warnings = cut(logs, vehicle, rotor_input, stride_s, limits, integrator)
     if windows is None:
         raise ValueError("; ".join(warnings))
-    model = RolloutModel(vehicle, make_space(vehicle), rotor_input, voltage, integrator)
+    model = RolloutModel(vehicle, rotor_input, voltage, integrator)
     return model, windows, start_estimate(model, windows)
 
 
@@ -225,15 +225,10 @@ class RolloutModel:
     """Simulation of windows with one vehicle: their residuals and slopes, compiled."""
 
     def __init__(
-        self,
-        vehicle: Vehicle,
-        space: ParameterSpace,
-        rotor_input: bool,
-        voltage: bool,
-        integrator: str = "continuous",
+        self, vehicle: Vehicle, rotor_input: bool, voltage: bool, integrator: str = "continuous"
     ) -> None:
         """Prepare the rollout of `vehicle`; for the other arguments see `fly_windows`."""
-        self.space = space
+        self.space = space = make_space(vehicle)
         self.size = len(space.entries)
         self.free = STATE + 4 * (KNOTS if rotor_input else 1)
         """Number F of start numbers of each window, which are fitted, too: 12 of its state, and 4
@@ -244,8 +239,7 @@ class RolloutModel:
         self.dt = step_s(vehicle)
         """About the length of a step [s]."""
         self.integrator = integrator
-        functions = compiled(space.layout, rotor_input, voltage, integrator)
-        _, self._linear, self._respond = functions
+        _, self._linear, self._respond = compiled(space.layout, rotor_input, voltage, integrator)
 
     def residual(self, at: Estimate, windows: FlightWindows) -> np.ndarray:
         """Return measured - simulated (W, N, 19) at the estimate `at`."""

@@ -242,7 +242,7 @@ class RolloutSource(Source):
         except ValueError:  # no flight meets the conditions of the force view
             return None
         voltage = all(log.voltage is not None for log in self.logs)
-        model = ForceModel(self.vehicle, self.space, voltage)
+        model = ForceModel(self.vehicle, voltage)
         return residual_swing(ViewEvidence(FORCE, model, flights, limits=self.limits), theta)
 
     def explained_by_steps(self, found: SearchResult) -> bool:

@@ -22,7 +22,7 @@ from suite.diagnose.data.whitening import Whitening, block_of, make_whitening, s
 from suite.diagnose.data.windows import LENGTH_S, SLICES, cut, take
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.composites import composites
-from suite.diagnose.estimate.parameters import candidates, make_space
+from suite.diagnose.estimate.parameters import candidates
 from suite.diagnose.evidence.evidence import Evaluation
 from suite.diagnose.evidence.rollouts import (
     RolloutModel,
@@ -95,7 +95,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
         f"{BASE_S + count * STRETCH_S:.0f} s, and half a minute more the first time on a machine"
     )
     voltage = all(log.voltage is not None for log in logs)
-    model = RolloutModel(vehicle, make_space(vehicle), rotor_input, voltage, integrator)
+    model = RolloutModel(vehicle, rotor_input, voltage, integrator)
     start = start_estimate(model, windows)
     linear = model.linearise(start, windows)
     is_finite = _finite(linear, limits)

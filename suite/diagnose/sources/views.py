@@ -20,7 +20,7 @@ from suite.diagnose.data.hold_out import choose_held_out, parted
 from suite.diagnose.data.inertial import UNSEEN, is_inertial
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.gauss_newton import TINY
-from suite.diagnose.estimate.parameters import Candidate, candidates, make_space
+from suite.diagnose.estimate.parameters import Candidate, candidates
 from suite.diagnose.evidence.view_means import ForceModel, means_of
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.search.change import (
@@ -58,10 +58,10 @@ def by_views(given: DiagnosisInput) -> SourceSet:
     # Smooth the flights, and set up the model and the effects that the search tries.
     vehicle, limits, references = given.vehicle, given.limits, given.references
     flights = ready(given.logs, vehicle, limits, given.references)
-    logs, space = flights.logs, make_space(vehicle)
+    logs = flights.logs
     voltage = all(log.voltage is not None for log in [*logs, *references])
-    model = ForceModel(vehicle, space, voltage)
-    allowed, not_shown = candidates(space, voltage, ()), list[str]()
+    model = ForceModel(vehicle, voltage)
+    allowed, not_shown = candidates(model.space, voltage, ()), list[str]()
     # Flights without a position (inertial logs) do not show wind.
     if any(is_inertial(log) for log in [*logs, *references]):
         allowed = [one for one in allowed if EFFECTS[one.name].wind is None]
