@@ -131,10 +131,11 @@ def cut(
     stride_s: float = LENGTH_S,
     limits: Thresholds = THRESHOLDS,
     integrator: str = "continuous",
-    coarser: FlightWindows | None = None,
     only: Collection[int] | None = None,
     since_s: float = 0.0,
-    fewer_commands: FlightWindows | None = None,
+    like: FlightWindows | None = None,
+    stride: int = 1,
+    held: int = 1,
 ) -> tuple[FlightWindows | None, list[str]]:
     """Return the windows of `logs` (None if no flight has one) and warnings.
 
@@ -148,11 +149,11 @@ def cut(
         limits: longest hole in a window, and largest numbers of windows.
         integrator: integrator of the model; with "euler" its steps are those that the log states,
             or else the rate loop's periods.
-        coarser: windows of an earlier call, which are cut again with steps of twice the length
-            and every second rotor speed.
         only: numbers of the flights that are cut; all if not given.
         since_s: earliest start of a window after its log's start [s].
-        fewer_commands: as `coarser`, but with usual steps and every second command.
+        like: windows of an earlier call, to whose size these are padded.
+        stride: factor on the length of the steps; only every `stride`-th rotor speed is used.
+        held: only every `held`-th command is used.
     """
     starts, warnings = list[tuple[int, int]](), list[str]()  # (flight, row) each
     states = [on_every_row(log, limits) for log in logs]
@@ -179,12 +180,11 @@ def cut(
     if len(starts) > most:
         warnings.append(f"{most} stretches of 1 s, evenly spread, are used of {len(starts)}")
         starts = [starts[k] for k in np.linspace(0, len(starts) - 1, most).astype(int)]
-    steps_s = [LONGEST_S * (1.0 if coarser is None else 2.0)] * len(logs)
+    steps_s = [LONGEST_S * stride] * len(logs)
     if integrator == "euler":
         steps_s = [log.step_s or 1.0 / vehicle.controller.frequency for log in logs]
-    held = 1 if fewer_commands is None else 2
     inputs = [_input_of(logs[k], row, vehicle, steps_s[k], held) for k, row in starts]
-    sizes, stride = _padded_sizes(inputs, coarser or fewer_commands), 1 if coarser is None else 2
+    sizes = _padded_sizes(inputs, like)
     windows = [
         _window(logs[k], states[k], k, row, vehicle, spacings_s.get(k), one, stride, sizes)
         for (k, row), one in zip(starts, inputs, strict=True)
