@@ -188,10 +188,7 @@ def _hats(time_s: Any) -> Any:
 
 
 def _places(time_s: Any, edge_s: Any) -> Any:
-    """Return number, time since the start [s] and length [s] of the step of each `time_s` (B, N).
-
-    `edge_s` (B, S + 1) are the ends of the steps.
-    """
+    """Return number, time since the start and length [s] of the step of each `time_s` (B, N)."""
     ends = edge_s.shape[1] - 1
     step = jax.vmap(partial(jnp.searchsorted, side="right"))(edge_s, time_s + 1e-9) - 1
     step = jnp.clip(step, 0, ends - 1)

@@ -119,10 +119,7 @@ def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
 
 
 def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None:
-    """Return the spectrum of a flight with the residual force `residual_b` (M, 3) [m/s^2].
-
-    None where it is too short for one, or has many holes.
-    """
+    """Return the spectrum of `residual_b` (M, 3) [m/s^2]; None if too short, or with many holes."""
     middle_s = flight.form.middle_s
     if len(middle_s) < LEAST_MEANS:
         return None
@@ -316,13 +313,10 @@ def _has_outliers(
 
 
 def _free_likelihood(equations: DisturbanceEquations) -> float:
-    """Return the largest log-likelihood ratio of a random disturbance along the body axes.
-
-    Fitted are the logarithms of a size for each of the six axes and of one correlation time.
-    """
+    """Return the largest log-likelihood ratio of a random disturbance along the body axes."""
     time = np.linspace(0.0, 1.0, KNOTS)
 
-    def loss(logs: np.ndarray) -> float:
+    def loss(logs: np.ndarray) -> float:  # of a size for each axis, and of a correlation time
         sizes, tau_s = np.exp(logs[:6]), np.exp(logs[6])
         correlation = np.exp(-np.abs(time[:, None] - time) / tau_s) + 1e-9 * np.eye(KNOTS)
         root = np.kron(np.linalg.cholesky(correlation), np.diag(sizes))
