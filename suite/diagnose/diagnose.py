@@ -75,8 +75,9 @@ def diagnose(
     # A delay of half a step between pose and rates is how MuJoCo integrates, not a fault. If that
     # explains the named effects, repeat the diagnosis with its integrator.
     is_continuous = integrator == "auto" and integrator_of(logs, "auto") == "continuous"
-    rollouts = rollouts_of(main)
-    if rollouts and is_continuous and rollouts.explained_by_steps(main.search):
+    longest_s = limits.integrator_share * (1.0 / vehicle.controller.frequency)
+    delays_s = pose_delays(main.search).values() if rollouts_of(main) else ()
+    if is_continuous and any(abs(delay_s) <= longest_s for delay_s in delays_s):
         say("pose and rates differ by half a step: repeating with MuJoCo's Euler steps")
         euler = _diagnose(replace(given, integrator="euler", chosen=True), names[:1], seed)
         if not pose_delays(euler.main.search):

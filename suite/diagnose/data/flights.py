@@ -294,10 +294,7 @@ def acting_rotors(log: FlightLog, vehicle: Vehicle, limits: Thresholds) -> Actin
 
 
 def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:
-    """Return the rotor speeds (N, 4) behind commanded ones `wanted` (N, 4); NaN where these are.
-
-    A command holds until the next row, and acts after the vehicle's delay and first-order lag.
-    """
+    """Return the rotor speeds (N, 4) behind held commands (N, 4), by delay and lag; NaN stays."""
     constants = make_plant(vehicle, LONGEST_S).constants
     acts_s, lag = log.time_s + float(constants.delay), float(constants.time_constant)
     # A delayed command may begin to act between two rows.

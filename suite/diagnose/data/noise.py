@@ -221,11 +221,7 @@ def _without_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.nd
 def _fit_by_time(
     stretches: _Stretches, limits: Thresholds, times_s: Sequence[float] = TIMES_S
 ) -> list[tuple[_Process, float]]:
-    """Return for each T in `times_s` the most likely process, and its gain over white noise.
-
-    The gain is a difference of log-likelihoods. A process with a drift (error of the model) has to
-    be clearly more likely than without it.
-    """
+    """Return the most likely process for each T, and its log-likelihood above white noise's."""
 
     def score(process: _Process) -> float:
         """Return the restricted log-likelihood, less the cost of a drift."""
@@ -298,8 +294,8 @@ def noise_of(
     upper limit. A polynomial is subtracted from (by default `limits.noise_rows`) rows together.
     """
     block_rows, degree = rows_together or limits.noise_rows, limits.noise_degree
-    power: list[list[float]] = [[] for _ in range(CHANNELS)]
-    freedom: list[list[int]] = [[] for _ in range(CHANNELS)]
+    # Sum of squares and degrees of freedom of each piece, by channel.
+    pieces: list[list[tuple[float, int]]] = [[] for _ in range(CHANNELS)]
     valid = np.asarray(windows.valid)
     # For each window, and each set of channels that were measured in the same rows.
     for w in range(len(residual)):
@@ -315,13 +311,11 @@ def noise_of(
                 basis = np.linalg.qr(_powers(np.asarray(windows.row_s)[w, rows], degree))[0]
                 remainder = values - basis @ (basis.T @ values)
                 for channel, energy in zip(channels, (remainder**2).sum(axis=0), strict=True):
-                    power[channel].append(float(energy))
-                    freedom[channel].append(count - degree - 1)
+                    pieces[channel].append((float(energy), count - degree - 1))
     sigma = np.full(CHANNELS, np.nan)
     for c in range(CHANNELS):
-        if power[c]:
-            freedoms = np.array(freedom[c])
-            sigma[c] = np.sqrt(typical_variance(np.array(power[c]), freedoms))
+        if pieces[c]:
+            sigma[c] = np.sqrt(typical_variance(*np.array(pieces[c]).T))
         elif valid[..., c].any():
             sigma[c] = np.sqrt((residual[..., c][valid[..., c]] ** 2).mean())
     return at_least(sigma, limits)

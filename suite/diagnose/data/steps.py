@@ -104,11 +104,8 @@ def padded_grid(grid: StepGrid, count: int, at_front: bool = False) -> StepGrid:
     """Return `grid` with `count` steps; the added ones have zero length, and so no effect."""
     missing = count - len(grid.sample_s)
     ends = (missing, 0) if at_front else (0, missing)
-    return StepGrid(
-        np.pad(grid.edge_s, ends, mode="edge"),
-        np.pad(grid.sample_s, ends),
-        np.pad(grid.lead_s, ends),
-    )
+    edge_s = np.pad(grid.edge_s, ends, mode="edge")
+    return StepGrid(edge_s, np.pad(grid.sample_s, ends), np.pad(grid.lead_s, ends))
 
 
 def _step_rows(row_s: np.ndarray, shortest_s: float) -> np.ndarray:

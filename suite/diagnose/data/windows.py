@@ -7,7 +7,7 @@ short time before, the rotors follow the commands, so that their speeds at the s
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -131,10 +131,11 @@ def cut(
     stride_s: float = LENGTH_S,
     limits: Thresholds = THRESHOLDS,
     integrator: str = "continuous",
-    coarser: FlightWindows | None = None,
     only: Collection[int] | None = None,
     since_s: float = 0.0,
-    fewer_commands: FlightWindows | None = None,
+    like: FlightWindows | None = None,
+    stride: int = 1,
+    held: int = 1,
 ) -> tuple[FlightWindows | None, list[str]]:
     """Return the windows of `logs` (None if no flight has one) and warnings.
 
@@ -148,11 +149,11 @@ def cut(
         limits: longest hole in a window, and largest numbers of windows.
         integrator: integrator of the model; with "euler" its steps are those that the log states,
             or else the rate loop's periods.
-        coarser: windows of an earlier call, which are cut again with steps of twice the length
-            and every second rotor speed.
         only: numbers of the flights that are cut; all if not given.
         since_s: earliest start of a window after its log's start [s].
-        fewer_commands: as `coarser`, but with usual steps and every second command.
+        like: windows of an earlier call, to whose size these are padded.
+        stride: factor on the length of the steps; only every `stride`-th rotor speed is used.
+        held: only every `held`-th command is used.
     """
     starts, warnings = list[tuple[int, int]](), list[str]()  # (flight, row) each
     states = [on_every_row(log, limits) for log in logs]
@@ -179,15 +180,14 @@ def cut(
     if len(starts) > most:
         warnings.append(f"{most} stretches of 1 s, evenly spread, are used of {len(starts)}")
         starts = [starts[k] for k in np.linspace(0, len(starts) - 1, most).astype(int)]
-    steps_s = [LONGEST_S * (1.0 if coarser is None else 2.0)] * len(logs)
+    steps_s = [LONGEST_S * stride] * len(logs)
     if integrator == "euler":
         steps_s = [log.step_s or 1.0 / vehicle.controller.frequency for log in logs]
-    held = 1 if fewer_commands is None else 2
     inputs = [_input_of(logs[k], row, vehicle, steps_s[k], held) for k, row in starts]
-    like, stride = coarser or fewer_commands, 1 if coarser is None else 2
+    sizes = _padded_sizes(inputs, like)
     windows = [
-        _window(logs[k], states[k], k, row, vehicle, spacings_s.get(k), one, stride)
-        for (k, row), one in zip(starts, _of_one_shape(inputs, like), strict=True)
+        _window(logs[k], states[k], k, row, vehicle, spacings_s.get(k), one, stride, sizes)
+        for (k, row), one in zip(starts, inputs, strict=True)
     ]
     return jax.tree.map(lambda *field: np.stack(field), *windows), warnings
 
@@ -240,22 +240,18 @@ class _Input(NamedTuple):
 
 
 def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, stride: int) -> _Input:
-    """Return the inputs of the window at `row`; if there are no commands, those of a hover.
-
-    At most `ROWS` rows are compared. Only every `stride`-th command is used.
-    """
+    """Return the inputs of the window at `row`, by every `stride`-th command; else of a hover."""
     time_s, begin_s, period_s = log.time_s, log.time_s[row], 1.0 / vehicle.controller.frequency
     rows = np.flatnonzero((time_s >= begin_s - 1e-9) & (time_s <= begin_s + LENGTH_S + 1e-9))
     signals = (log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b, log.acc_b, log.rotor_speed)
-    none = np.full((len(time_s), 1), np.nan)
-    values = [(none if signal is None else signal)[rows] for signal in signals]
-    valid = np.stack([np.isfinite(one).all(axis=1) for one in values], axis=1)
+    logged = [signal[rows] for signal in signals if signal is not None]
+    valid = np.stack([np.isfinite(values).all(axis=1) for values in logged], axis=1)
     rows = rows[thinned(valid, time_s[rows], ROWS)]
     length_s = time_s[rows[-1]] - begin_s
     command = np.tile([GRAVITY, 0.0, 0.0, 0.0], (len(time_s), 1))
-    logged = log.command
-    if logged is not None and (finite := np.isfinite(logged).all(axis=1)).any():
-        time_s, command = time_s[finite], logged[finite]
+    given = log.command
+    if given is not None and (finite := np.isfinite(given).all(axis=1)).any():
+        time_s, command = time_s[finite], given[finite]
     first_s, last_s = begin_s - BURN_IN_S - HISTORY_S - 1e-9, begin_s + length_s + 1e-9
     used = slice(max(np.searchsorted(time_s, first_s) - 1, 0), np.searchsorted(time_s, last_s) + 1)
     time_s, command = with_lost_rows(time_s[used] - begin_s, command[used])
@@ -268,30 +264,21 @@ def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, stri
     return _Input(rows, grid(-BURN_IN_S, 0.0), grid(0.0, length_s), time_s, command)
 
 
-def _of_one_shape(inputs: Sequence[_Input], like: FlightWindows | None) -> list[_Input]:
-    """Return `inputs` padded to the sizes of `like`, or to one of few sizes (to compile rarely)."""
+def _padded_sizes(inputs: Sequence[_Input], like: FlightWindows | None) -> tuple[int, ...]:
+    """Return the numbers of steps of burn-in and window, and of commands, after padding.
 
-    def padded_size(counts: Iterable[int], sizes: Sequence[int]) -> int:
-        count = max(counts)
-        return next((size for size in sizes if size >= count), -(-count // sizes[0]) * sizes[0])
-
-    if like is None:
-        burn_in = padded_size((len(one.burn_in.sample_s) for one in inputs), BURN_IN_STEPS)
-        steps = padded_size((len(one.window.sample_s) for one in inputs), STEPS)
-        commands = padded_size((len(one.command_s) for one in inputs), COMMANDS)
-    else:
-        burn_in, steps = like.burn_in_rate_b.shape[1], like.rotor_speed.shape[1]
-        commands = like.command_s.shape[1]
-    return [
-        _Input(
-            one.rows,
-            padded_grid(one.burn_in, burn_in, at_front=True),
-            padded_grid(one.window, steps),
-            np.pad(one.command_s, (0, commands - len(one.command_s)), constant_values=np.inf),
-            np.pad(one.command, ((0, commands - len(one.command)), (0, 0))),
-        )
-        for one in inputs
+    They are those of `like`, or else some of few, since each makes the model compile again.
+    """
+    if like is not None:
+        return like.burn_in_rate_b.shape[1], like.rotor_speed.shape[1], like.command_s.shape[1]
+    lengths = [
+        (len(one.burn_in.sample_s), len(one.window.sample_s), len(one.command_s)) for one in inputs
     ]
+    counts, allowed = map(max, zip(*lengths, strict=True)), (BURN_IN_STEPS, STEPS, COMMANDS)
+    return tuple(
+        next((size for size in sizes if size >= count), -(-count // sizes[0]) * sizes[0])
+        for count, sizes in zip(counts, allowed, strict=True)
+    )
 
 
 def _window(
@@ -303,14 +290,17 @@ def _window(
     rotor_spacing_s: float | None,
     inputs: _Input,
     stride: int,
+    sizes: Sequence[int],
 ) -> FlightWindows:
     """Return the window (without the axis W) at `row` of `log`, whose `state` is in every row.
 
-    If measured rotor speeds are the input, they are `rotor_spacing_s` [s] apart, and every
-    `stride`-th is used; else it is None.
+    Its inputs are padded to `sizes` (see `_padded_sizes`). If measured rotor speeds are the input,
+    they are `rotor_spacing_s` [s] apart, and every `stride`-th is used; else it is None.
     """
     time_s, begin_s = log.time_s, log.time_s[row]
-    rows, before, window = inputs.rows, inputs.burn_in, inputs.window
+    rows, burn_in_steps, steps, commands = inputs.rows, *sizes
+    before = padded_grid(inputs.burn_in, burn_in_steps, at_front=True)
+    window = padded_grid(inputs.window, steps)
     sample_s = begin_s + before.edge_s[:-1] + before.lead_s
     middle_s = begin_s + 0.5 * (window.edge_s[:-1] + window.edge_s[1:])
     speed = np.zeros((len(middle_s), 4))
@@ -341,10 +331,9 @@ def _window(
         padding = np.zeros((ROWS - len(rows), *values.shape[1:]), values.dtype)
         return np.concatenate([np.nan_to_num(values), padding])
 
-    # Infinite times of commands are padding, and add nothing to the integral.
-    command_s = np.minimum(inputs.command_s, inputs.command_s[np.isfinite(inputs.command_s)].max())
-    added = np.diff(command_s)[:, None] * inputs.command[:-1]
+    added = np.diff(inputs.command_s)[:, None] * inputs.command[:-1]
     command_sum = np.concatenate([np.zeros((1, 4)), np.cumsum(added, axis=0)])
+    later = (0, commands - len(added) - 1)
     rotor_error = 0.0
     if rotor_spacing_s is None:
         burn_in = (time_s > begin_s - BURN_IN_S - 1e-9) & (time_s <= begin_s + 1e-9)
@@ -356,9 +345,9 @@ def _window(
         np.concatenate([before.edge_s[:-1], window.edge_s]),
         np.concatenate([before.sample_s, window.sample_s]),
         np.concatenate([before.lead_s, window.lead_s]),
-        inputs.command_s,
-        inputs.command,
-        command_sum,
+        np.pad(inputs.command_s, later, constant_values=np.inf),
+        np.pad(inputs.command, (later, (0, 0))),
+        np.pad(command_sum, (later, (0, 0)), mode="edge"),
         interpolate(sample_s, time_s, log.rate_b),
         speed,
         voltage_drop(log, middle_s),

@@ -90,17 +90,15 @@ def inactive_at(
     they act; None where there are none. The first composite that contains them counts. `acts` (P,)
     bool marks the parameters that change the model at `theta`.
     """
-    for composite in COMPOSITES:
-        composite_candidate = next((c for c in among if c.name == JOIN.join(composite.parts)), None)
-        if composite.carried is None or composite_candidate is None:
-            continue
-        carried_indices = carried([composite_candidate])[0].indices
-        if acts[list(carried_indices)].any() or theta[list(carried_indices)].any():
-            continue  # it acts, or it was named and the effect through which it acts was dropped
-        raised, usual = theta.copy(), usual_size(space)
-        carrier_indices = [i for i in composite_candidate.indices if i not in carried_indices]
-        raised[carrier_indices] = theta[carrier_indices] + usual[carrier_indices]
-        return carried_indices, raised
+    for composite in among:
+        for part in carried([composite]):
+            inactive = list(part.indices)
+            if acts[inactive].any() or theta[inactive].any():
+                continue  # it acts, or was named and the effect through which it acts was dropped
+            carriers = [i for i in composite.indices if i not in inactive]
+            raised = theta.copy()
+            raised[carriers] += usual_size(space)[carriers]
+            return part.indices, raised
     return None
 
 

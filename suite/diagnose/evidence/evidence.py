@@ -31,8 +31,9 @@ class Evidence(ABC):
 
     limits: Thresholds = THRESHOLDS
     """Thresholds of all steps of the diagnosis."""
-    misfit_is_noise: bool = False
-    """Whether even the best model is wrong, so that its whole residual counts as noise."""
+    misfit_is_noise: bool = True
+    """Whether the whole residual of the best model counts as noise. A model's error is the same all
+    along a flight, so each flight is then one random draw."""
 
     @property
     @abstractmethod
@@ -98,11 +99,6 @@ class Evidence(ABC):
             best, block = trial, trial_block
         return Evaluation(self, best, block)
 
-    @property
-    def flights_differ_p(self) -> float:
-        """Argument `differ_p` of `intervals95`: 1 if each flight is one random draw, else 0."""
-        return 1.0
-
     def scores(
         self, current: Evaluation, named: Sequence[int], among: Sequence[Candidate], seed: int
     ) -> list[CandidateScore]:
@@ -160,7 +156,7 @@ class Evaluation(NamedTuple):
     def half_widths(self, indices: Sequence[int]) -> np.ndarray:
         """Return the half-widths (K,) of the 95 % intervals of the parameters at `indices`."""
         equations = self.block.equations.along_numbers(indices)
-        return intervals95(equations, self.evidence.flights_differ_p).half_width
+        return intervals95(equations, float(self.evidence.misfit_is_noise)).half_width
 
 
 def validation_groups(flight: np.ndarray) -> np.ndarray:

@@ -8,30 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from eval.effects.interface import Sample
 from eval.effects.log_faults import pose_delay, to_logged, to_true
-from eval.quadrotor.continuous import Carry, Steps, fly, turn_rotors, update_loop
+from eval.quadrotor.continuous import Carry, Flight, Steps, fly, turn_rotors, update_loop
 from eval.quadrotor.plant import Motion, Plant, Wrench, unpack_command
 from eval.quadrotor.stepper import Inputs, wanted_speed
 from suite.diagnose.data.steps import LONGEST_S
 from suite.diagnose.data.windows import CHANNELS, KNOTS, LENGTH_S, STATE, FlightWindows
 from tracks.geometry.rotation import exp_rot
-
-
-class Flown(NamedTuple):
-    """Simulated states of B windows at the S + 1 ends of their steps."""
-
-    track: Motion
-    """(B, S + 1, ...) position, attitude, velocity and rates."""
-    rotor_speed: Any
-    """(B, S + 1, 4) rotor speeds [rad/s]."""
-    force_b: Any
-    """(B, S + 1, 3) specific force [m/s^2]; at the start, that at the end of the first step."""
 
 
 def fly_windows(
@@ -43,8 +32,11 @@ def fly_windows(
     offset: Any,
     windows: FlightWindows,
     push: Any = None,
-) -> Flown:
+) -> Flight:
     """Simulate B windows from their measured start states.
+
+    Returned are the states (B, S + 1, ...) at the S + 1 ends of their steps. The specific force at
+    the start is that at the end of the first step.
 
     Args:
         plant: model of the vehicle (rotors, delays and rate loop), with the effects `values`.
@@ -93,24 +85,23 @@ def fly_windows(
     spans = jax.tree.map(lambda field: field[burn_in:], spans)
     begin_s = jnp.asarray(windows.start_s)
     flown = fly(plant, motion, spans, inputs, begin_speed, begin_s, integrator)
-    force_b = jnp.concatenate([flown.acc_b[:1], flown.acc_b])
-    along = (flown.motion, flown.rotor_speed, force_b)
-    return Flown(*jax.tree.map(lambda field: jnp.moveaxis(field, 0, 1), along))
+    flown = flown._replace(acc_b=jnp.concatenate([flown.acc_b[:1], flown.acc_b]))
+    return jax.tree.map(lambda field: jnp.moveaxis(field, 0, 1), flown)
 
 
 def difference(
-    values: Mapping[str, Any], integrator: str, flown: Flown, windows: FlightWindows
+    values: Mapping[str, Any], integrator: str, flown: Flight, windows: FlightWindows
 ) -> Any:
     """Return simulated - measured (B, N, 19), zero where nothing was measured.
 
     See `fly_windows`, of which `flown` is the result.
     """
-    track, speeds, forces = flown
+    motion, speeds, forces_b = flown
     edge_s = jnp.asarray(windows.edge_s)[:, windows.burn_in_rate_b.shape[1] :]
     pose = _places(windows.row_s - pose_delay(values), edge_s)
     now = _places(jnp.asarray(windows.row_s), edge_s)
-    rate_b, force_b = _interpolated(track.rate_b, now), _interpolated(forces, now)
-    logged = to_logged(values, Sample(*_pose(track, pose, integrator), rate_b, force_b))
+    rate_b, force_b = _interpolated(motion.rate_b, now), _interpolated(forces_b, now)
+    logged = to_logged(values, Sample(*_pose(motion, pose, integrator), rate_b, force_b))
     # The attitude's error is the vector of the rotation between both attitudes, for small angles.
     row = windows.row
     rotation = jnp.matmul(jnp.swapaxes(row.rot_w, -1, -2), logged.rot_w)
@@ -135,7 +126,7 @@ def difference(
     return jnp.where(windows.valid, error, 0.0)
 
 
-def at_knots(flown: Flown, windows: FlightWindows) -> Flown:
+def at_knots(flown: Flight, windows: FlightWindows) -> Flight:
     """Return the state `flown` at the knots (at the nearest ends of steps), (B, KNOTS, ...)."""
     edge_s = jnp.asarray(windows.edge_s)[:, windows.burn_in_rate_b.shape[1] :]
     knot_s = jnp.linspace(0.0, LENGTH_S, KNOTS)
@@ -197,10 +188,7 @@ def _hats(time_s: Any) -> Any:
 
 
 def _places(time_s: Any, edge_s: Any) -> Any:
-    """Return number, time since the start [s] and length [s] of the step of each `time_s` (B, N).
-
-    `edge_s` (B, S + 1) are the ends of the steps.
-    """
+    """Return number, time since the start and length [s] of the step of each `time_s` (B, N)."""
     ends = edge_s.shape[1] - 1
     step = jax.vmap(partial(jnp.searchsorted, side="right"))(edge_s, time_s + 1e-9) - 1
     step = jnp.clip(step, 0, ends - 1)

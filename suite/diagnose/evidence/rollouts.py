@@ -18,6 +18,7 @@ import numpy as np
 
 from eval.effects.log_faults import pose_delay
 from eval.logs.flight_log import FlightLog
+from eval.quadrotor.continuous import Flight
 from eval.quadrotor.plant import assemble
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.noise import Linearisation, Noise, measured_noise, residual_as_noise
@@ -42,7 +43,7 @@ from suite.diagnose.evidence.linearise import (
     linearised,
     slopes_along,
 )
-from suite.diagnose.evidence.rollout import Flown, at_knots, difference, fly_windows
+from suite.diagnose.evidence.rollout import at_knots, difference, fly_windows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 ACC_ROW = 9
@@ -67,11 +68,6 @@ class RolloutEvidence(Evidence):
     def space(self) -> ParameterSpace:
         """The parameters of all effects in the catalogue."""
         return self.model.space
-
-    @property
-    def flights_differ_p(self) -> float:
-        """1 if the model is wrong, as its error is the same all along a flight; else 0."""
-        return 1.0 if self.misfit_is_noise else 0.0
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
         """Return the block at `at`, with slopes along `indices`; see `Evidence`."""
@@ -155,7 +151,7 @@ def rollouts_along(
     windows, warnings = cut(logs, vehicle, rotor_input, stride_s, limits, integrator)
     if windows is None:
         raise ValueError("; ".join(warnings))
-    model = RolloutModel(vehicle, make_space(vehicle), rotor_input, voltage, integrator)
+    model = RolloutModel(vehicle, rotor_input, voltage, integrator)
     return model, windows, start_estimate(model, windows)
 
 
@@ -195,7 +191,9 @@ def rollout_evidence(
     near = linear._replace(windows=trusted(linear.windows, linear.residual, limits))
     noise = noise or measured_noise(near, limits)
     whitening = make_whitening(near, noise, limits)
-    evidence = RolloutEvidence(model, linear.windows, near.windows, noise, whitening, limits=limits)
+    evidence = RolloutEvidence(
+        model, linear.windows, near.windows, noise, whitening, limits=limits, misfit_is_noise=False
+    )
     indices = range(model.size) if along is None else along
     return evidence, block_of(whitening, linear, indices)
 
@@ -227,15 +225,10 @@ class RolloutModel:
     """Simulation of windows with one vehicle: their residuals and slopes, compiled."""
 
     def __init__(
-        self,
-        vehicle: Vehicle,
-        space: ParameterSpace,
-        rotor_input: bool,
-        voltage: bool,
-        integrator: str = "continuous",
+        self, vehicle: Vehicle, rotor_input: bool, voltage: bool, integrator: str = "continuous"
     ) -> None:
         """Prepare the rollout of `vehicle`; for the other arguments see `fly_windows`."""
-        self.space = space
+        self.space = space = make_space(vehicle)
         self.size = len(space.entries)
         self.free = STATE + 4 * (KNOTS if rotor_input else 1)
         """Number F of start numbers of each window, which are fitted, too: 12 of its state, and 4
@@ -246,14 +239,13 @@ class RolloutModel:
         self.dt = step_s(vehicle)
         """About the length of a step [s]."""
         self.integrator = integrator
-        functions = compiled(space.layout, rotor_input, voltage, integrator)
-        _, self._linear, self._respond = functions
+        _, self._linear, self._respond = compiled(space.layout, rotor_input, voltage, integrator)
 
     def residual(self, at: Estimate, windows: FlightWindows) -> np.ndarray:
         """Return measured - simulated (W, N, 19) at the estimate `at`."""
         return self.linearise(at, windows, []).residual
 
-    def respond(self, at: Estimate, windows: FlightWindows) -> tuple[Linearisation, Flown]:
+    def respond(self, at: Estimate, windows: FlightWindows) -> tuple[Linearisation, Flight]:
         """Return residuals and slopes along disturbances, and the states (W, KNOTS, ...) at knots.
 
         These are a force [m/s^2] and torque [rad/s^2] in body axes at one of the knots each.
@@ -292,7 +284,7 @@ def compiled(
 
     def fly(
         given: VehicleArrays, theta: Any, offset: Any, windows: FlightWindows, push: Any = None
-    ) -> tuple[Any, Flown]:
+    ) -> tuple[Any, Flight]:
         values = effects_at(layout, given.base, theta)
         plant = assemble(given.nominal, given.constants, values, LONGEST_S, 0.0, given.loop)
         flown = fly_windows(plant, values, rotor_input, voltage, integrator, offset, windows, push)
@@ -300,7 +292,7 @@ def compiled(
 
     def respond(
         given: VehicleArrays, theta: Any, offset: Any, windows: FlightWindows
-    ) -> tuple[Any, Any, Flown]:
+    ) -> tuple[Any, Any, Flight]:
         none = jnp.zeros((BATCH, KNOTS, 6))
 
         def along(direction: Any) -> Any:

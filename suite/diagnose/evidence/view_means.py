@@ -28,7 +28,7 @@ from suite.diagnose.data.steps import LONGEST_S
 from suite.diagnose.data.view import FlightRows
 from suite.diagnose.estimate.block import Block, without_nuisance
 from suite.diagnose.estimate.gauss_newton import intervals95
-from suite.diagnose.estimate.parameters import ParameterLayout, ParameterSpace, effects_at
+from suite.diagnose.estimate.parameters import ParameterLayout, effects_at, make_space
 from suite.diagnose.evidence.linearise import VehicleArrays, arrays_of, linearised, slopes_along
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
@@ -41,11 +41,11 @@ LEAST_CORRELATION = 0.05
 class ForceModel:
     """Model of a vehicle's accelerations at measured attitude, velocity, rates and rotor speeds."""
 
-    def __init__(self, vehicle: Vehicle, space: ParameterSpace, voltage: bool) -> None:
+    def __init__(self, vehicle: Vehicle, voltage: bool) -> None:
         """Prepare `vehicle`; `voltage` says whether the rows have a battery voltage."""
-        self.space = space
-        self._vehicle = arrays_of(vehicle, space)
-        self._compiled = _accelerations(space.layout, voltage)
+        self.space = make_space(vehicle)
+        self._vehicle = arrays_of(vehicle, self.space)
+        self._compiled = _accelerations(self.space.layout, voltage)
 
     def at(
         self, theta: np.ndarray, rows: FlightRows, indices: Sequence[int] | None = None

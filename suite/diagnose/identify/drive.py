@@ -190,10 +190,8 @@ def driven_vehicle(
     """
     if drive != "pwm":
         return DrivenVehicle(vehicle, drive)
-    commands = [f.signals["pwm"] for f in flights]
     commands = [
-        values if f.on_ground is None else values[~f.on_ground]
-        for f, values in zip(flights, commands, strict=True)
+        f.signals["pwm"][slice(None) if f.on_ground is None else ~f.on_ground] for f in flights
     ]
     command = float(np.nanmedian(np.concatenate(commands)))
     volts = [f.signals["voltage"] for f in flights if f.has("voltage")]

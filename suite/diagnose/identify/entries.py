@@ -135,10 +135,8 @@ def with_entries(
                 continue
             component = f"[{k}]" if len(entry.value) > 1 else ""
             given = f"{fitted:.4g} ({span[0]:.4g} to {span[1]:.4g}) {entry.unit}"
-            then = f"the file has {allowed:.4g}, the nearest allowed value"
-            if removed:
-                then = "the file has none"
-            notes.append(f"{entry.key}{component}: these flights give {given}; {then}")
+            then = "none" if removed else f"{allowed:.4g}, the nearest allowed value"
+            notes.append(f"{entry.key}{component}: these flights give {given}; the file has {then}")
     return vehicle, numbers, notes
 
 

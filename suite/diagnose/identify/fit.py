@@ -320,13 +320,13 @@ def _covariance(
 ) -> np.ndarray:
     """Return the covariance (P, P) of all numbers; `free` are the indices of the fitted ones."""
     unknowns = evidence.unknowns
-    total, names = len(unknowns), [unknown.name for unknown in unknowns]
+    names = [unknown.name for unknown in unknowns]
     fixed = [names.index(name) for name in known.names]
+    covariance = np.diag([unknown.max_half_width**2 for unknown in unknowns])
+    covariance[np.ix_(fixed, fixed)] = known.covariance
     if not free:
-        covariance = np.diag([unknown.max_half_width**2 for unknown in unknowns])
-        covariance[np.ix_(fixed, fixed)] = known.covariance
         return covariance
-    others = [k for k in range(total) if k not in fixed]
+    others = [k for k in range(len(names)) if k not in fixed]
     equations = evidence.estimate_noise(at).block.equations
     prior = np.array([0.0 if k in free else 1.0 / unknowns[k].max_half_width ** 2 for k in others])
     intervals = intervals95(equations.take(others), DIFFER_P, True, LEAST_NOISE_SHARE, prior)
@@ -342,7 +342,5 @@ def _covariance(
     # How far the fitted numbers move with each number that is held fixed.
     response = intervals.inverse @ equations.sums()[0][np.ix_(others, fixed)]
     own_covariance = (correlation * np.outer(noise_half, noise_half) + np.diag(method**2)) / Z95**2
-    covariance = np.zeros((total, total))
     covariance[np.ix_(others, others)] = own_covariance + response @ known.covariance @ response.T
-    covariance[np.ix_(fixed, fixed)] = known.covariance
     return covariance

@@ -17,7 +17,7 @@ from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.flights import ViewFlights, ready
 from suite.diagnose.data.view import TORQUE
 from suite.diagnose.estimate.block import Estimate
-from suite.diagnose.estimate.parameters import candidates, make_space
+from suite.diagnose.estimate.parameters import candidates
 from suite.diagnose.evidence.view_means import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.identify.body import FORCE_NUMBERS
@@ -66,8 +66,7 @@ def flapping_of(
 
 def _torque_evidence(flights: ViewFlights, vehicle: Vehicle, voltage: bool) -> ViewEvidence:
     """Return the torques of `flights` compared with those of `vehicle`."""
-    model = ForceModel(vehicle, make_space(vehicle), voltage)
-    return ViewEvidence(TORQUE, model, flights.smoothed[TORQUE.name])
+    return ViewEvidence(TORQUE, ForceModel(vehicle, voltage), flights.smoothed[TORQUE.name])
 
 
 def _coefficient_step(evidence: ViewEvidence, result: SearchResult) -> float:

@@ -77,8 +77,6 @@ class Identified:
     """Drive of the flights: pwm, rotors, torques, rates or thrust."""
     residual_rms: dict[str, list[float]]
     """RMS of the residual along each body axis, by fit: `force` (per mass) and `torque`."""
-    flights: tuple[str, ...]
-    """Names of the flights that were used."""
     notes: tuple[str, ...] = ()
     """Lines for people on what was done with flights and vehicle beyond the fitted numbers."""
 
@@ -276,6 +274,5 @@ class _Fits:
             (*not_identified(results, by_key, file_delay_s), *lacking),
             self.drive,
             {name: results[name].residual_rms.tolist() for name in fits},
-            tuple(flight.name for flight in self.flights),
             (*misfit_notes(results), *further, *notes),
         )

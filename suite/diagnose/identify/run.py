@@ -52,14 +52,14 @@ def identify_files(
     checked = read_checked(flights, CheckContext(start), accepted, partial=True)
     logs, slow = without_slow_rotors(checked.logs)
     warnings = [*checked.warnings, *slow]
-    console.say(f"{_counted(len(logs))}, {sum(log.duration_s for log in logs):.0f} s in all")
+    counted = "1 flight" if len(logs) == 1 else f"{len(logs)} flights"
+    console.say(f"{counted}, {sum(log.duration_s for log in logs):.0f} s in all")
     if unmodelled := unmodelled_effects(start):
         warnings.append(
             f"{start.name} has {', '.join(unmodelled)}: the fits do not model them, so the "
             "estimates include their share, and they stay in the file; start without them"
         )
     identified = identify(logs, start, leave)
-    counted = _counted(len(identified.flights))
     lines = [f"From {vehicle} {MADE_BY}, {counted} ({identified.drive}); 95 % intervals:"]
     lines += number_lines(identified.numbers)
     header = "\n".join([*lines, *(f"not identifiable: {t}" for t in identified.not_identified)])
@@ -74,16 +74,11 @@ def identify_files(
         "parameters": numbers_json(identified.numbers),
         "not_identified": list(identified.not_identified),
         "left": identified.residual_rms,
-        "flights": list(identified.flights),
+        "flights": [log.name for log in logs],
         "findings": checked.findings,
         "warnings": [*warnings, *identified.notes],
         **stamp(SCHEMA, None),
     }
-
-
-def _counted(flights: int) -> str:
-    """Return a number of flights in words."""
-    return "1 flight" if flights == 1 else f"{flights} flights"
 
 
 def is_identified(vehicle: str) -> bool:

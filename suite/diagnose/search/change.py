@@ -333,9 +333,7 @@ def search_motion_change(
     close = [one for one in changes if one[1] >= least]
     close.sort(key=lambda one: usual_first(space, one[2], one[0].candidate))
     name, _, theta, theta_before = close[0]
-    at = Estimate(theta)
     rivals = tuple(dict.fromkeys(other.candidate.name for other, *_ in close[1:]))
-    block = evidence.linearise(at, sorted(name.candidate.indices))
-    last = Evaluation(evidence, at, block)
+    last = evidence.fitted(Estimate(theta), sorted(name.candidate.indices), 0)
     named = (replace(name, rivals=rivals),)
     return SearchResult(named, Estimate(theta_before), last, last, [])

@@ -174,6 +174,5 @@ class SearchResult:
         begin = Estimate(theta, self.estimate.free) if named else self.start
         last = judged = self.judged.evidence.fitted(begin, indices)
         if self.judged is not self.last:
-            block = self.last.evidence.linearise(judged.at, indices)
-            last = Evaluation(self.last.evidence, judged.at, block)
+            last = self.last.evidence.fitted(judged.at, indices, 0)  # no step: evaluated only
         return replace(self, named=tuple(named), last=last, judged=judged)

@@ -86,8 +86,7 @@ def search(
         say("the remaining error is more than noise: effects are tested again, with it as noise")
         named, at = _settle(task, misfit, last.at, named)
         judged = _final_fit(misfit, at, named)
-        block = last.evidence.linearise(judged.at, fitted_by(named))
-        last = Evaluation(last.evidence, judged.at, block)
+        last = last.evidence.fitted(judged.at, fitted_by(named), 0)  # no step: evaluated only
     return SearchResult(tuple(named), start, last, judged, first)
 
 
@@ -165,26 +164,22 @@ def _best_candidate(
     allowed = max(min(limits.rival_chi2, limits.rival_share * explained), 0.0)
     close = [trial for trial in trials if trial.cost - lowest <= allowed]
     significant = [trial for trial in close if trial.name.p_value <= limits.name_p_value]
-    if not significant and tested:
+    at_fit = next((trial for trial in close if trial.name.candidate == tested), None)
+    if at_fit and not significant:
         # A large effect is not linear, and its score without it may be wrong: test it at its fit.
-        at_fit = [trial for trial in close if trial.name.candidate == tested]
-        p_values = [_p_value_at_fit(task, current, others, unnamed, trial) for trial in at_fit]
-        significant = [
-            trial._replace(name=replace(trial.name, p_value=p))
-            for trial, p in zip(at_fit, p_values, strict=True)
-            if p <= limits.name_p_value
-        ]
+        p_value = _p_value_at_fit(task, current, others, unnamed, at_fit)
+        if p_value <= limits.name_p_value:
+            significant = [at_fit._replace(name=replace(at_fit.name, p_value=p_value))]
     if not significant:
         return None
     best = min(significant, key=lambda t: (*evidence.preference(t.at, t.name.candidate), t.cost))
     chosen = best.name.candidate
-    rivals = dict.fromkeys(
-        c.name for c in (t.name.candidate for t in close) if c.name != chosen.name
-    )
+    names = dict.fromkeys(trial.name.candidate.name for trial in close)
+    rivals = tuple(name for name in names if name != chosen.name)
     worse_by = {
         t.name.candidate.label: t.cost - best.cost for t in trials if t.name.candidate != chosen
     }
-    return replace(best.name, rivals=tuple(rivals), worse_by=worse_by), best.at
+    return replace(best.name, rivals=rivals, worse_by=worse_by), best.at
 
 
 def _p_value_at_fit(

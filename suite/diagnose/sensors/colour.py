@@ -130,7 +130,8 @@ def fit_colour(flights: Sequence[Series]) -> Coloured | None:
     if not flights:
         return None
     step_s = max(flight.step_s for flight in flights)
-    lag_s = _in_rows(np.linspace(step_s, max(SHORT_S, step_s), SHORT_LAGS), flights)
+    # No lags are measured but whole rows of the slowest flight.
+    lag_s = step_s * np.rint(np.linspace(step_s, max(SHORT_S, step_s), SHORT_LAGS) / step_s)
     variograms = _variograms(flights, lag_s, about_mean=True)
     if variograms is None:
         return None
@@ -232,7 +233,8 @@ def _drift(flights: Sequence[Series]) -> Interval:
     longest = LONGEST * min(flight.duration_s for flight in flights)
     if longest < 2.0 * LONG_S:
         return ZERO
-    lag_s = _in_rows(np.geomspace(LONG_S, longest, LONG_LAGS), flights)
+    step_s = max(flight.step_s for flight in flights)
+    lag_s = step_s * np.rint(np.geomspace(LONG_S, longest, LONG_LAGS) / step_s)
     variograms = _variograms(flights, lag_s)
     if variograms is None:
         return ZERO
@@ -250,12 +252,6 @@ def _drift(flights: Sequence[Series]) -> Interval:
     power, half = max(float(theta[1]), 0.0), float(half)
     high = max(power + half, power * np.exp(half / power) if half < power else 0.0)
     return Interval(*(float(v) for v in np.sqrt([power, max(power - half, 0.0), high])))
-
-
-def _in_rows(lag_s: np.ndarray, flights: Sequence[Series]) -> np.ndarray:
-    """Return `lag_s` (L,) [s] as whole rows of the slowest flight: no other lags are measured."""
-    step_s = max(flight.step_s for flight in flights)
-    return step_s * np.rint(lag_s / step_s)
 
 
 def _variograms(

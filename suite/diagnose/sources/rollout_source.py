@@ -135,7 +135,6 @@ class RolloutSource(Source):
 
         Rollouts overlap, so the number of independent ones is the held-out time in seconds.
         """
-        force, torque, drift = self.limits.relevance
         independent = max(len(self.held.flight) * overlap(self.held), 1.0)
         # A standard deviation of n normal errors has the relative standard error 1 / sqrt(2 n).
         upper = 1.0 + Z95 / np.sqrt(2.0 * independent)
@@ -145,11 +144,8 @@ class RolloutSource(Source):
             error, floor = gap.channels[horizon][group]
             return float(np.sqrt(max((upper * error) ** 2 - floor**2, 0.0)))
 
-        return bool(
-            excess("1 s", "position") >= drift
-            or excess("0.5 s", "velocity") >= FORCE_S * force
-            or excess("0.1 s", "rates") >= TORQUE_S * torque
-        )
+        force, torque = excess("0.5 s", "velocity") / FORCE_S, excess("0.1 s", "rates") / TORQUE_S
+        return EffectSize(force, torque, excess("1 s", "position")).relevant(self.limits)
 
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
         """Return the sizes of the named effects on the fitted flights, see `Source`.
@@ -242,14 +238,8 @@ class RolloutSource(Source):
         except ValueError:  # no flight meets the conditions of the force view
             return None
         voltage = all(log.voltage is not None for log in self.logs)
-        model = ForceModel(self.vehicle, self.space, voltage)
+        model = ForceModel(self.vehicle, voltage)
         return residual_swing(ViewEvidence(FORCE, model, flights, limits=self.limits), theta)
-
-    def explained_by_steps(self, found: SearchResult) -> bool:
-        """Return whether a named delay of the pose is about half a step, as in MuJoCo's flights."""
-        step_s = 1.0 / self.vehicle.controller.frequency
-        delays_s = pose_delays(found).values()
-        return any(abs(delay_s) <= self.limits.integrator_share * step_s for delay_s in delays_s)
 
     def model_error(self, found: SearchResult) -> float:
         """Return the share of the noise floor that is the model's numerical error, see `Source`.
@@ -349,14 +339,11 @@ def structure_where(
         axes = [axis[-1] for axis in coloured if axis.startswith(quantity)]
         if axes:
             where.append(f"a changing {quantity} along body {', '.join(axes)}")
-    return "; ".join(where) or _worst_channels(slow.sum(axis=0), expected.sum(axis=0))
-
-
-def _worst_channels(slow: np.ndarray, expected: np.ndarray) -> str:
-    """Return in words the three channels whose `slow` errors (12,) exceed the `expected` most."""
-    energy = np.maximum(slow / np.maximum(expected, 1e-9) - 1.0, 0.0)
-    worst = [k for k in np.argsort(-energy)[:3] if energy[k] > 0]
-    # Each group of channels has three axes.
+    if where:
+        return "; ".join(where)
+    # The three channels whose slow errors exceed the expected ones most, of three axes a group.
+    excess = np.maximum(slow.sum(axis=0) / np.maximum(expected.sum(axis=0), 1e-9) - 1.0, 0.0)
+    worst = [k for k in np.argsort(-excess)[:3] if excess[k] > 0]
     return "errors of " + ", ".join(f"{STATE_GROUPS[k // 3]} {'xyz'[k % 3]}" for k in worst)
 
 

@@ -22,7 +22,7 @@ from suite.diagnose.data.whitening import Whitening, block_of, make_whitening, s
 from suite.diagnose.data.windows import LENGTH_S, SLICES, cut, take
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.composites import composites
-from suite.diagnose.estimate.parameters import candidates, make_space
+from suite.diagnose.estimate.parameters import candidates
 from suite.diagnose.evidence.evidence import Evaluation
 from suite.diagnose.evidence.rollouts import (
     RolloutModel,
@@ -95,7 +95,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
         f"{BASE_S + count * STRETCH_S:.0f} s, and half a minute more the first time on a machine"
     )
     voltage = all(log.voltage is not None for log in logs)
-    model = RolloutModel(vehicle, make_space(vehicle), rotor_input, voltage, integrator)
+    model = RolloutModel(vehicle, rotor_input, voltage, integrator)
     start = start_estimate(model, windows)
     linear = model.linearise(start, windows)
     is_finite = _finite(linear, limits)
@@ -105,7 +105,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     # Estimate the model's numerical error from the same stretches with steps of twice the length.
     # Flights that a simulator flew with Euler steps, driven by commands, have no such error.
     has_error = integrator != "euler" or rotor_input
-    coarser = take(windows_of(coarser=windows)[0], is_finite) if has_error else None
+    coarser = take(windows_of(like=windows, stride=2)[0], is_finite) if has_error else None
     linear = take(linear, is_finite)
     at = Estimate(start.theta, linear.offset)
     if coarser is not None:
@@ -120,7 +120,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     commands = [(log.time_s, log.rate_cmd_b) for log in logs if log.rate_cmd_b is not None]
     are_slow = any(own_spacing_s(*command) > limits.command_spacing_s for command in commands)
     if are_slow and not rotor_input:
-        fewer = take(windows_of(fewer_commands=windows)[0], is_finite)
+        fewer = take(windows_of(like=windows, held=2)[0], is_finite)
         held = with_held_commands(linear, model.residual(at, fewer) - linear.residual, limits)
         if held is not None:
             limits, coarser, coarser_share = held, fewer, 1.0

@@ -8,7 +8,7 @@ changed, the fallback searches for a change that shows only in motion.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +20,7 @@ from suite.diagnose.data.hold_out import choose_held_out, parted
 from suite.diagnose.data.inertial import UNSEEN, is_inertial
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.gauss_newton import TINY
-from suite.diagnose.estimate.parameters import Candidate, candidates, make_space
+from suite.diagnose.estimate.parameters import Candidate, candidates
 from suite.diagnose.evidence.view_means import ForceModel, means_of
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.search.change import (
@@ -58,10 +58,10 @@ def by_views(given: DiagnosisInput) -> SourceSet:
     # Smooth the flights, and set up the model and the effects that the search tries.
     vehicle, limits, references = given.vehicle, given.limits, given.references
     flights = ready(given.logs, vehicle, limits, given.references)
-    logs, space = flights.logs, make_space(vehicle)
+    logs = flights.logs
     voltage = all(log.voltage is not None for log in [*logs, *references])
-    model = ForceModel(vehicle, space, voltage)
-    allowed, not_shown = candidates(space, voltage, ()), list[str]()
+    model = ForceModel(vehicle, voltage)
+    allowed, not_shown = candidates(model.space, voltage, ()), list[str]()
     # Flights without a position (inertial logs) do not show wind.
     if any(is_inertial(log) for log in [*logs, *references]):
         allowed = [one for one in allowed if EFFECTS[one.name].wind is None]
@@ -71,8 +71,12 @@ def by_views(given: DiagnosisInput) -> SourceSet:
         view.name: ViewEvidence(view, model, flights.smoothed[view.name], limits=limits)
         for view in flights.views
     }
-    # `earlier` is the evidence of the reference flights by view; empty if there are none.
-    before, earlier, spread, left_out = references_of(given, flights, evidence)
+    # `before` are the reference flights, and `earlier` is their evidence by view.
+    before, spread = references_of(given, flights), None
+    earlier = dict[str, ViewEvidence]()
+    if before:
+        earlier = {n: replace(one, flights=before.smoothed[n]) for n, one in evidence.items()}
+        spread = rotor_spread([*earlier.values(), *evidence.values()])
     rows = min(sum(len(log.time_s) for log in logs), limits.most_rows)
     about = ", ".join(view.about for view in flights.views)
     given.say(f"views: {about}; by {flights.source}; {rows} rows: "
@@ -125,9 +129,9 @@ def by_views(given: DiagnosisInput) -> SourceSet:
         tuple(sources),
         held_names,
         flights.source,
-        (*notes, *not_shown, *left_out, *untested),
+        (*notes, *not_shown, *(before.notes if before else ()), *untested),
         (lag,) if lag else (),
-        before,
+        tuple(log.name for log in before.logs) if before else (),
         spread.words if spread else None,
     )
 
@@ -242,18 +246,14 @@ def _deviations(reference: ViewEvidence, theta: np.ndarray) -> np.ndarray:
     return means - means.mean(axis=0)
 
 
-def references_of(
-    given: DiagnosisInput, flights: ViewFlights, evidence: Mapping[str, ViewEvidence]
-) -> tuple[tuple[str, ...], dict[str, ViewEvidence], RotorSpread | None, tuple[str, ...]]:
-    """Return names and evidence (by view) of the usable reference flights, spread, and notes.
-
-    `flights` and `evidence` are those of the other flights.
+def references_of(given: DiagnosisInput, flights: ViewFlights) -> ViewFlights | None:
+    """Return the usable reference flights, if any are given; `flights` are the other flights.
 
     Raises:
         ValueError: if less than two are usable, or their signals differ from the other flights'.
     """
     if not given.references:
-        return (), {}, None, ()
+        return None
     before = ready(given.references, given.vehicle, given.limits, given.logs)
     if len(before.logs) < 2:
         words = (
@@ -267,9 +267,7 @@ def references_of(
             f"{_view_words(before)}, the others by {flights.source} and {_view_words(flights)}: "
             "log the same signals in both"
         )
-    earlier = {n: replace(one, flights=before.smoothed[n]) for n, one in evidence.items()}
-    spread = rotor_spread([*earlier.values(), *evidence.values()])
-    return tuple(log.name for log in before.logs), earlier, spread, before.notes
+    return before
 
 
 def _view_words(flights: ViewFlights) -> str:

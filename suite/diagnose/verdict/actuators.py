@@ -119,10 +119,7 @@ def actuator_mismatches(
 def _stretches(
     log: FlightLog, plant: Plant, commanded_by: str, limits: Thresholds
 ) -> list[_Stretch]:
-    """Return the stretches of `log` that have measured and commanded rotor speeds.
-
-    The rate loop is that of `plant`, the model of the vehicle.
-    """
+    """Return the stretches of `log` that have measured and commanded rotor speeds."""
     command = log.command if commanded_by == RATE_LOOP else log.rotor_speed_cmd
     if log.rotor_speed is None or command is None:
         return []
@@ -161,10 +158,7 @@ def _stretches(
 def _mismatch(
     commanded_by: str, logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds
 ) -> ActuatorMismatch | None:
-    """Fit lag, delay and scales of the rotors, and return how the rotor speeds differ.
-
-    None where no log has both commanded and measured rotor speeds.
-    """
+    """Fit lag, delay and scales, and return how rotor speeds differ; None if no log has both."""
     dt, stretches = step_s(vehicle), list[_Stretch]()
     plant = make_plant(vehicle, dt)
     own_delay, own_lag = float(plant.constants.delay), float(plant.constants.time_constant)

@@ -24,12 +24,12 @@ from scipy.stats import chi2
 from eval.effects import EFFECTS
 from eval.effects.interface import GRAVITY
 from eval.effects.wind import CONSTANT_WIND, GUSTS, VERTICAL, ConstantWind, Gusts
+from eval.quadrotor.continuous import Flight
 from eval.quadrotor.plant import Motion, assemble
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
 from suite.diagnose.data.view import SmoothedFlight
 from suite.diagnose.data.windows import KNOTS
 from suite.diagnose.evidence.evidence import flights_agree
-from suite.diagnose.evidence.rollout import Flown
 from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.verdict.actuators import LEAST_P, TestedEffect
@@ -119,10 +119,7 @@ def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
 
 
 def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None:
-    """Return the spectrum of a flight with the residual force `residual_b` (M, 3) [m/s^2].
-
-    None where it is too short for one, or has many holes.
-    """
+    """Return the spectrum of `residual_b` (M, 3) [m/s^2]; None if too short, or with many holes."""
     middle_s = flight.form.middle_s
     if len(middle_s) < LEAST_MEANS:
         return None
@@ -248,12 +245,12 @@ def _range_of(tried: np.ndarray, is_likely: np.ndarray) -> list[float] | None:
     return [float(tried[is_likely][0]), float(tried[is_likely][-1])]
 
 
-def _wind_transmission(model: RolloutModel, theta: np.ndarray, knot: Flown) -> np.ndarray:
+def _wind_transmission(model: RolloutModel, theta: np.ndarray, knot: Flight) -> np.ndarray:
     """Return the accelerations per m/s of wind along world axes, (W, 6 KNOTS, 3 KNOTS)."""
     given = model.given
     values = {n: v for n, v in model.space.effects(theta).items() if EFFECTS[n].by_state}
     steady_w = np.asarray(values[CONSTANT_WIND.name].velocity)
-    motion = Motion(*(np.asarray(field) for field in knot.track))
+    motion = Motion(*(np.asarray(field) for field in knot.motion))
     count = len(motion.pos_w)
     state = PlantState(np.asarray(knot.rotor_speed), np.zeros(0), {})
     zeros = np.zeros(motion.pos_w.shape[:2])
@@ -273,12 +270,12 @@ def _wind_transmission(model: RolloutModel, theta: np.ndarray, knot: Flown) -> n
     return transmission.reshape(count, KNOTS * 6, KNOTS * 3)
 
 
-def _wind_root(knot: Flown, length_m: float) -> np.ndarray:
+def _wind_root(knot: Flight, length_m: float) -> np.ndarray:
     """Return a root (W, 3 KNOTS, 3 KNOTS) of the covariance of a wind of intensity 1 m/s.
 
     The correlation decays exponentially with the distance flown over the length scale `length_m`.
     """
-    speed = np.maximum(np.sqrt((np.asarray(knot.track.vel_w) ** 2).sum(axis=-1)), 1.0)
+    speed = np.maximum(np.sqrt((np.asarray(knot.motion.vel_w) ** 2).sum(axis=-1)), 1.0)
     step = 0.5 * (speed[:, 1:] + speed[:, :-1]) / (KNOTS - 1) / length_m
     distance = np.concatenate([np.zeros((len(speed), 1)), np.cumsum(step, axis=1)], axis=1)
     correlation = np.exp(-np.abs(distance[:, :, None] - distance[:, None, :]))
@@ -316,13 +313,10 @@ def _has_outliers(
 
 
 def _free_likelihood(equations: DisturbanceEquations) -> float:
-    """Return the largest log-likelihood ratio of a random disturbance along the body axes.
-
-    Fitted are the logarithms of a size for each of the six axes and of one correlation time.
-    """
+    """Return the largest log-likelihood ratio of a random disturbance along the body axes."""
     time = np.linspace(0.0, 1.0, KNOTS)
 
-    def loss(logs: np.ndarray) -> float:
+    def loss(logs: np.ndarray) -> float:  # of a size for each axis, and of a correlation time
         sizes, tau_s = np.exp(logs[:6]), np.exp(logs[6])
         correlation = np.exp(-np.abs(time[:, None] - time) / tau_s) + 1e-9 * np.eye(KNOTS)
         root = np.kron(np.linalg.cholesky(correlation), np.diag(sizes))

@@ -17,13 +17,13 @@ import numpy as np
 from scipy.stats import gamma
 
 from eval.effects.interface import GRAVITY
+from eval.quadrotor.continuous import Flight
 from suite.diagnose.data.whitening import block_of
 from suite.diagnose.data.windows import KNOTS, FlightWindows
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.gauss_newton import Z95
 from suite.diagnose.estimate.parameters import Candidate
 from suite.diagnose.estimate.permutation import CandidateScore, permutation_test
-from suite.diagnose.evidence.rollout import Flown
 from suite.diagnose.evidence.rollouts import RolloutEvidence
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.gap import EffectSize, beyond_error, less_error
@@ -41,7 +41,7 @@ class DisturbanceEquations(NamedTuple):
     """(W, 6 KNOTS, 6 KNOTS) J'J, the information on the disturbance."""
     gradient: np.ndarray
     """(W, 6 KNOTS) J'r."""
-    knot: Flown
+    knot: Flight
     """(W, KNOTS, ...) simulated state at the knots."""
     unit: np.ndarray
     """(W, 6 KNOTS, J) linear [m/s^2] and angular [rad/s^2] acceleration in body axes that each of
@@ -195,15 +195,12 @@ def _energy_p_value(equations: DisturbanceEquations, axis: int) -> float:
     return min(1.0, len(p_values) * min(p_values))
 
 
-def _shapes(knot: Flown, start_s: np.ndarray) -> tuple[np.ndarray, list[Candidate]]:
-    """Return `unit` and `shapes` at the knots, as in `DisturbanceEquations`.
-
-    `start_s` (W,) is the start of each window, from the start of its flight [s].
-    """
-    pos_w, rot_w, vel_w, rate_b = (np.asarray(field) for field in knot.track)
+def _shapes(knot: Flight, start_s: np.ndarray) -> tuple[np.ndarray, list[Candidate]]:
+    """Return `unit` and `shapes` of `DisturbanceEquations`; `start_s` (W,) as in the windows."""
+    pos_w, rot_w, vel_w, rate_b = (np.asarray(field) for field in knot.motion)
     axes_b = np.swapaxes(rot_w, -1, -2)
     vel_b = (axes_b @ vel_w[..., None])[..., 0]
-    thrust = np.asarray(knot.force_b)[..., 2] / GRAVITY
+    thrust = np.asarray(knot.acc_b)[..., 2] / GRAVITY
     change = np.gradient(thrust, axis=1) * (KNOTS - 1) * GRAVITY
     speed = np.sqrt((vel_w**2).sum(axis=-1))
     yaw = np.arctan2(rot_w[..., 1, 0], rot_w[..., 0, 0])

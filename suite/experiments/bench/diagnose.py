@@ -38,9 +38,7 @@ def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = 3) -> Comparis
         )
     task = sysid_baseline.make_task(seed, duration_s)
     # Measured rotor speeds are the input of the simulation, as for the baseline.
-    model = RolloutModel(
-        task.nominal, task.space, rotor_input=True, voltage=False, integrator="euler"
-    )
+    model = RolloutModel(task.nominal, rotor_input=True, voltage=False, integrator="euler")
     start = start_estimate(model, task.windows)
     residual = model.residual(start, task.windows)
     problem = sysid_baseline.prepare(task, noise_of(residual, task.windows))

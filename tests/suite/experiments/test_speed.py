@@ -56,9 +56,7 @@ def test_both_sides_compute_the_same_loss_and_gradient():
 
 def test_both_sides_have_the_same_residuals():
     task = make_task(20_000, 2.5)
-    model = RolloutModel(
-        task.nominal, task.space, rotor_input=True, voltage=False, integrator="euler"
-    )
+    model = RolloutModel(task.nominal, rotor_input=True, voltage=False, integrator="euler")
     begin = start_estimate(model, task.windows)
     residual = model.residual(begin, task.windows)
     noise = noise_of(residual, task.windows)

@@ -319,7 +319,7 @@ def test_a_rate_loop_faster_than_the_log_does_not_look_like_inertia():
     vehicle = load_vehicle("reference")
     log = fly(vehicle, 0, duration_s=4.0, noise=0.0, motors=True)
     space = make_space(vehicle)
-    model, smoothed = ForceModel(vehicle, space, voltage=False), ready([log], vehicle).smoothed
+    model, smoothed = ForceModel(vehicle, voltage=False), ready([log], vehicle).smoothed
     data = ViewEvidence(TORQUE, model, smoothed[TORQUE.name]).residuals(space.array("start"))
     share = (data.value * data.residual).sum(axis=0) / (data.value**2).sum(axis=0)
     assert share == pytest.approx([0.0] * 3, abs=0.0015)

@@ -260,7 +260,7 @@ def test_a_fault_from_a_package_is_a_candidate_and_in_the_simulated_log(
     space = make_space(GIVEN)
     (one,) = [c for c in candidates(space, False, set()) if c.name == "imu_fault"]
     assert len(one.indices) == 5
-    model, start = rollouts.RolloutModel(GIVEN, space, False, False, "euler"), space.array("start")
+    model, start = rollouts.RolloutModel(GIVEN, False, False, "euler"), space.array("start")
     true = start.copy()
     true[list(one.indices)] = *TURN, 1.04, 0.01
     fly_model = jax.jit(rollouts.compiled(space.layout, False, False, "euler")[0])

@@ -43,7 +43,7 @@ def made(rng, count, length=200, trim=(0.5, 0.0, 2.0), scatter=0.3):
 
 
 def test_slopes_are_those_of_finite_differences():
-    model, theta = view_means.ForceModel(VEHICLE, SPACE, False), SPACE.array("start")
+    model, theta = view_means.ForceModel(VEHICLE, False), SPACE.array("start")
     smoothed = ready(flights(1, duration_s=4.0), VEHICLE).smoothed[FORCE.name]
     evidence = ViewEvidence(FORCE, model, smoothed)
     first = evidence.residuals(theta, None)
@@ -155,7 +155,7 @@ DRAG = (0.4, 0.3, 0.2)
 
 def task_of(logs, view=FORCE):
     smoothed = ready(logs, VEHICLE).smoothed[view.name]
-    return ViewEvidence(view, view_means.ForceModel(VEHICLE, SPACE, False), smoothed)
+    return ViewEvidence(view, view_means.ForceModel(VEHICLE, False), smoothed)
 
 
 def named(found):

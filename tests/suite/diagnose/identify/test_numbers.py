@@ -274,7 +274,7 @@ def test_parts_that_do_not_exist_and_nothing_but_parts_to_leave_are_refused(tmp_
 def test_numbers_that_no_file_may_hold_are_printed_with_the_refusal(tmp_path, monkeypatch):
     numbers = (Number("motors.thrust", "N", [9.0, -8.0], [(8.0, 10.0), None]),)
     weak = replace(PLAIN, motors=MotorMap((9.0, -8.0), 16.0))
-    result = Identified(weak, numbers, ("the rest",), "pwm", {}, ("one",))
+    result = Identified(weak, numbers, ("the rest",), "pwm", {})
     monkeypatch.setattr(run, "identify", lambda *_: result)
     write_flight(tmp_path / "one.parquet", known.logs("rates", 0, known.HOVER)[0])
     out = tmp_path / "v.toml"
