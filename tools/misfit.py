@@ -24,7 +24,7 @@ from eval.judging.statistics import wilson, wilson_by_group
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import Motion, Wrench
 from eval.vehicles.vehicle import Vehicle, with_effects
-from suite.blind.build import simulator_for
+from suite.blind.build import Simulator
 from suite.blind.cases import CONTINUOUS, Case
 from suite.blind.outside import Law, Outside
 from suite.common.startup import keep_compiled
@@ -93,7 +93,7 @@ def run_case(seed: list[int]) -> Outcome:
     """
     rng = np.random.default_rng(seed)
     case = Case("outside", (), 0.0, "bare", "capture", (0, 0), simulator=CONTINUOUS)
-    simulator = simulator_for(case, rng)
+    simulator = Simulator(case, rng)
     drag = rng.uniform(0.15, 0.6, 3) * [1.0, 1.0, 0.5]
     truth = with_effects(simulator.nominal, {DRAG: EFFECTS[DRAG].values(tuple(drag.tolist()))})
     trajectories, law = ordinary_flights(rng), force_law(rng)

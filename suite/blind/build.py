@@ -9,7 +9,7 @@ of the noise.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from itertools import permutations
 from typing import Any
 
@@ -58,10 +58,6 @@ class Built:
 
     nominal: Vehicle
     """The vehicle file that the diagnosis gets."""
-    truth: Vehicle
-    """The vehicle that flew, with the hidden effects."""
-    trajectories: tuple[Trajectory, ...]
-    """The commanded trajectories, one for each flight."""
     logs: tuple[FlightLog, ...]
     """The logs of the flights, with noise."""
     answer: dict[str, Any]
@@ -92,17 +88,17 @@ class _Unsuitable(Exception):
 def _attempt(case: Case, rng: np.random.Generator) -> Built:
     """Make the case with one draw of flights and strengths, from `rng`."""
     trajectories = _trajectories(case, rng)
-    simulator = simulator_for(case, rng)
+    simulator = Simulator(case, rng)
     hide = _hide_outside if case.kind == "outside" else _hide_effects
-    truth, flown, answer = hide(case, simulator, trajectories, rng)
+    flown, answer = hide(simulator, trajectories, rng)
     logs = flown(rng)
     if simulator.conditions:
-        answer["conditions"] = simulator.conditions
+        answer["conditions"] = asdict(simulator.conditions)
     answer["case"] = asdict(case)
     answer["trajectories"] = [asdict(way) for way in trajectories]
     # Without a salt a short answer could be guessed from its hash.
     answer["salt"] = rng.bytes(16).hex()
-    return Built(simulator.nominal, truth, tuple(trajectories), logs, answer)
+    return Built(simulator.nominal, logs, answer)
 
 
 def _trajectories(case: Case, rng: np.random.Generator) -> list[Trajectory]:
@@ -116,32 +112,29 @@ def _trajectories(case: Case, rng: np.random.Generator) -> list[Trajectory]:
     return ordinary_flights(rng)
 
 
-@dataclass(frozen=True)
 class Simulator:
-    """A simulator for one case."""
+    """The simulator of one case."""
 
-    nominal: Vehicle
-    """The vehicle file for the diagnosis."""
-    fly: Callable[..., LogFlights]
-    """Function that flies N trajectories and returns a function that makes their logs. Its
-    arguments are the true vehicle, the trajectories, the random generator of gusts, and additional
-    physics (optional)."""
-    conditions: dict[str, Any] = field(default_factory=dict)
-    """Conditions of flights and logs, such as rates, which the answer records; may be empty."""
+    def __init__(self, case: Case, rng: np.random.Generator) -> None:
+        """Prepare; for the continuous-time engine `rng` draws the conditions of the flights."""
+        self.case, self.nominal = case, nominal_vehicle(case.vehicle)
+        self.sensors, self.conditions = SENSORS[case.sensors], None
+        if case.simulator == CONTINUOUS:
+            self.conditions = draw_conditions(rng)
+            self.nominal = with_loop_frequency(self.nominal, self.conditions.loop_hz)
 
-
-def simulator_for(case: Case, rng: np.random.Generator) -> Simulator:
-    """Return the simulator of `case`.
-
-    For the continuous-time engine `rng` draws the conditions of the flights, such as rates.
-    """
-    nominal, sensors = nominal_vehicle(case.vehicle), SENSORS[case.sensors]
-
-    def fly_in_steps(
-        truth: Vehicle, trajectories: Trajectories, rng: Random, extra: Extra | None = None
+    def fly(
+        self, truth: Vehicle, trajectories: Trajectories, rng: Random, extra: Extra | None = None
     ) -> LogFlights:
-        """Fly in MuJoCo or RotorPy, which advance in steps of the period of the rate loop."""
-        if case.simulator == ROTORPY:
+        """Fly with the true vehicle and perhaps additional physics; `rng` draws the gusts.
+
+        MuJoCo and RotorPy advance in steps of the period of the rate loop.
+        """
+        nominal, sensors, conditions = self.nominal, self.sensors, self.conditions
+        if conditions is not None:
+            in_time = fly_continuous(nominal, truth, trajectories, conditions, rng, extra)
+            return lambda rng: logs_of(in_time, trajectories, truth, sensors, conditions, rng)
+        if self.case.simulator == ROTORPY:
             flown = fly_rotorpy(nominal, truth, trajectories, sensors.rate_hz)
         else:
             has_voltage = bool(sensors.voltage)
@@ -151,30 +144,14 @@ def simulator_for(case: Case, rng: np.random.Generator) -> Simulator:
             for index, flight in enumerate(flown)
         )
 
-    if case.simulator != CONTINUOUS:
-        return Simulator(nominal, fly_in_steps)
 
-    conditions = draw_conditions(rng)
-    nominal_at_rate = with_loop_frequency(nominal, conditions.loop_hz)
-
-    def fly_in_continuous_time(
-        truth: Vehicle, trajectories: Trajectories, rng: Random, extra: Extra | None = None
-    ) -> LogFlights:
-        flown = fly_continuous(nominal_at_rate, truth, trajectories, conditions, rng, extra)
-        return lambda rng: logs_of(flown, trajectories, truth, sensors, conditions, rng)
-
-    return Simulator(nominal_at_rate, fly_in_continuous_time, asdict(conditions))
+Hidden = tuple[LogFlights, dict[str, Any]]
+"""The function that makes the logs of the flights, and the answer."""
 
 
-Hidden = tuple[Vehicle, LogFlights, dict[str, Any]]
-"""The vehicle that flew, the function that makes the logs of its flights, and the answer."""
-
-
-def _hide_effects(
-    case: Case, simulator: Simulator, trajectories: Sequence[Trajectory], rng: np.random.Generator
-) -> Hidden:
+def _hide_effects(simulator: Simulator, trajectories: Trajectories, rng: Random) -> Hidden:
     """Fly with the hidden effects of a case; a null has none."""
-    nominal, sensors = simulator.nominal, SENSORS[case.sensors]
+    case, nominal, sensors = simulator.case, simulator.nominal, simulator.sensors
     # 1. Draw the hidden effects: change of the parameters, strength, values.
     changes, multiples, effects = {}, {}, {}
     # A blurred and a separated case are twins, so their truth must not depend on the channels.
@@ -206,7 +183,7 @@ def _hide_effects(
             for name in case.hidden
         ],
     }
-    return truth, flown, answer
+    return flown, answer
 
 
 def _expected_names(
@@ -281,16 +258,14 @@ def _blurred_strength(case: Case, nominal: Vehicle, name: str, change: np.ndarra
     return case.multiple * detectable(info.block(name), change) * change
 
 
-def _hide_outside(
-    case: Case, simulator: Simulator, trajectories: Sequence[Trajectory], rng: np.random.Generator
-) -> Hidden:
+def _hide_outside(simulator: Simulator, trajectories: Trajectories, rng: Random) -> Hidden:
     """Fly with physics that no effect describes.
 
     The strength is `case.multiple` times the strength that is just detectable after a fit of all
     effects of the catalogue. It is computed from a flight at the usual strength.
     """
-    name, nominal, sensors = case.hidden[0], simulator.nominal, SENSORS[case.sensors]
-    kind = KINDS[name]
+    case, nominal, sensors = simulator.case, simulator.nominal, simulator.sensors
+    name, kind = case.hidden[0], KINDS[case.hidden[0]]
 
     def fly_at(strength: float) -> tuple[LogFlights, float]:
         """Return flights at a strength, and the log-likelihood ratio that remains after a fit."""
@@ -314,7 +289,7 @@ def _hide_outside(
             "multiple": float(np.sqrt(ratio / THRESHOLD)),
         },
     }
-    return nominal, flown, answer
+    return flown, answer
 
 
 def unexplained_ratio(nominal: Vehicle, logs: Sequence[FlightLog], sensors: Sensors) -> float:

@@ -104,22 +104,16 @@ class _RotorpyBodies:
 def hub_damping(effects: Sequence[Mapping[str, Any]], vehicle: Vehicle) -> np.ndarray:
     """Return the angular damping (3,) about body axes that moving hubs cause in hover [1/s].
 
-    The true effects are those of a case's answer, the vehicle is that for the diagnosis.
+    The true effects are those of a case's answer, the vehicle is that for the diagnosis. A rotor at
+    r with the speed W has the force -W diag(k_d, k_d, k_z) (w x r) if the body turns at w. Its
+    torque about the body's axes is divided by the inertia.
     """
     drags = {
         effect["name"]: EFFECTS[effect["name"]].values(effect["parameters"]["coefficient"])
         for effect in effects
         if effect["name"] in ("rotor_drag", "inflow")
     }
-    return damping_at_hover(rotorpy_parameters(with_effects(vehicle, drags)))
-
-
-def damping_at_hover(parameters: Mapping[str, Any]) -> np.ndarray:
-    """Return the damping (3,) of rotations by the rotors' drag at their hubs, at hover [1/s].
-
-    A rotor at r with the speed W has the force -W diag(k_d, k_d, k_z) (w x r) if the body turns at
-    w. Its torque about the body's axes is divided by the inertia.
-    """
+    parameters = rotorpy_parameters(with_effects(vehicle, drags))
     x2, y2, z2 = (np.array(list(parameters["rotor_pos"].values())) ** 2).sum(axis=0)
     drag, lift = parameters["k_d"], parameters["k_z"]
     torque = np.array([lift * y2 + drag * z2, lift * x2 + drag * z2, drag * (x2 + y2)])

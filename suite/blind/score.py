@@ -188,7 +188,6 @@ def shares(verdicts: Sequence[Verdict]) -> list[Share]:
     single, null, pair = of("single"), of("null"), of("pair")
     # A failed diagnosis names nothing, which must not count as correct.
     completed = [v for v in verdicts if v.verdict != "failed"]
-    ratios = _gap_ratios(verdicts)
     lines = [
         ("single effects: named, nothing else", "96 %", [v.exact for v in single]),
         *((f"  of these at {times:g} times detectable", "", [v.exact for v in single
@@ -210,7 +209,7 @@ def shares(verdicts: Sequence[Verdict]) -> list[Share]:
         ("cases with a false extra name", "", [v.extra > 0 for v in completed if v.hidden]),
         (COVERED, "93-97 %", [x for v in verdicts for x in v.covered]),
         (f"gap after within {GAP_LIMIT} of the noise floor, where named", "all",
-         [ratio <= GAP_LIMIT for ratio in ratios if ratio is not None]),
+         [ratio <= GAP_LIMIT for ratio in _gap_ratios(verdicts)]),
         ("diagnosis failed", "none", [v.verdict == "failed" for v in verdicts]),
     ]  # fmt: skip
     rows = []

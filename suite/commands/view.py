@@ -129,7 +129,7 @@ def _choose_trials(config: Config, console: Console) -> _Chosen:
     """Return the trials that the options choose."""
     from policies.shipped import locate, names
     from suite.judging.flying import default_policy, manners
-    from suite.judging.replay import first_trials, read_digests, read_evaluation
+    from suite.judging.replay import first_trials, read_evaluation
     from suite.judging.requests import Evaluation
 
     folder = Path(config.run)
@@ -157,17 +157,18 @@ def _choose_trials(config: Config, console: Console) -> _Chosen:
         )
         trials = first_trials(evaluation)[: config.count]
         return _Chosen(evaluation, config.run, trials, None, {})
-    from eval.judging.results import read_trials
+    from suite.judging.comparing import read_runs
 
     reason = f"{folder} is a run, whose trials are flown again unchanged"
     config.refuse_unused(("track", "difficulty", "vehicle", "seed", "speed"), reason)
     # A folder's record must not decide that the files that it names may run code.
     evaluation = replace(read_evaluation(folder), trust=config.trust)
-    results = read_trials(folder / "trials.parquet")
-    # The rows are in the order of the evaluation's entries, and monitored ones are the last.
+    # The runs are in the order of the evaluation's entries, and monitored ones are the last.
     sources = evaluation.policies or (default_policy(),)
-    entries = [(each, k) for each in manners(evaluation.speed, False) for k in range(len(sources))]
-    labels = list(dict.fromkeys(result.policy for result in results))[: len(entries)]
+    entries = [(each, source) for each in manners(evaluation.speed, False) for source in sources]
+    runs = read_runs(folder)[: len(entries)]
+    results = [result for run in runs for result in run.rows.values()]
+    labels = list(dict.fromkeys(result.policy for result in results))
     if config.policy not in (None, *labels):
         raise unknown_name("--policy", str(config.policy), labels)
     if config.pick != "first":
@@ -182,12 +183,10 @@ def _choose_trials(config: Config, console: Console) -> _Chosen:
         )
     if others := ", ".join(each for each in found if each != label):
         console.note(f"shown are trials of {label}; --policy selects another of: {others}")
-    manner, number = entries[labels.index(label)]
-    evaluation = replace(
-        evaluation,
-        policies=(sources[number],),
-        speed=() if manner.speed is None else (manner.speed,),
-    )
+    number = labels.index(label)
+    (manner, source), run = entries[number], runs[number]
+    speed = () if manner.speed is None else (manner.speed,)
+    evaluation = replace(evaluation, policies=(source,), speed=speed)
     judged = {result.trial: result for result in results if result.policy == label}
-    trials, digests = list(judged)[: config.count], read_digests(folder, number)
-    return _Chosen(evaluation, label, trials, digests, judged)
+    digests = {"policy": run.digest, **run.inputs}
+    return _Chosen(evaluation, label, list(judged)[: config.count], digests, judged)

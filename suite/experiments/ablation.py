@@ -89,16 +89,9 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
         }
         for row in rows
     ]
+    fields = ("setting", "seed", "seconds", "commit", "machine", "diverged")
     trainings = [
-        {
-            "setting": run.setting,
-            "seed": run.seed,
-            "seconds": run.seconds,
-            "commit": run.commit,
-            "machine": run.machine,
-            "measured": run.points[-1] if run.points else None,
-            "diverged": run.diverged,
-        }
+        {**{f: getattr(run, f) for f in fields}, "measured": run.points[-1] if run.points else None}
         for run in runs
     ]
     return PageContents(facts, parts, {"rows": numbers, "runs": trainings})

@@ -30,7 +30,9 @@ class Run(NamedTuple):
     rows: dict[TrialSpec, TrialResult]
     """The result of each trial."""
     conditions: dict[str, Any]
-    """Settings, and SHA-256 of input files, that must be the same for a comparison."""
+    """Settings that must be the same for a comparison."""
+    inputs: dict[str, str]
+    """Name of each input, such as the vehicle -> its SHA-256, which must be the same as well."""
     versions: dict[str, Any]
     """Versions of the suite and of MuJoCo, which may change results."""
     manner: str
@@ -53,7 +55,7 @@ def read_runs(folder: Path) -> list[Run]:
     if len({(row.trial, row.policy) for row in results}) < len(results):
         raise ValueError(f"{path}: holds a trial twice; run suite eval again")
     judged = summary["judged"]
-    conditions = {key: judged.get(key) for key in CONDITIONS} | summary["sha256"]
+    conditions = {key: judged.get(key) for key in CONDITIONS}
     versions = {key: summary.get(key) for key in ("suite_version", "git_commit")}
     if (record := folder / "run.json").is_file():
         versions["mujoco"] = read_json(record, packages=dict)["packages"].get("mujoco")
@@ -73,6 +75,7 @@ def read_runs(folder: Path) -> list[Run]:
             f"{folder}" if len(names) == 1 else f"{folder}: {name}",
             {row.trial: row for row in results if row.policy == name},
             conditions,
+            summary["sha256"],
             versions,
             next((ending for ending in endings if name.endswith(ending)), ""),
             digest,
@@ -87,8 +90,8 @@ def refuse_other_conditions(first: Run, other: Run) -> None:
     Raises:
         ValueError: naming what differs and what to do.
     """
-    keys = dict.fromkeys([*first.conditions, *other.conditions])
-    pairs = {key: (first.conditions.get(key), other.conditions.get(key)) for key in keys}
+    of_first, of_other = (run.conditions | run.inputs for run in (first, other))
+    pairs = {key: (of_first.get(key), of_other.get(key)) for key in of_first | of_other}
     if different := {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}:
         # The value of a setting is printed, but not the digest of a file.
         names = [

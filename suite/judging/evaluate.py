@@ -7,7 +7,7 @@ each has a journal.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,8 +19,7 @@ from eval.judging.policy_checks.in_flight import action_report
 from eval.judging.results import Journal, write_results
 from eval.judging.tables import grids, markdown_table, summarise, with_interval
 from eval.quadrotor.vehicle_file import load_vehicle, vehicle_table
-from eval.sensors.sensors_file import SensorSet, sensors_table
-from eval.vehicles.vehicle import Vehicle
+from eval.sensors.sensors_file import sensors_table
 from eval.worlds.trial import TrialResult
 from policies.policy import Policy
 from suite.common.console import Console
@@ -46,7 +45,6 @@ from tracks.common.files import digest_of
 from tracks.common.grid import rich_table
 from tracks.common.provenance import stamp
 from tracks.common.work import Workers
-from tracks.track import Track
 
 
 class Entry(NamedTuple):
@@ -124,7 +122,7 @@ def evaluate(
         "sentences": _sentences(results),
         "judged": evaluation,
         "policies": [policy_record(entry.source, entry.policy) for entry in entries],
-        "sha256": file_digests(trial_set.vehicle, trial_set.tracks, trial_set.sensors),
+        "sha256": file_digests(trial_set),
         "flown_otherwise": trial_set.differences,
     }
     write_results(
@@ -194,17 +192,15 @@ def _actions(entry: Entry, results: Sequence[TrialResult], console: Console) -> 
     return actions
 
 
-def file_digests(
-    vehicle: Vehicle, tracks: Mapping[str, Track], sensors: SensorSet
-) -> dict[str, str]:
+def file_digests(trial_set: TrialSet) -> dict[str, str]:
     """Return the SHA-256 of the vehicle, of the sensors and of tracks from files, by name.
 
     It is computed from the values in a file, so comments do not change it.
     """
-    contents: dict[str, object] = {"vehicle": vehicle_table(vehicle)}
-    if sensors.models:
-        contents["sensors"] = sensors_table(sensors)
-    contents |= {f"track {name}": track for name, track in tracks.items()}
+    contents: dict[str, object] = {"vehicle": vehicle_table(trial_set.vehicle)}
+    if trial_set.sensors.models:
+        contents["sensors"] = sensors_table(trial_set.sensors)
+    contents |= {f"track {name}": track for name, track in trial_set.tracks.items()}
     return {name: digest_of(content) for name, content in contents.items()}
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from policies import shipped
 from policies.formats.checkpoint import CONFIG
@@ -53,7 +53,13 @@ class Manner:
             PolicyError: for a speed if the policy has no speed input.
         """
         if self.speed is not None:
-            policy = _at_speed(policy, self.speed)
+            if not policy.spec.speed_input:
+                raise PolicyError(
+                    f"--speed {self.speed:g}: {policy.name} takes no speed as an input; leave "
+                    "--speed out, or train a policy with --set spec.speed_input=True"
+                )
+            spec = dataclasses.replace(policy.spec, speed=self.speed)
+            policy = dataclasses.replace(cast(Any, policy), spec=spec)
         if self.monitored:
             from eval.judging.monitor import Monitored
 
@@ -76,16 +82,6 @@ def manners(speeds: Sequence[float], monitor: bool) -> list[Manner]:
     return unmonitored + [
         dataclasses.replace(manner, monitored=True) for manner in unmonitored if monitor
     ]
-
-
-def _at_speed(policy: Any, speed: float) -> Any:
-    """Return `policy` with a commanded speed; refuse a policy without a speed input."""
-    if not policy.spec.speed_input:
-        raise PolicyError(
-            f"--speed {speed:g}: {policy.name} takes no speed as an input; leave --speed out, or "
-            "train a policy with --set spec.speed_input=True"
-        )
-    return dataclasses.replace(policy, spec=dataclasses.replace(policy.spec, speed=speed))
 
 
 def default_policy() -> str:

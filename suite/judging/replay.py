@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from eval.judging.judge import Record
 from eval.logs.flight import Flight
@@ -25,15 +25,6 @@ from tracks.input.reading import read_json
 
 if TYPE_CHECKING:
     from eval.view.recording import Drone, Rollout
-
-
-class Replay(NamedTuple):
-    """Trials flown again."""
-
-    rollouts: list[Rollout]
-    """Track, flight (with depth images) and result of each trial."""
-    drone: Drone
-    """The vehicle and the policy's camera, as a recording shows them."""
 
 
 def read_evaluation(folder: Path) -> Evaluation:
@@ -56,26 +47,6 @@ def read_evaluation(folder: Path) -> Evaluation:
     return evaluation
 
 
-def read_digests(folder: Path, number: int) -> dict[str, str]:
-    """Return the SHA-256 of the inputs of the evaluation in `folder`, by name.
-
-    The inputs are policy `number` (from 0), the vehicle, the sensors and the tracks; see
-    `evaluate.file_digests`.
-
-    Raises:
-        ValueError: if summary.json in `folder` does not have that of the policy.
-    """
-    path = folder / "summary.json"
-    try:
-        summary = read_json(path)
-        return {"policy": str(summary["policies"][number]["sha256"]), **summary["sha256"]}
-    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
-        raise ValueError(
-            f"{path}: does not say which policy was judged ({error}); run suite eval again with "
-            "another --out, then view that folder"
-        ) from error
-
-
 def first_trials(evaluation: Evaluation) -> list[TrialSpec]:
     """Return the first trial of every track and level that `evaluation` flies."""
     tracks, levels = parse_tracks(evaluation.track), parse_levels(evaluation.difficulty)
@@ -87,11 +58,12 @@ def fly_again(
     trials: list[TrialSpec],
     policy: str | None = None,
     judged: Mapping[str, str] | None = None,
-) -> Replay:
-    """Fly `trials` as they were judged, and return their flights.
+) -> tuple[list[Rollout], Drone]:
+    """Fly `trials` as they were judged; return them, and the vehicle with the policy's camera.
 
-    The policy is one of the evaluation's; None: the first one. `judged` has the expected SHA-256 of
-    the inputs, from `read_digests`; None: no comparison.
+    A rollout has the track, the flight (with depth images) and the result of a trial. The policy is
+    one of the evaluation's; None: the first one. `judged` has the expected SHA-256 of the
+    policy and of `evaluate.file_digests`; None: no comparison.
 
     Raises:
         ValueError: if the policy, vehicle, sensors or a track has changed.
@@ -100,12 +72,11 @@ def fly_again(
 
     # Read the inputs as the evaluation did.
     trial_set = read_trial_set(evaluation)
-    _, tracks, vehicle, sensors, *_ = trial_set
     name = policy or (evaluation.policies or (default_policy(),))[0]
     manner = manners(evaluation.speed, monitor=False)[0]
     loaded = load_in_manner(name, evaluation.trust, manner)
     if judged is not None:
-        digests = {"policy": policy_digest(name), **file_digests(vehicle, tracks, sensors)}
+        digests = {"policy": policy_digest(name), **file_digests(trial_set)}
         sources = {"policy": name, "vehicle": evaluation.vehicle, "sensors": evaluation.sensors}
         _refuse_changed(sources, digests, judged)
     # Fly, and keep the flights.
@@ -118,12 +89,12 @@ def fly_again(
     record = Record(depth=True)
     results = fly_trials(loaded, evaluation, trial_set, 1, trials, keep, record)
     rollouts = [
-        (track_of(tracks, trial), flights[trial], result)
+        (track_of(trial_set.tracks, trial), flights[trial], result)
         for trial, result in zip(trials, results, strict=True)
     ]
     # Flights have the camera of the policy, not that of the vehicle file.
-    camera = loaded.spec.camera
-    return Replay(rollouts, Drone(vehicle.body.half_size, vehicle.rotors.position, camera))
+    vehicle, camera = trial_set.vehicle, loaded.spec.camera
+    return rollouts, Drone(vehicle.body.half_size, vehicle.rotors.position, camera)
 
 
 def _refuse_changed(

@@ -24,11 +24,6 @@ CHUNK = 320
 cache."""
 
 
-def _chunk_size(count: int) -> int:
-    """Return the largest divisor of count that is at most CHUNK."""
-    return max(size for size in range(1, min(count, CHUNK) + 1) if count % size == 0)
-
-
 def encoder_gradient(
     params: network.Params, images: jax.Array, cotangents: jax.Array
 ) -> network.Params:
@@ -39,7 +34,9 @@ def encoder_gradient(
         images: (N, height, width) encoded images, inverse depths.
         cotangents: (N, hidden) gradient of the loss with respect to the embeddings.
     """
-    size = _chunk_size(images.shape[0])
+    count = images.shape[0]
+    # The largest divisor of the number of images that is at most CHUNK.
+    size = max(size for size in range(1, min(count, CHUNK) + 1) if count % size == 0)
 
     def add_chunk(
         total: network.Params, part: tuple[jax.Array, jax.Array]

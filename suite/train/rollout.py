@@ -24,11 +24,12 @@ from eval.sensors import SENSORS, scale_model, view_models
 from eval.sensors.interface import keyed_draws, product, rotation_since
 from policies.networks import delta_network, network
 from policies.observation import Observation, View, observe
+from policies.spec import PolicySpec
 from suite.train import losses
-from suite.train.config import TrainConfig
+from suite.train.config import SensorsConfig, TrainConfig
 from suite.train.dynamics.interface import DynamicsState, make_dynamics
 from suite.train.step import make_step, target_gate
-from suite.train.worlds import Worlds
+from suite.train.worlds import Sensed, Worlds
 from tracks.common.masks import select
 from tracks.geometry.camera import pixel_rays_b
 from tracks.geometry.depth import depth_image
@@ -40,27 +41,35 @@ SEEN = Counts(boxes=24, cylinders=8, capsules=5, spheres=5)
 which scores policies in MuJoCo, have all solids."""
 
 
-class RolloutCarry(NamedTuple):
-    """State of the B worlds between steps."""
+class Episode(NamedTuple):
+    """The flights of the B worlds between steps; those of PPO have the same."""
 
     state: Any
     """State of the dynamics."""
     target: jax.Array
     """(B,) number of passed gates, counted from the track's first one; the next gate's index."""
-    hidden: jax.Array
-    """(B, hidden) recurrent state of the policy."""
     action_b: jax.Array
     """(B, 3) the policy's last action, without the correction of a Delta Action network [m/s^2]."""
-    embeddings: jax.Array
-    """(B, image_delay, hidden) embeddings of images that wait for their delay, oldest first."""
+    waiting: jax.Array
+    """(B, image_delay, ...) images or their embeddings that wait for their delay, oldest first. At
+    the start they are zero: an image of zeros is embedded as zeros."""
     observed: jax.Array
-    """(B, state_delay, state_size) state vectors that wait for their delay, oldest first."""
+    """(B, state_delay, state_size) state vectors that wait for their delay, oldest first. At the
+    start all are the state vector of the start."""
+    sensed: Any
+    """Memory of the sensor models; () without models."""
+
+
+class RolloutCarry(NamedTuple):
+    """The episodes of the B worlds, and what a training needs besides."""
+
+    episode: Episode
+    hidden: jax.Array
+    """(B, hidden) recurrent state of the policy."""
     delta_hidden: jax.Array
     """(B, 32) recurrent state of the Delta Action network."""
     alive: jax.Array
     """(B,) 1 while the world counts in the loss: until it crashes, stops or finishes, then 0."""
-    sensed: Any
-    """Memory of the sensor models."""
 
 
 class StepRecord(NamedTuple):
@@ -115,70 +124,64 @@ def world_keys(key: jax.Array, worlds: Worlds) -> jax.Array:
     return jax.vmap(jax.random.fold_in, (None, 0))(key, worlds.number)
 
 
-class SensorModels(NamedTuple):
-    """The sensor models of a training, as pure functions over B worlds.
-
-    In this file a view has all from which the policy's observation is computed: pose, velocity,
-    gates and depth image (`policies.observation.View`).
-    """
-
-    start: Callable[[Worlds, View], Any]
-    """(worlds, view at the start) -> memory of the models: past views, and states of the models."""
-    measure: Callable[[Worlds, View, jax.Array, Any], tuple[View, Any]]
-    """(worlds, true view, keys (B,), memory) -> (view with errors, new memory)."""
-
-
-def make_sensor_models(config: TrainConfig) -> SensorModels:
-    """Return the sensor models of `config.sensors`, with each world's magnitudes and draws.
+class SensorModels:
+    """The sensor models of a training, with each world's magnitudes and draws.
 
     The functions are those of the judge. The trainer has states only at decisions. If a delay ends
     between two decisions, the state is interpolated, and the image is one of the two neighbouring
-    ones, at random.
+    ones, at random. In this file a view has all from which the policy's observation is computed:
+    pose, velocity, gates and depth image (`policies.observation.View`).
     """
-    assert config.sensors is not None
-    models, spec, dt_s = config.sensors.seen.models, config.spec, 1.0 / config.spec.rate_hz
-    seen_models, largest = view_models(models), config.sensors.magnitude[1]
-    delays = (scale_model(name, models[name], largest) for name in models if name == "delay")
-    # Number of stored views: the largest possible age in policy periods.
-    periods = max((ceil((1 + d.jitter) * max(d.state, d.image) / dt_s) for d in delays), default=0)
 
-    def current_models(worlds: Worlds) -> dict[str, Any]:
-        assert worlds.sensed is not None
-        return sensors.scale_models(seen_models, worlds.sensed.magnitude)
+    def __init__(self, config: SensorsConfig, spec: PolicySpec) -> None:
+        self._models, self._camera, self._dt_s = config.seen.models, spec.camera, 1.0 / spec.rate_hz
+        self._view_models = view_models(self._models)
+        # Number of stored views: the largest possible age in policy periods.
+        self._periods = 0
+        if "delay" in self._models:
+            delay = scale_model("delay", self._models["delay"], config.magnitude[1])
+            longest_s = (1 + delay.jitter) * max(delay.state, delay.image)
+            self._periods = ceil(longest_s / self._dt_s)
 
-    def start(worlds: Worlds, truth: View) -> Any:
-        assert worlds.sensed is not None
-        arguments = worlds.sensed.trial, dt_s, spec.camera
-        return (truth,) * periods, sensors.start(current_models(worlds), truth, *arguments)
+    def start(self, worlds: Worlds, truth: View) -> Any:
+        """Return the memory of the models at the start: past views, and states of the models."""
+        models, sensed = self._current_models(worlds)
+        states = sensors.start(models, truth, sensed.trial, self._dt_s, self._camera)
+        return (truth,) * self._periods, states
 
-    def measure(worlds: Worlds, truth: View, keys: jax.Array, memory: Any) -> tuple[View, Any]:
-        past_views, states = memory
+    def measure(
+        self, worlds: Worlds, truth: View, keys: jax.Array, memory: Any
+    ) -> tuple[View, Any]:
+        """Return the view with errors and the new memory; `keys` (B,) are random keys."""
+        (past_views, states), (models, sensed) = memory, self._current_models(worlds)
         # Random numbers of each model.
         draws, views = {}, (truth, *past_views)
-        for number, name in enumerate(seen_models):
+        for number, name in enumerate(models):
             model_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, number + 1)
             needs = SENSORS[name].observation
-            draws[name] = jax.vmap(lambda key, n=needs: keyed_draws(n, key, spec.camera))(
+            draws[name] = jax.vmap(lambda key, n=needs: keyed_draws(n, key, self._camera))(
                 model_keys
             )
         # The delayed view, with a random variation of the delay (jitter); then the other errors.
         delayed = truth
         if past_views:
-            assert worlds.sensed is not None
-            delay = scale_model("delay", models["delay"], worlds.sensed.magnitude["delay"])
+            delay = scale_model("delay", self._models["delay"], sensed.magnitude["delay"])
             delay_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, 0)
             uniform = jax.vmap(lambda key: jax.random.uniform(key, (3,)))(delay_keys)
             jitter = 1.0 + delay.jitter * (2.0 * uniform[:, :2] - 1.0)
-            ages = jnp.stack([delay.state, delay.image], -1) * jitter / dt_s
+            ages = jnp.stack([delay.state, delay.image], -1) * jitter / self._dt_s
             # Random rounding: the probability to round up is the fraction.
             delayed = delayed_view(views, ages[:, 0], jnp.floor(ages[:, 1] + uniform[:, 2]))
-        view, states = sensors.sense(
-            current_models(worlds), states, delayed, draws, dt_s, spec.camera
-        )
+        view, states = sensors.sense(models, states, delayed, draws, self._dt_s, self._camera)
         image = jax.lax.stop_gradient(view.depth_m)
-        return view._replace(depth_m=image), (views[:periods], jax.lax.stop_gradient(states))
+        memory = views[: self._periods], jax.lax.stop_gradient(states)
+        return view._replace(depth_m=image), memory
 
-    return SensorModels(start, measure)
+    def _current_models(self, worlds: Worlds) -> tuple[dict[str, Any], Sensed]:
+        """Return the models at the magnitudes of the worlds, and the worlds' draws."""
+        assert worlds.sensed is not None
+        models = sensors.scale_models(self._view_models, worlds.sensed.magnitude)
+        return models, worlds.sensed
 
 
 def delayed_view(views: tuple[View, ...], age: jax.Array, image_age: jax.Array) -> View:
@@ -206,65 +209,59 @@ def delayed_view(views: tuple[View, ...], age: jax.Array, image_age: jax.Array) 
     return view
 
 
-class Observer(NamedTuple):
-    """The observation of policies, as pure functions over B worlds; images have no gradient."""
+class Observer:
+    """The observation of policies in training, with image noise and sensor errors.
 
-    start: Callable[[Worlds, DynamicsState], Any]
-    """(worlds, state at the start) -> memory of the sensor models; () without models."""
-    observe: Callable[..., tuple[Observation, Any]]
-    """(worlds, state, target, last_action_b, keys (B,), memory) -> (observation, new memory).
-    `target` is the number of passed gates."""
+    Its methods are pure functions over B worlds. Images have no gradient.
+    """
 
+    def __init__(self, config: TrainConfig) -> None:
+        self._spec, self._physics = config.spec, config.physics
+        # One ray a pixel, also for a supersampling camera: more rays cost time and had no benefit.
+        self._rays = jnp.asarray(pixel_rays_b(config.spec.camera), jnp.float32)
+        self._models = SensorModels(config.sensors, config.spec) if config.sensors else None
 
-def make_observer(config: TrainConfig) -> Observer:
-    """Return the observation in training, with image noise and sensor errors."""
-    spec, camera, noise = config.spec, config.spec.camera, config.physics.depth_noise
-    # One ray a pixel, also for a supersampling camera: more rays cost time and had no benefit.
-    rays = jnp.asarray(pixel_rays_b(camera), jnp.float32)
-    models = None if config.sensors is None else make_sensor_models(config)
-
-    def true_view(worlds: Worlds, state: DynamicsState, target: jax.Array) -> View:
+    def _true_view(self, worlds: Worlds, state: DynamicsState, target: jax.Array) -> View:
         # Scaling the rays across the optical axis changes the field of view. All worlds of an
         # iteration share the scale, so that the rays are one array.
-        axis = rays.mean(0)
-        scaled_rays = axis + (rays - axis) * worlds.fov_scale[0]
+        camera, axis = self._spec.camera, self._rays.mean(0)
+        scaled_rays = axis + (self._rays - axis) * worlds.fov_scale[0]
         pos_w, rot_w = jax.lax.stop_gradient((state.pos_w, state.rot_w))
         depth_m = depth_image(worlds.scene, pos_w, rot_w, scaled_rays, camera.range_m, SEEN)
         image_m = depth_m.reshape(-1, camera.height, camera.width)
         return view_in(worlds, state, target)._replace(depth_m=image_m)
 
-    def start(worlds: Worlds, state: DynamicsState) -> Any:
-        if models is None:
-            return ()
-        return models.start(worlds, true_view(worlds, state, jnp.asarray(worlds.target)))
+    def start(self, worlds: Worlds, state: DynamicsState, shape: tuple[int, ...]) -> Episode:
+        """Return the episodes at their start; `shape` is that of an entry of `Episode.waiting`."""
+        target, no_action, sensed = jnp.asarray(worlds.target), jnp.zeros_like(state.pos_w), ()
+        view = view_in(worlds, state, target)
+        observed = observe(self._spec, view, no_action, worlds.speed_command).state
+        if self._models:
+            sensed = self._models.start(worlds, self._true_view(worlds, state, target))
+        return Episode(
+            state=state,
+            target=target,
+            action_b=no_action,
+            waiting=jnp.zeros((len(target), self._physics.image_delay, *shape)),
+            observed=jnp.repeat(observed[:, None], self._physics.state_delay, axis=1),
+            sensed=sensed,
+        )
 
-    def observe_worlds(
-        worlds: Worlds,
-        state: DynamicsState,
-        target: jax.Array,
-        last_action_b: jax.Array,
-        keys: jax.Array,
-        memory: Any,
-    ) -> tuple[Observation, Any]:
-        view = true_view(worlds, state, target)
-        if models is not None:
-            view, memory = models.measure(worlds, view, keys, memory)
-        observation = observe(spec, view, last_action_b, worlds.speed_command)
+    def observe(
+        self, worlds: Worlds, episode: Episode, keys: jax.Array
+    ) -> tuple[Observation, Episode]:
+        """Return the delayed state vector with the newest image, and the new episodes.
+
+        `keys` (B,) are random keys of the noise.
+        """
+        view, sensed = self._true_view(worlds, episode.state, episode.target), episode.sensed
+        if self._models:
+            view, sensed = self._models.measure(worlds, view, keys, sensed)
+        newest = observe(self._spec, view, episode.action_b, worlds.speed_command)
         grain = jax.vmap(lambda key: jax.random.normal(key, view.depth_m.shape[1:]))(keys)
-        return observation._replace(image=observation.image + noise * grain), memory
-
-    return Observer(start, observe_worlds)
-
-
-def observed_at_start(worlds: Worlds, state: DynamicsState, config: TrainConfig) -> jax.Array:
-    """Return the queue of delayed state vectors at the start, (B, state_delay, state_size).
-
-    All of its entries are the state vector of the start.
-    """
-    view = view_in(worlds, state, jnp.asarray(worlds.target))
-    no_action = jnp.zeros_like(state.pos_w)
-    observed = observe(config.spec, view, no_action, worlds.speed_command).state
-    return jnp.repeat(observed[:, None], config.physics.state_delay, axis=1)
+        state, observed = queue(episode.observed, newest.state)
+        image = newest.image + self._physics.depth_noise * grain
+        return Observation(state, image), episode._replace(observed=observed, sensed=sensed)
 
 
 def make_rollout(
@@ -277,22 +274,17 @@ def make_rollout(
     flights match measured ones, or None. The loss is the mean over steps and worlds. The records
     have arrays (T, B, ...), without gradient; `note` adds some.
     """
-    weights, physics, width = config.loss, config.physics, config.spec.hidden_size
-    observer, dynamics = make_observer(config), make_dynamics(config)
+    weights, width = config.loss, config.spec.hidden_size
+    observer, dynamics = Observer(config), make_dynamics(config)
 
     def start(worlds: Worlds) -> RolloutCarry:
         batch = len(worlds.target)
         state = dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w)
         return RolloutCarry(
-            state=state,
-            target=jnp.asarray(worlds.target),
+            episode=observer.start(worlds, state, (width,)),
             hidden=jnp.asarray(worlds.hidden),
-            action_b=jnp.zeros((batch, 3)),
-            embeddings=jnp.zeros((batch, physics.image_delay, width)),
-            observed=observed_at_start(worlds, state, config),
             delta_hidden=delta_network.start(batch),
             alive=jnp.ones(batch),
-            sensed=observer.start(worlds, state),
         )
 
     def rollout(
@@ -309,16 +301,13 @@ def make_rollout(
             carry: RolloutCarry, inputs: tuple[jax.Array, jax.Array, jax.Array]
         ) -> tuple[RolloutCarry, StepRecord]:
             shift_now, key_now, number = inputs
-            before, target = carry.state, carry.target
+            before, target = carry.episode.state, carry.episode.target
             keys = world_keys(key_now, worlds)
             # What the policy observes, with delays, and its action.
-            observation, sensed = observer.observe(
-                worlds, before, target, carry.action_b, keys, carry.sensed
-            )
+            observation, episode = observer.observe(worlds, carry.episode, keys)
             embedding = encode(params, observation.image) + shift_now
-            embedding, embeddings = queue(carry.embeddings, embedding)
-            state, observed = queue(carry.observed, observation.state)
-            action, hidden = network.recur(params, carry.hidden, embedding, state)
+            embedding, waiting = queue(episode.waiting, embedding)
+            action, hidden = network.recur(params, carry.hidden, embedding, observation.state)
             # The corrected action, the motion and its loss.
             corrected, delta_hidden = action, carry.delta_hidden
             if delta is not None:
@@ -349,18 +338,11 @@ def make_rollout(
                 alive=carry.alive,
                 noted=None if note is None else note(worlds, before, after, target),
             )
-            carry = RolloutCarry(
-                state=after,
-                target=target_after,
-                hidden=hidden,
-                action_b=action,
-                embeddings=embeddings,
-                observed=observed,
-                delta_hidden=delta_hidden,
-                alive=carry.alive * intact * goes_on,
-                sensed=sensed,
+            episode = episode._replace(
+                state=after, target=target_after, action_b=action, waiting=waiting
             )
-            return carry, record
+            alive = carry.alive * intact * goes_on
+            return RolloutCarry(episode, hidden, delta_hidden, alive), record
 
         keys = jax.random.split(key, steps)
         inputs = embedding_shift, keys, jnp.arange(steps)

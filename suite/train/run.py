@@ -29,7 +29,7 @@ from suite.train.config import TrainConfig
 from suite.train.overrides import check_phases, phase_configs, phase_ends
 from suite.train.shards import check_processes
 from suite.train.training_loop import Outcome, Run, RunPhase, Watch, flight_note, train_in_folder
-from suite.train.update import TrainState, make_update, start_state
+from suite.train.update import make_update, start_state
 from suite.train.worlds import sample_worlds
 from tracks.common.files import plain
 from tracks.common.work import usable_cores
@@ -112,8 +112,6 @@ def train(
         for note in without_signal(configs[0].quadrotor.vehicle):
             console.note(note)
     begins = (0, *ends[:-1])
-    # The spec before each phase: the rate may change, and the parameters are then converted.
-    specs_before = (configs[0].spec, *(phase.spec for phase in configs[:-1]))
     phases = [
         RunPhase(
             end=end,
@@ -122,19 +120,11 @@ def train(
             worlds=functools.partial(sample_worlds, phase),
             make_update=functools.partial(make_update, phase, delta, begin),
             note=functools.partial(flight_note, "loss"),
-            begin=functools.partial(_convert_policy, before=before, spec=phase.spec),
         )
-        for phase, begin, end, before in zip(configs, begins, ends, specs_before, strict=True)
+        for phase, begin, end in zip(configs, begins, ends, strict=True)
     ]
     run = Run(config, origin, folder, estimate(config), mirror)
     return train_in_folder(phases, run, start_state(configs[0], params), console, watch)
-
-
-def _convert_policy(state: TrainState, before: PolicySpec, spec: PolicySpec) -> TrainState:
-    """Return the state of a policy with spec `before`, converted for a policy with `spec`."""
-    if before == spec:
-        return state
-    return state._replace(params=network.adapt_params(state.params, before, spec))
 
 
 def _digest(params: Mapping[str, Any] | None) -> str | None:

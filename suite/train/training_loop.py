@@ -73,7 +73,7 @@ class RunPhase(NamedTuple):
     end: int
     """Iteration of the run at which the phase ends; it begins at the end of the phase before."""
     spec: PolicySpec
-    """Spec of the policy during the phase."""
+    """Spec of the policy during the phase; the parameters are converted if it changes."""
     frames: int
     """Number of environment steps (decisions, over all simulated drones) in one iteration."""
     worlds: Callable[[int], Worlds]
@@ -82,8 +82,6 @@ class RunPhase(NamedTuple):
     """Returns update(state, worlds) -> (new state, row of the curve); called once in a phase."""
     note: Callable[[Mapping[str, float]], str]
     """(row of the curve) -> a short text about it, for the progress line."""
-    begin: Callable[[Any], Any] = lambda state: state
-    """(last state of the phase before) -> the phase's first state."""
 
 
 def flight_note(goal: str, row: Mapping[str, float]) -> str:
@@ -160,7 +158,7 @@ def _iterate(
     phases: Sequence[RunPhase], run: Run, state: Any, console: Console, watch: Watch | None = None
 ) -> Any:
     """Return the state after the last phase; phases that are already finished are skipped."""
-    total, first, beginning = phases[-1].end, int(state.iteration), 0
+    total, first = phases[-1].end, int(state.iteration)
     with (
         console.progress("training", total, begun=first) as show,
         _Recorder(run, watch, total) as recorder,
@@ -170,14 +168,16 @@ def _iterate(
         recorder.last = (_last_phase(phases, first), state)
         if _is_missing(watch, run.folder, first, total):
             recorder.measure_if_due(state)
+        beginning, spec = 0, phases[0].spec
         for phase in phases:
             # A run that is resumed within a phase has its converted state already. A phase without
             # iterations converts the state, too: the next phase converts from its spec.
-            if int(state.iteration) == beginning:
-                state = phase.begin(state)
+            if int(state.iteration) == beginning and spec != phase.spec:
+                params = network.adapt_params(state.params, spec, phase.spec)
+                state = state._replace(params=params)
             if int(state.iteration) < phase.end:
                 state = _iterate_phase(phase, state, recorder, show, ahead)
-            beginning = phase.end
+            beginning, spec = phase.end, phase.spec
     return state
 
 

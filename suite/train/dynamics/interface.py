@@ -7,46 +7,21 @@ The models are a point mass and the differentiable quadrotor of a vehicle file. 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import jax
 
 from suite.train.config import TrainConfig
 from suite.train.dynamics import point_mass
-from tracks.geometry.scene import Array
+
+if TYPE_CHECKING:
+    from suite.train.dynamics.quadrotor import QuadrotorParams, QuadrotorState
 
 
-class DynamicsState(Protocol):
-    """The part of a state that a rollout (simulated flight) reads; models may have more fields."""
-
-    @property
-    def pos_w(self) -> jax.Array:
-        """(B, 3) position [m]."""
-        ...
-
-    @property
-    def vel_w(self) -> jax.Array:
-        """(B, 3) velocity [m/s]."""
-        ...
-
-    @property
-    def acc_w(self) -> jax.Array:
-        """(B, 3) net acceleration [m/s^2]."""
-        ...
-
-    @property
-    def rot_w(self) -> jax.Array:
-        """(B, 3, 3) attitude, body to world."""
-        ...
-
-
-class WorldParams(Protocol):
-    """Parameters of the dynamics that are drawn once per world; a model may have more fields."""
-
-    @property
-    def time_step(self) -> Array:
-        """(B,) the policy's period [s]."""
-        ...
+DynamicsState: TypeAlias = "point_mass.PointMassState | QuadrotorState"
+"""State of B worlds. Rollouts (simulated flights) read pos_w, vel_w, acc_w and rot_w only."""
+WorldParams: TypeAlias = "point_mass.PointMassParams | QuadrotorParams"
+"""Parameters that are drawn once per world. Both models have `time_step`, the policy's period."""
 
 
 class Dynamics(NamedTuple):

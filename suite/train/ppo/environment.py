@@ -21,30 +21,13 @@ from policies.spec import ActionSpec, PolicySpec
 from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import make_dynamics
 from suite.train.ppo.reward import COLLISION, RewardTerms, make_reward
-from suite.train.rollout import make_observer, observed_at_start, queue, world_keys
+from suite.train.rollout import Episode, Observer, queue, world_keys
 from suite.train.step import BODY_RADIUS_M, target_gate
 from suite.train.worlds import Worlds, sample_worlds
 from tracks.common.masks import select
 
 ACTION_LIMIT = 20.0
 """Acceleration that an action of 1 means in `JaxRace`, as in `eval.envs` [m/s^2]."""
-
-
-class Episode(NamedTuple):
-    """State of the episodes of B worlds between steps."""
-
-    state: Any
-    """State of the dynamics."""
-    target: jax.Array
-    """(B,) number of passed gates, counted from the track's first one."""
-    action_b: jax.Array
-    """(B, 3) the policy's last action [m/s^2]."""
-    images: jax.Array
-    """(B, image_delay, height, width) images that wait for their delay, oldest first."""
-    observed: jax.Array
-    """(B, state_delay, state_size) state vectors that wait for their delay, oldest first."""
-    sensed: Any
-    """Memory of the sensor models."""
 
 
 class PeriodResult(NamedTuple):
@@ -72,31 +55,17 @@ class Race(NamedTuple):
 
 def make_race(config: TrainConfig) -> Race:
     """Return the race that `config` describes: its observation, dynamics, noise and delays."""
-    spec, physics = config.spec, config.physics
-    observer, reward, dynamics = make_observer(config), make_reward(config), make_dynamics(config)
+    camera = config.spec.camera
+    observer, reward, dynamics = Observer(config), make_reward(config), make_dynamics(config)
 
     def start(worlds: Worlds) -> Episode:
-        batch = worlds.pos_w.shape[0]
         state = dynamics.start(worlds.constants, worlds.pos_w, worlds.vel_w, worlds.heading_w)
-        return Episode(
-            state=state,
-            target=jnp.asarray(worlds.target),
-            action_b=jnp.zeros((batch, 3)),
-            # An image of zeros is embedded as zeros, which is how the trainer's rollouts start.
-            images=jnp.zeros((batch, physics.image_delay, spec.camera.height, spec.camera.width)),
-            observed=observed_at_start(worlds, state, config),
-            sensed=observer.start(worlds, state),
-        )
+        return observer.start(worlds, state, (camera.height, camera.width))
 
     def observe(worlds: Worlds, episode: Episode, keys: jax.Array) -> tuple[Observation, Episode]:
-        newest, sensed = observer.observe(
-            worlds, episode.state, episode.target, episode.action_b, keys, episode.sensed
-        )
-        state, observed = queue(episode.observed, newest.state)
-        image, images = queue(episode.images, newest.image)
-        return Observation(state, image), episode._replace(
-            images=images, observed=observed, sensed=sensed
-        )
+        newest, episode = observer.observe(worlds, episode, keys)
+        image, waiting = queue(episode.waiting, newest.image)
+        return newest._replace(image=image), episode._replace(waiting=waiting)
 
     def fly(
         worlds: Worlds, episode: Episode, action_b: jax.Array, keys: jax.Array

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from policies.networks import network
 from suite.train.ppo.config import PpoConfig
-from suite.train.ppo.rollout import log_probability
+from suite.train.ppo.rollout import Record, log_probability
 
 
 class Actor(NamedTuple):
@@ -24,14 +24,9 @@ class Actor(NamedTuple):
 class Sequences(NamedTuple):
     """The inputs of the objective from a rollout of T steps in B worlds."""
 
-    state: jax.Array
-    """(T, B, state_size) state vectors of the observations."""
-    action_b: jax.Array
-    """(T, B, 3) actions with exploration [m/s^2]."""
-    log_prob: jax.Array
-    """(T, B) logarithm of the actions' probability density under the policy that flew."""
-    done: jax.Array
-    """(T, B) bool: the episode ended with the step."""
+    records: Record
+    """(T, B, ...) what the policy observed and did; the log-probabilities are those of the policy
+    that flew."""
     advantage: jax.Array
     """(T, B) advantage of the action over the mean one, normalised over the rollout."""
     start: jax.Array
@@ -71,7 +66,7 @@ def action_means(params: network.Params, embeddings: jax.Array, sequences: Seque
 
     The recurrent state is set back to that of the start after the end of an episode.
     """
-    start = sequences.start[0]
+    start, records = sequences.start[0], sequences.records
 
     def step(
         hidden: jax.Array, now: tuple[jax.Array, jax.Array, jax.Array]
@@ -80,7 +75,7 @@ def action_means(params: network.Params, embeddings: jax.Array, sequences: Seque
         mean, hidden = network.recur(params, hidden, embedding, state)
         return jnp.where(done[:, None], start, hidden), mean
 
-    return jax.lax.scan(step, start, (embeddings, sequences.state, sequences.done))[1]
+    return jax.lax.scan(step, start, (embeddings, records.state, records.done))[1]
 
 
 def clipped_loss(
@@ -92,10 +87,10 @@ def clipped_loss(
         config: has the clip limit and the weight of the entropy.
         actor: the policy and its exploration, with gradient.
         embeddings: (T, B, hidden) embeddings of the images, with gradient.
-        sequences: states, actions and advantages of the rollout.
+        sequences: the rollout, and its advantages.
     """
-    mean = action_means(actor.params, embeddings, sequences)
-    log_ratio = log_probability(mean, actor.log_deviation, sequences.action_b) - sequences.log_prob
+    mean, flown = action_means(actor.params, embeddings, sequences), sequences.records
+    log_ratio = log_probability(mean, actor.log_deviation, flown.action_b) - flown.log_prob
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
     gain = jnp.minimum(ratio * sequences.advantage, clipped * sequences.advantage).mean()

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from policies.networks import network
 from suite.train.config import TrainConfig
 from suite.train.ppo import critic
-from suite.train.ppo.environment import Episode, make_race
+from suite.train.ppo.environment import make_race
 from suite.train.ppo.reward import RewardTerms
-from suite.train.rollout import world_keys
+from suite.train.rollout import Episode, world_keys
 from suite.train.worlds import Worlds
 from tracks.common.masks import select
 

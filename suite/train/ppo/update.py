@@ -101,17 +101,13 @@ def shuffled(key: jax.Array, count: int, epochs: int, parts: int) -> jax.Array:
 
 
 def actor_gradient(
-    config: PpoConfig, actor: Actor, images: jax.Array, sequences: Sequences, key: jax.Array
+    config: PpoConfig, actor: Actor, sequences: Sequences, key: jax.Array
 ) -> tuple[Actor, dict[str, jax.Array]]:
     """Return the gradient of the clipped loss, and numbers of the learning curve by name.
 
-    Args:
-        config: the run.
-        actor: the policy and its exploration, at which the gradient is computed.
-        images: (T, B, height, width) images of the rollout.
-        sequences: (T, B, ...) other numbers of the same worlds.
-        key: selects the images for the encoder's gradient, with `episode.image_stride`.
+    `key` selects the images for the encoder's gradient, with `episode.image_stride`.
     """
+    images = sequences.records.image
     steps, batch = images.shape[:2]
     embeddings = network.encode(actor.params, images.reshape(-1, *images.shape[2:]))
     embeddings = embeddings.reshape(steps, batch, -1)
@@ -156,14 +152,14 @@ def make_update(
     seed = jax.random.key(np.uint32(config.seed))
 
     def train_actor(
-        state: PpoState, images: jax.Array, sequences: Sequences, key: jax.Array
+        state: PpoState, sequences: Sequences, key: jax.Array
     ) -> tuple[PpoState, dict[str, jax.Array]]:
         def learn(
             carry: tuple[Actor, optax.OptState], part: tuple[jax.Array, jax.Array]
         ) -> tuple[tuple[Actor, optax.OptState], dict[str, jax.Array]]:
             (actor, optimizer), (rows, key) = carry, part
-            minibatch = Sequences(*(array[:, rows] for array in sequences))
-            gradient, numbers = actor_gradient(config, actor, images[:, rows], minibatch, key)
+            minibatch = jax.tree.map(lambda array: array[:, rows], sequences)
+            gradient, numbers = actor_gradient(config, actor, minibatch, key)
             squares = [(leaf * leaf).sum() for leaf in jax.tree.leaves(gradient)]
             numbers["gradient_norm"] = jnp.sqrt(jnp.stack(squares).sum())
             change, optimizer = actor_optimizer.update(gradient, optimizer, actor)
@@ -206,16 +202,10 @@ def make_update(
         reward = config.reward_scale * records.reward.total()
         advantage = advantages(reward, value, records.done, config.discount, config.trace)
         goal = advantage + value[:-1]
-        sequences = Sequences(
-            state=records.state,
-            action_b=records.action_b,
-            log_prob=records.log_prob,
-            done=records.done,
-            advantage=(advantage - advantage.mean()) / (advantage.std() + 1e-8),
-            start=worlds.hidden[None],
-        )
+        normalised = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        sequences = Sequences(records, normalised, worlds.hidden[None])
         # Train both networks; then keep recurrent states for starts of the next rollout.
-        state, numbers = train_actor(state, records.image, sequences, keys[1])
+        state, numbers = train_actor(state, sequences, keys[1])
         state = train_critic(state, records.critic_inputs, goal, keys[2])
         step = jax.random.randint(keys[3], (batch,), 0, steps)
         hidden = records.hidden[step, jnp.arange(batch)]

@@ -12,6 +12,7 @@ from eval.effects import EFFECTS, nameable_effects
 from eval.flights.simulate import SENSORS, fly, log_of
 from eval.flights.trajectory import Trajectory
 from eval.logs.flight_log import read_flight
+from eval.vehicles.vehicle import with_effects
 from suite.blind import build as module
 from suite.blind import make, oracle
 from suite.blind.build import build
@@ -185,7 +186,9 @@ def test_a_case_is_the_same_to_the_bit_and_its_seed_matters(made_set, monkeypatc
     # What is hidden is in the flights, and not in the vehicle file.
     assert "linear_drag" not in first.nominal.effects
     coefficient = np.array(first.answer["effects"][0]["parameters"]["coefficient"])
-    (flight,) = fly(first.nominal, first.truth, first.trajectories)
+    hidden = {"linear_drag": EFFECTS["linear_drag"].values(tuple(coefficient))}
+    ways = [Trajectory(**way) for way in first.answer["trajectories"]]
+    (flight,) = fly(first.nominal, with_effects(first.nominal, hidden), ways)
     vel_b = np.einsum("tij,ti->tj", flight.motion.rot_w, flight.motion.vel_w)
     # The accelerometer of a vehicle without other aerodynamics shows the drag alone across.
     across = flight.acc_b[1:, :2]
@@ -195,7 +198,7 @@ def test_a_case_is_the_same_to_the_bit_and_its_seed_matters(made_set, monkeypatc
 def test_outside_cases_say_how_much_the_catalogue_cannot_explain(short_flights):
     built = build(Case("outside", ("ripple",), 6.0, "bare", "capture", (5, 3)))
     outside = built.answer["outside"]
-    assert built.answer["verdict"] == "unknown" and not built.truth.effects
+    assert built.answer["verdict"] == "unknown" and not built.answer["effects"]
     assert outside["multiple"] == pytest.approx(6.0, rel=0.25) or outside["strength"] == 0.3
 
 
@@ -247,8 +250,8 @@ def test_a_continuous_cases_vehicle_has_the_loop_that_its_seed_draws(monkeypatch
     assert nominal == first.nominal and list(named) == ["linear_drag"]
     jumps = [np.diff(log.vel_w, 2, axis=0).std() for log in (exact, first.logs[0])]
     assert jumps[0] < 0.1 * jumps[1]
-    simulator = module.simulator_for(CONTINUOUS, np.random.default_rng(3))
+    simulator = module.Simulator(CONTINUOUS, np.random.default_rng(3))
     drawn = draw_conditions(np.random.default_rng(3))
-    assert simulator.conditions["row_hz"] == drawn.row_hz
+    assert simulator.conditions == drawn
     assert simulator.nominal.controller.frequency == drawn.loop_hz
-    assert not module.simulator_for(SINGLE, np.random.default_rng()).conditions
+    assert not module.Simulator(SINGLE, np.random.default_rng()).conditions

@@ -266,7 +266,7 @@ def test_a_run_is_held_to_its_policy(pilots, tmp_path, capsys):
     assert evaluate(out, ONE, pilots["diver"]) == 0
     summary = json.loads(path.read_text())
     for policies, words in (
-        ([], "does not say which policy was judged"),
+        ([], "has no SHA-256 for each of the 1 policies"),
         ([{"sha256": "another"}], f"policy {pilots['diver']}: has changed"),
     ):
         path.write_text(json.dumps({**summary, "policies": policies}))

@@ -46,8 +46,9 @@ def test_training_casts_one_ray_a_pixel_whatever_the_camera_casts_in_flight(monk
 
     monkeypatch.setattr(rollout, "depth_image", spy)
     state = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
-    now = state, worlds.target, state.pos_w, jax.random.split(KEY, 4), ()
-    jax.eval_shape(partial(rollout.make_observer(config).observe, worlds), *now)
+    observer = rollout.Observer(config)
+    start = observer.start(worlds, state, (SPEC.hidden_size,))
+    jax.eval_shape(partial(observer.observe, worlds), start, jax.random.split(KEY, 4))
     assert cast == [(camera.height * camera.width, 3)]
 
 
@@ -175,7 +176,8 @@ def test_what_is_delayed_is_shown_so_many_steps_later_and_before_them_the_start(
     worlds = sample_worlds(config, 0)
     worlds = worlds._replace(vel_w=3.0 * worlds.heading_w)
     state = jax.jit(make_dynamics(config).start)(worlds.constants, *worlds[1:4])
-    found = jax.jit(lambda *start: rollout.observed_at_start(*start, config))(worlds, state)
+    start = rollout.Observer(config).start
+    found = jax.jit(lambda *given: start(*given, (1,)).observed)(worlds, state)
     assert found.shape == (2, 2, config.spec.state_size)
     np.testing.assert_array_equal(found[:, 0], found[:, 1])
     np.testing.assert_allclose(np.linalg.norm(found[:, 0, :3], axis=-1), 3.0, rtol=1e-6)

@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -171,42 +170,47 @@ def test_a_folder_of_another_run_is_refused_by_what_differs(tmp_path):
         train(tmp_path, counting(4))
 
 
-def test_phases_follow_each_other_and_a_stop_at_a_boundary_begins_the_next_one_once(tmp_path):
-    begun = []
-    fast = replace(SPEC, rate_hz=2 * SPEC.rate_hz)
+@pytest.fixture
+def converted(monkeypatch):
+    """Return a list of the rates (before, after) of conversions, which double the parameters."""
+    rates = []
 
-    def begin(state):
-        begun.append(int(state.iteration))
-        return state._replace(params={k: 2 * v for k, v in state.params.items()})
+    def convert(params, before, after):
+        rates.append((before.rate_hz / SPEC.rate_hz, after.rate_hz / SPEC.rate_hz))
+        return {name: 2 * value for name, value in params.items()}
 
-    def phases(stop=None):
-        first, second = counting(4, stop=stop), counting(7, stop=stop)
-        return first, second._replace(spec=fast, begin=begin)
+    monkeypatch.setattr(module.network, "adapt_params", convert)
+    return rates
 
-    train(tmp_path / "whole", *phases())
+
+def phases_of(*ends, stop=None):
+    """Return phases, each with a rate of its own: 1, 2, ... times the usual one."""
+    specs = (replace(SPEC, rate_hz=k * SPEC.rate_hz) for k in range(1, len(ends) + 1))
+    pairs = zip(ends, specs, strict=True)
+    return [counting(end, stop=stop)._replace(spec=spec) for end, spec in pairs]
+
+
+def test_phases_follow_each_other_and_a_stop_at_a_boundary_begins_the_next_one_once(
+    tmp_path, converted
+):
+    train(tmp_path / "whole", *phases_of(4, 7))
     whole = load_policy_checkpoint(tmp_path / "whole" / "policy")
-    assert begun == [4]
-    for stop, spec, begins in ((4, SPEC, [4, 4]), (5, fast, [4])):
-        begun.clear()
+    assert converted == [(1, 2)]
+    for stop, rate, conversions in ((4, 1, 2), (5, 2, 1)):
+        converted.clear()
         folder = tmp_path / str(stop)
         with pytest.raises(KeyboardInterrupt):
-            train(folder, *phases(stop))
-        assert load_policy_checkpoint(folder / "policy").spec.rate_hz == spec.rate_hz
-        assert train(folder, *phases()).iterations == 7 and begun == begins
+            train(folder, *phases_of(4, 7, stop=stop))
+        assert load_policy_checkpoint(folder / "policy").spec.rate_hz == rate * SPEC.rate_hz
+        assert train(folder, *phases_of(4, 7)).iterations == 7
+        assert converted == [(1, 2)] * conversions
         ours = load_policy_checkpoint(folder / "policy")
         for name, value in whole.params.items():
             np.testing.assert_array_equal(ours.params[name], value, err_msg=name)
         assert [row["iteration"] for row in curve.read(folder)] == list(range(7))
 
 
-def test_a_phase_without_iterations_converts_the_state_for_the_next_one(tmp_path):
+def test_a_phase_without_iterations_converts_the_state_for_the_next_one(tmp_path, converted):
     """A recipe of three phases in two iterations: the conversions are from phase to phase."""
-    begun = []
-
-    def begin(number, state):
-        begun.append(number)
-        return state
-
-    phases = [counting(end)._replace(begin=partial(begin, k)) for k, end in enumerate((1, 1, 2))]
-    assert train(tmp_path, *phases).iterations == 2
-    assert begun == [0, 1, 2]
+    assert train(tmp_path, *phases_of(1, 1, 2)).iterations == 2
+    assert converted == [(1, 2), (2, 3)]

@@ -16,7 +16,7 @@ from suite.delta.replay import nominal_model
 from suite.train import worlds as sampling
 from suite.train.config import SensorsConfig
 from suite.train.dynamics.interface import make_dynamics
-from suite.train.rollout import SEEN, delayed_view, make_observer, view_in, world_keys
+from suite.train.rollout import SEEN, Observer, delayed_view, view_in, world_keys
 from suite.train.step import NEAR
 from suite.train.worlds import WorldsAhead, sample_worlds
 from tests.support.training import KEY, boxes_worlds, small_config
@@ -161,22 +161,20 @@ def sensed(**changes):
 
 def seen(config, steps=3):
     """Return a function (worlds, start) of what a drone that moves and turns sees, and both."""
-    observer = make_observer(config)
+    observer = Observer(config)
     worlds = boxes_worlds(config)
     start = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
-    target, turn = jnp.asarray(worlds.target), exp_rot(jnp.array([0.0, 0.05, 0.1]))
+    turn = exp_rot(jnp.array([0.0, 0.05, 0.1]))
 
     def of(worlds, state):
-        def move(carry, step):
-            state, memory = carry
-            keys = world_keys(jax.random.fold_in(KEY, step), worlds)
+        def move(episode, step):
+            state, keys = episode.state, world_keys(jax.random.fold_in(KEY, step), worlds)
             moved = {"pos_w": state.pos_w + 0.05 * state.vel_w, "rot_w": state.rot_w @ turn}
             state = state._replace(**moved)
-            one, memory = observer.observe(worlds, state, target, state.pos_w, keys, memory)
-            return (state, memory), one
+            episode = episode._replace(state=state, action_b=state.pos_w)
+            return observer.observe(worlds, episode, keys)[::-1]
 
-        begin = state, observer.start(worlds, state)
-        return jax.lax.scan(move, begin, jnp.arange(steps))[1]
+        return jax.lax.scan(move, observer.start(worlds, state, (1,)), jnp.arange(steps))[1]
 
     return of, worlds, start
 

@@ -20,7 +20,7 @@ from suite.train.ppo.config import PpoConfig, ppo_like
 from suite.train.ppo.environment import JaxRace
 from suite.train.ppo.objective import Actor, Sequences, action_means, advantages, clipped_loss
 from suite.train.ppo.reward import COLLISION
-from suite.train.ppo.rollout import log_probability, make_rollout
+from suite.train.ppo.rollout import Record, log_probability, make_rollout
 from suite.train.rollout import world_keys
 from tests.support.training import (
     SPEC,
@@ -61,18 +61,19 @@ def rollout_of(actor, seed=1, done=False):
     embeddings = jnp.asarray(rng.normal(size=(STEPS, BATCH, SPEC.hidden_size)))
     ends = np.zeros((STEPS, BATCH), bool)
     ends[2, 1] = done
+    records = Record(**dict.fromkeys(Record._fields))._replace(
+        state=jnp.asarray(rng.normal(size=(STEPS, BATCH, SPEC.state_size))), done=jnp.asarray(ends)
+    )
     sequences = Sequences(
-        state=jnp.asarray(rng.normal(size=(STEPS, BATCH, SPEC.state_size))),
-        action_b=jnp.zeros((STEPS, BATCH, 3)),
-        log_prob=jnp.zeros((STEPS, BATCH)),
-        done=jnp.asarray(ends),
+        records,
         advantage=jnp.asarray(rng.normal(size=(STEPS, BATCH))),
         start=jnp.asarray(rng.normal(size=(1, BATCH, SPEC.hidden_size))),
     )
     mean = means(actor.params, embeddings, sequences)
     action = mean + jnp.exp(actor.log_deviation) * rng.normal(size=mean.shape)
     log_prob = density(mean, actor.log_deviation, action)
-    return embeddings, sequences._replace(action_b=action, log_prob=log_prob)
+    flown = records._replace(action_b=action, log_prob=log_prob)
+    return embeddings, sequences._replace(records=flown)
 
 
 means, density, recur = map(jax.jit, (action_means, log_probability, network.recur))
@@ -93,7 +94,7 @@ def test_where_nothing_has_changed_its_gradient_is_the_policy_gradient(float64):
     @jax.jit
     def surrogate(actor):
         mean = action_means(actor.params, embeddings, sequences)
-        logs = log_probability(mean, actor.log_deviation, sequences.action_b)
+        logs = log_probability(mean, actor.log_deviation, sequences.records.action_b)
         return -(logs * sequences.advantage).mean()
 
     (_, numbers), gradient = loss_and_slope(PLAIN, actor, embeddings, sequences)
@@ -115,8 +116,10 @@ def test_where_nothing_has_changed_its_gradient_is_the_policy_gradient(float64):
 def test_a_change_beyond_the_clip_is_not_rewarded(ratio, advantage, gain, learns, float64):
     actor = actor_of()
     embeddings, sequences = rollout_of(actor)
+    records = sequences.records
     sequences = sequences._replace(
-        log_prob=sequences.log_prob - np.log(ratio), advantage=np.full((STEPS, BATCH), advantage)
+        records=records._replace(log_prob=records.log_prob - np.log(ratio)),
+        advantage=np.full((STEPS, BATCH), advantage),
     )
     config = replace(PLAIN, clip=0.2)
     (loss, numbers), gradient = loss_and_slope(config, actor, embeddings, sequences)
@@ -131,7 +134,9 @@ def test_an_episode_that_ended_leaves_no_memory(float64):
     mean = means(actor.params, embeddings, sequences)
     hidden, again = sequences.start[0], []
     for step in (3, 4):
-        action, hidden = recur(actor.params, hidden, embeddings[step], sequences.state[step])
+        action, hidden = recur(
+            actor.params, hidden, embeddings[step], sequences.records.state[step]
+        )
         again.append(action)
     np.testing.assert_allclose(mean[3:, 1], jnp.stack(again)[:, 1], rtol=1e-12)
     assert not np.allclose(mean[3:, 0], jnp.stack(again)[:, 0])
@@ -227,10 +232,7 @@ def flown(worlds):
 def means_of(actor, records, hidden):
     """Return the policy's actions (T, B, 3) without exploration on what a rollout observed."""
     embeddings = jax.jit(network.encode)(actor.params, records.image.reshape(-1, 20, 20))
-    sequences = Sequences(
-        state=records.state, action_b=records.action_b, log_prob=records.log_prob,
-        done=records.done, advantage=records.log_prob, start=jnp.asarray(hidden)[None],
-    )  # fmt: skip
+    sequences = Sequences(records, records.log_prob, jnp.asarray(hidden)[None])
     return means(actor.params, embeddings.reshape(6, 4, -1), sequences)
 
 
