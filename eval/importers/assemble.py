@@ -34,6 +34,7 @@ from eval.logs.faults.reading import BY_ATTITUDE, MOTORS, read_rows
 from eval.logs.faults.sensors import check_copy
 from eval.logs.faults.vehicle import check_controller, check_vehicle_name
 from eval.logs.flight_log import FlightLog, log_from_columns
+from tracks.common.figures import rounded
 
 SLOW_HZ = 40.0
 """A signal below this rate gets a note [Hz]."""
@@ -229,7 +230,7 @@ def _require_signals(recording: Recording, partial: bool) -> None:
 def _notes_on_rates(recording: Recording, time_s: np.ndarray) -> list[Finding]:
     """Return notes on the row rate, slow signals and gaps."""
     name = slowest(recording)
-    row_rate = f"at {1.0 / median_step(time_s):.3g} Hz, by the {SIGNAL_TEXTS[name]}"
+    row_rate = f"at {rounded(1.0 / median_step(time_s), 3)} Hz, by the {SIGNAL_TEXTS[name]}"
     findings = [Finding("note", "rows", row_rate)]
     for name, subject in SIGNAL_TEXTS.items():
         if name not in recording.signals:

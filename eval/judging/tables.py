@@ -130,9 +130,13 @@ def _pairing(rows: Sequence[TrialResult], others: Sequence[TrialResult]) -> Pair
 
 
 def percent(interval: Interval) -> str:
-    """Return a rate with its interval: "94 % [88, 97]"."""
+    """Return a rate with its interval: "94 % [88, 97]".
+
+    A rate has a decimal place where it would be rounded to 0 or 100 %: "99.7 % [98, 100]".
+    """
     value, low, high = (100 * x for x in interval)
-    return f"{value:.0f} % [{low:.0f}, {high:.0f}]"
+    digits = int(0.0 < value < 100.0 and round(value) in (0, 100))
+    return f"{value:.{digits}f} % [{low:.0f}, {high:.0f}]"
 
 
 def with_interval(interval: Interval, scale: float = 1.0, form: str = ".2f") -> str:

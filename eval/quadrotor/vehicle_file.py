@@ -18,6 +18,7 @@ from eval.effects.interface import Effect, bound_value
 from eval.quadrotor.loops import KINDS, NOMINAL
 from eval.vehicles.vehicle import CollisionBox, Controller, MotorMap, Rotors, Vector, Vehicle
 from eval.vehicles.vehicle_check import check_vehicle
+from tracks.common.figures import with_unit
 from tracks.common.files import write_text
 from tracks.common.toml_table import (
     REQUIRED,
@@ -177,7 +178,7 @@ def check_bounds(effect: Effect, values: Any, vehicle: Vehicle) -> None:
             if not (math.isfinite(number) and low <= number <= high):
                 raise ValueError(
                     f"effects.{effect.name}.{parameter.name} = {_plain(value)}: "
-                    f"must be from {low:g} to {high:g} {parameter.unit}"
+                    f"must be from {with_unit(f'{low:g} to {high:g}', parameter.unit)}"
                 )
 
 

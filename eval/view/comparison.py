@@ -174,7 +174,8 @@ def _layout(flights: Sequence[ComparedFlight]) -> rrb.Blueprint:
     """Return the layout of the recording, with a tab for each flight."""
     times = [flight.measured.time_s for flight in flights]
     # The playback skips the start, where simulations still agree with the measurement.
-    playback_s = (0.1 * float(times[0][-1]), max(float(time[-1]) for time in times))
+    first_s, last_s = float(times[0][0]), float(times[0][-1])
+    playback_s = (0.9 * first_s + 0.1 * last_s, max(float(time[-1]) for time in times))
     views = [_flight_view(f"/flight_{number}", flight) for number, flight in enumerate(flights)]
     return tabs_blueprint(views, playback_s)
 

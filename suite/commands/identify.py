@@ -81,6 +81,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
 def _show_parameters(result: dict[str, Any], console: Console) -> None:
     """Print each parameter with its 95 % interval, or a note if it is not identifiable."""
+    from tracks.common.figures import with_unit
+
     for key, entry in result["parameters"].items():
         values, intervals = entry["value"], entry["ci95"]
         if not isinstance(values, list):
@@ -94,7 +96,7 @@ def _show_parameters(result: dict[str, Any], console: Console) -> None:
             else f"{value:.4g} ({notes.get(k, 'as it was')})"
             for k, (value, interval) in enumerate(zip(values, intervals, strict=True))
         ]
-        console.say(f"  {key}: {', '.join(shown)} {entry['unit']}")
+        console.say(with_unit(f"  {key}: {', '.join(shown)}", entry["unit"]))
 
 
 def _out_path(config: Config) -> Path:

@@ -155,8 +155,10 @@ def _choose_trials(config: Config, console: Console) -> _Chosen:
             trust=config.trust,
             speed=() if config.speed is None else (config.speed,),
         )
-        trials = first_trials(evaluation)[: config.count]
-        return _Chosen(evaluation, config.run, trials, None, {})
+        trials = first_trials(evaluation)
+        if len(trials) > config.count:
+            console.note(f"shown are {config.count} of {len(trials)} trials; --count shows more")
+        return _Chosen(evaluation, config.run, trials[: config.count], None, {})
     from suite.judging.comparing import read_runs
 
     reason = f"{folder} is a run, whose trials are flown again unchanged"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -35,6 +36,12 @@ def plain_axes(axes: Axes) -> None:
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=8)
+
+
+def percent_axis(axes: Axes, low: float, vertical: bool = True) -> None:
+    """Limit an axis of percentages to the data, whose lowest value or interval end is `low`."""
+    limits = (max(-2.0, 5.0 * math.floor(low / 5.0) - 2.0), 101.5)
+    (axes.set_ylim if vertical else axes.set_xlim)(*limits)
 
 
 def legend(figure: Figure, axes: Axes, columns: int = 3, size: float = 9) -> None:

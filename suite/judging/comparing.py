@@ -238,7 +238,8 @@ def _seeds_sentence(
     value, low, high = (100 * number for number in interval)
     count = " and ".join(str(len(group)) for group in rates)
     means = " and ".join(
-        f"{np.mean(group):.1%} (standard deviation over seeds {100 * np.std(group, ddof=1):.1f})"
+        f"{100 * np.mean(group):.1f} % (standard deviation over seeds "
+        f"{100 * np.std(group, ddof=1):.1f} percentage points)"
         for group in rates
     )
     prefix, sign, unit = "", "", "%"

@@ -24,11 +24,12 @@ from suite.common import curve
 from suite.common.charts import curves_chart
 from suite.common.report import Links, Picture, Section
 from suite.delta.run import errors_grid
-from suite.diagnose.report.summary import components
+from suite.diagnose.report.summary import components, figure
 from suite.loop.compare import BEFORE, PolicyResult, points, significance
 from suite.loop.config import EXACT_SIMULATORS, LoopConfig
 from suite.loop.variants import COLOURS, DeltaModel, Findings, Loop, ShownPolicy, Variant
 from suite.loop.work import named_effects, read_diagnosis
+from tracks.common.figures import with_unit
 from tracks.common.files import to_json
 from tracks.common.grid import markdown, table
 
@@ -144,8 +145,8 @@ def _diagnosis_section(config: LoopConfig, diagnosis: Mapping[str, Any]) -> Sect
         "What the diagnosis found in the flights",
         [
             f"Verdict: {diagnosis['verdict']}. The gap (error) on held-out flights is "
-            f"{gap['before']:.2f} before, {gap['after']:.2f} after; "
-            f"{gap['noise_floor']:.2g} is the noise floor.",
+            f"{figure(gap['before'])} {gap['unit']} before, {figure(gap['after'])} after; "
+            f"{gap['noise_floor']:.3g} is the noise floor.",
             table(headers, rows),
             *describe_hidden(config),
             Links([("diagnosis/report.html", "the diagnosis's own report")]),
@@ -175,8 +176,8 @@ def hidden_effects(simulated: Vehicle, true: Vehicle) -> str:
     for name, value in true.effects.items():
         if simulated.effects.get(name) != value:
             values = (
-                f"{parameter.name} {to_json(getattr(value, parameter.name))} {parameter.unit}"
-                for parameter in EFFECTS[name].parameters
+                with_unit(f"{p.name} {to_json(getattr(value, p.name))}", p.unit)
+                for p in EFFECTS[name].parameters
             )
             texts.append(f"{name} ({', '.join(values)})")
     texts += [f"no {name}" for name in simulated.effects if name not in true.effects]

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from eval.judging.results import read_trials
-from suite.common.charts import dots, legend, png, titled
+from suite.common.charts import dots, legend, percent_axis, png, titled
 from suite.common.console import Console, duration
 from suite.common.report import Details, Links, Part, Picture, Report, Section, html
 from suite.common.stages import claim, run_stages, stage_commits
@@ -219,6 +219,7 @@ def success_chart(results: Sequence[PolicyResult], labels: Mapping[str, str]) ->
     axes.set_xticks(range(len(cells)), cells, fontsize=8)
     # A line separates the last cell, that of all trials.
     axes.axvline(len(cells) - 1.5, color="#b8bec8", lw=0.8)
-    axes.set_ylim(-3, 103)
+    lowest = min(rate.low for each in results for rate in (*each.by_cell.values(), each.success))
+    percent_axis(axes, 100 * lowest)
     legend(figure, axes)
     return png(figure)

@@ -17,6 +17,7 @@ from eval.effects import EFFECTS, all_values
 from eval.effects.interface import Parameter, bound_value
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from tracks.common.figures import with_unit
 from tracks.geometry.scene import Array
 
 JOIN = " + "
@@ -197,9 +198,8 @@ def implausible(
         size = abs(theta[index] - (0.0 if parameter.whole else _neutral(entry)))
         if size > limits.implausible_times * parameter.typical[1]:
             suffix = "" if entry.component is None else f" {entry.component + 1}"
-            phrases.append(
-                f"{entry.effect} {entry.parameter}{suffix} = {theta[index]:.3g} {parameter.unit}"
-            )
+            value = with_unit(f"{theta[index]:.3g}", parameter.unit)
+            phrases.append(f"{entry.effect} {entry.parameter}{suffix} = {value}")
     return phrases
 
 

@@ -17,6 +17,7 @@ from eval.vehicles.vehicle_check import check_vehicle
 from suite.diagnose.identify.drive import DrivenVehicle, possible_inertia
 from suite.diagnose.identify.fit import Z95, Fitted
 from suite.diagnose.identify.numbers import DELAY, Number
+from tracks.common.figures import with_unit
 
 INERTIAS, DRAGS, GAINS = ([f"{name}_{a}" for a in "xyz"] for name in ("inertia", "drag", "gain"))
 """Names of fitted numbers by axis."""
@@ -134,7 +135,7 @@ def with_entries(
             if span is None or fitted == allowed:
                 continue
             component = f"[{k}]" if len(entry.value) > 1 else ""
-            given = f"{fitted:.4g} ({span[0]:.4g} to {span[1]:.4g}) {entry.unit}"
+            given = with_unit(f"{fitted:.4g} ({span[0]:.4g} to {span[1]:.4g})", entry.unit)
             then = "none" if removed else f"{allowed:.4g}, the nearest allowed value"
             notes.append(f"{entry.key}{component}: these flights give {given}; the file has {then}")
     return vehicle, numbers, notes

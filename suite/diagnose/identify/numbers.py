@@ -10,6 +10,7 @@ from suite.diagnose.data.inertial import UNSEEN
 from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.identify.fit import Fitted
 from suite.diagnose.identify.grid import IMU_ACC, FlightGrid
+from tracks.common.figures import with_unit
 
 DELAY = "effects.command_delay.delay"
 """Key of the command delay in a vehicle file."""
@@ -86,7 +87,7 @@ def number_lines(numbers: Sequence[Number]) -> list[str]:
     """Return a line for people with the interval of every identified component."""
     return [
         f"{entry.key}{f'[{k}]' if len(entry.value) > 1 else ''} = {value:.4g}: "
-        f"{span[0]:.4g} to {span[1]:.4g} {entry.unit}"
+        + with_unit(f"{span[0]:.4g} to {span[1]:.4g}", entry.unit)
         for entry in numbers
         for k, (value, span) in enumerate(zip(entry.value, entry.ci95, strict=True))
         if span is not None

@@ -25,7 +25,8 @@ def series_chart(series: Series) -> bytes:
     figure = Figure(figsize=(9.0, 3.7), layout="constrained")
     is_over_time = series.x_label != "flight"
     panels = figure.subplots(1 + is_over_time, sharex=True, squeeze=False)[:, 0]
-    measured: dict[str, Any] = {"lw": 1.6}
+    # A wide line below the others shows also where the simulation agrees with it.
+    measured: dict[str, Any] = {"lw": 3.2}
     simulated: dict[str, Any] = {"lw": 1.4}
     if not is_over_time:
         measured = {"ls": "", "marker": "o", "ms": 9.0, "mfc": "none"}
@@ -36,9 +37,10 @@ def series_chart(series: Series) -> bytes:
         panels[0].plot(series.x, values, color=colour, label=label, **simulated)
         if is_over_time:
             panels[1].plot(series.x, series.measured - values, color=colour, lw=1.0)
-    titled(panels[0], superscripts(series.label))
+    label = superscripts(series.label)
+    titled(panels[0], label)
     for axes in panels[1:]:
-        axes.set_ylabel("measured -\nsimulated", fontsize=8)
+        axes.set_ylabel(f"measured -\nsimulated {label[label.rindex('[') :]}", fontsize=8)
         plain_axes(axes)
     panels[-1].set_xlabel(series.x_label, fontsize=8)
     figure.legend(fontsize=8, frameon=False, ncols=3, loc="outside lower center")
@@ -82,17 +84,21 @@ def _rollout(window: FlightWindows, residual: np.ndarray) -> tuple[States, np.nd
         return None
     error = np.where(is_logged, residual, np.nan)[rows]
     pos_w, attitude_b, vel_w, rate_b = np.split(error[:, :12], 4, axis=1)
-    # The attitude's error is the rotation axis times the sine of the angle.
-    sine = np.linalg.norm(attitude_b, axis=1, keepdims=True)
+    # The attitude's error is the rotation axis times the sine of the angle. Two angles have that
+    # sine; the integral of the rates' error along the axis decides which of them it is.
+    row_s, sine = np.asarray(window.row_s)[rows], np.linalg.norm(attitude_b, axis=1)
+    axis_b = -attitude_b / np.maximum(sine, 1e-12)[:, None]
+    growth = np.nan_to_num(-(axis_b * rate_b).sum(axis=1))
     angle = np.arcsin(np.clip(sine, 0.0, 1.0))
-    rotation_b = -attitude_b * angle / np.maximum(sine, 1e-12)
+    is_obtuse = np.cumsum(growth * np.gradient(row_s)) > np.pi / 2
+    angle = np.where(is_obtuse, np.pi - angle, angle)
     row = take(window.row, rows)
     states = States(
-        window.start_s + np.asarray(window.row_s)[rows],
+        window.start_s + row_s,
         row.pos_w - pos_w,
-        rot_to_quat(row.rot_w @ exp_rot(rotation_b)),
+        rot_to_quat(row.rot_w @ exp_rot(axis_b * angle[:, None])),
         row.vel_w - vel_w,
         row.rate_b - rate_b,
     )
     pos, vel, rate = (np.linalg.norm(part, axis=1) for part in (pos_w, vel_w, rate_b))
-    return states, np.stack([pos, vel, np.rad2deg(angle[:, 0]), rate], axis=1)
+    return states, np.stack([pos, vel, np.rad2deg(angle), rate], axis=1)

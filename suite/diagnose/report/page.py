@@ -24,6 +24,7 @@ from suite.diagnose.report.sections import (
 )
 from suite.diagnose.report.summary import components, figure, next_steps, superscripts
 from suite.diagnose.sources.rollout_source import Rollouts, rollouts_of
+from suite.diagnose.sources.source import FITTED, GIVEN
 from tracks.common.grid import Cell, Grid, table, table_of
 
 TITLES = {
@@ -34,7 +35,7 @@ TITLES = {
 }
 """Part of the page's title, by verdict."""
 FILES = (
-    ("vehicle.toml", "the vehicle with the named effects; every command takes it"),
+    ("vehicle.toml", "the vehicle file, with the named effects if there are any"),
     ("diagnosis.json", "all numbers of this page"),
     ("recording.rrd", "held-out flights measured and simulated, before and after, for rerun"),
     ("plan/plan.json", "flights that separate effects which these flights do not"),
@@ -64,7 +65,12 @@ def page(
     gap, flown, main = result["gap"], rollouts_of(diagnosis.main), diagnosis.main
     held = gap["held_out"]
     # The values of a held-out stretch: measured, and simulated without and with the named effects.
-    series = flown.series(main.search, rollouts) if flown else main.source.series(main.search)
+    # If an error remains, the chart shows it.
+    worst = FITTED if result["verdict"] == "partly" and main.search.named else GIVEN
+    if flown:
+        series = flown.series(main.search, rollouts, worst)
+    else:
+        series = main.source.series(main.search)
     chart = [Picture(series_chart(series), series.caption)] if series else []
     after = f" → {figure(gap['after'])}" if result["effects"] else ""
     facts = {
@@ -116,7 +122,7 @@ def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Gr
     """Return a table of the gap by channel, without channels that no log measured."""
     optional = {"repeatability": ".3g", "closed": ".0%", "explainable": ".0%"}
     errors = [error for values in channels.values() for error in values.values()]
-    shown = [key for key in optional if any(key in error for error in errors)]
+    shown = [key for key in optional if any(error.get(key) is not None for error in errors)]
     rows = []
     for group, values in channels.items():
         for channel, error in values.items():
@@ -145,7 +151,7 @@ def _answer(result: Mapping[str, Any]) -> Section:
         share = "exempt" if removed is None else f"{100 * removed:.0f} %"
         first = [effect["name"], ", ".join(effect["alternatives"]) or "none", effect["view"]]
         for component in components(effect):
-            rows.append((*first, component.label, *component.texts(), share))
+            rows.append((*first, superscripts(component.label), *component.texts(), share))
             # What holds for the whole effect is in its first row only.
             first, share = ["", "", ""], ""
     names = [effect["name"] for effect in effects]

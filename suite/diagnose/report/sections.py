@@ -110,7 +110,7 @@ def _mismatch(mismatch: Mapping[str, Any]) -> Grid:
         ("excess thrust", f"{spread(mismatch['thrust'])} m/s²"),
         ("excess angular acceleration, x y z", f"{turn} rad/s²"),
     ]
-    note = "± is the spread over the flights."
+    note = "± is the standard deviation over the rows of the logs."
     return table(["", ""], rows, f"Compared with the {mismatch['commanded_by']}", note)
 
 
@@ -228,7 +228,7 @@ def evidence_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section
             removed = f"{min(100 * (before - gap.rms) / (before - floor), 100.0):.0f} %"
         rows.append((label, figure(gap.rms), interval, removed))
     words = (
-        f"{main.source.measure}. Held out of search and fits: "
+        f"{superscripts(main.source.measure)}. Held out of search and fits: "
         f"{', '.join(result['gap']['held_out'])}. The noise floor is {floor:.3g}."
     )
     note = (

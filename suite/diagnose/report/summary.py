@@ -14,6 +14,7 @@ import numpy as np
 from eval.effects import EFFECTS
 from suite.diagnose.sources.source import FAR
 from suite.diagnose.verdict.gap import EffectSize
+from tracks.common.figures import rounded, with_unit
 
 VERDICTS = {
     "no_gap": "Simulation and flights agree within the measurement noise.",
@@ -97,9 +98,7 @@ def superscripts(text: str) -> str:
 
 def figure(value: float) -> str:
     """Return a gap as text; logs without noise give values such as 1e-10 and 41,400."""
-    if value >= 1000.0:
-        return f"{value:,.0f}"
-    return f"{value:.3g}" if value >= LEAST_SHOWN else f"less than {LEAST_SHOWN:g}"
+    return rounded(value, 3) if value >= LEAST_SHOWN else f"less than {LEAST_SHOWN:g}"
 
 
 def answer(result: Mapping[str, Any]) -> str:
@@ -163,8 +162,9 @@ def _effect_words(effect: Mapping[str, Any]) -> str:
     names = " or ".join([effect["name"], *effect["alternatives"]])
     summary = EFFECTS[effect["name"]].summary if effect["name"] in EFFECTS else "An effect"
     known = [one for one in components(effect) if one.value is not None]
+    # At most three significant digits, and no more than the interval supports.
     values = ", ".join(
-        f"{one.name} {one.value:.3g} {'' if one.unit == '1' else one.unit}".rstrip()
+        with_unit(f"{one.name} {min(f'{one.value:.3g}', one.texts()[0], key=len)}", one.unit)
         for one in known
         if one.is_significant
     ) or ", ".join(f"{one.name} {one.texts()[0]}" for one in known)
@@ -276,7 +276,7 @@ class Component(NamedTuple):
         numbers = (self.value, *self.ci95)
         value, low, high = (in_digits(number, numbers) for number in numbers)
         if not self.is_significant:
-            value = f"not different from {self.neutral:g}"
+            value += f" (not different from {self.neutral:g})"
         return value, f"{low} to {high}"
 
 

@@ -18,6 +18,7 @@ from suite.diagnose.estimate.parameters import Candidate, effects_in, indices_of
 from suite.diagnose.search.evaluation import NamedEffect, SearchResult
 from suite.diagnose.sources.source import TOGETHER, TOO_SMALL, Finding, Source
 from suite.diagnose.verdict.gap import EffectSize, Gap
+from tracks.common.figures import rounded
 
 CONTRADICTION = 1.5
 """Two values contradict each other if they differ by more than this many sums of half-widths."""
@@ -92,7 +93,8 @@ def examine(
         found, after, sizes = found.refitted(()), before, {}
         remaining = source.remaining(found, (before, before), seed)
     labels = ", ".join(one.label for one in found.candidates) or "nothing"
-    say(f"{source.name}: {labels}; gap {before.rms:.3g} as given, {after.rms:.3g} with it")
+    gaps = [rounded(gap.rms, 3) for gap in (before, after)]
+    say(f"{source.name}: {labels}; gap {gaps[0]} as given, {gaps[1]} with it")
     return Finding(
         source=source,
         search=found,

@@ -276,8 +276,13 @@ class RolloutSource(Source):
         named = {FITTED: errors(best)} if found.named else {}
         return windows, {GIVEN: errors(self.start.theta), **named}
 
-    def series(self, found: SearchResult, rollouts: Rollouts | None = None) -> Series:
-        """Return a held-out flight along the axis with the clearest error in `rollouts`."""
+    def series(
+        self, found: SearchResult, rollouts: Rollouts | None = None, worst: str = GIVEN
+    ) -> Series:
+        """Return a held-out flight along the axis with the clearest error in `rollouts`.
+
+        `worst` is the label of the model whose error counts.
+        """
         windows, simulated = rollouts or self.simulated(found)
         rows = np.asarray(windows.flight) == windows.flight[0]
         groups = ("position", "velocity", "rates")
@@ -286,8 +291,8 @@ class RolloutSource(Source):
         measured = np.concatenate([row.pos_w, row.vel_w, row.rate_b], axis=-1)
         is_logged = np.asarray(windows.valid)[rows][..., channels]
         errors = {label: values[rows][..., channels] for label, values in simulated.items()}
-        # The axis with the largest error of the vehicle file's model, relative to the noise.
-        error = np.where(is_logged, errors[GIVEN], np.nan)
+        # The axis with the largest error relative to the noise.
+        error = np.where(is_logged, errors[worst], np.nan)
         power = np.ma.masked_invalid(error**2).mean(axis=(0, 1)).filled(0.0)
         noise = np.nan_to_num(of_rollouts(found.last).noise.sigma[channels], nan=np.inf)
         channel = int((power / noise**2).argmax())
@@ -306,8 +311,8 @@ class RolloutSource(Source):
             f"{group.capitalize()} along {'body' if group == 'rates' else 'world'} {axis} "
             f"[{UNITS[group]}]",
             "A held-out flight in rollouts of a second. Each starts from the measured state, "
-            "corrected within its noise. Shown is the axis where the error is largest in units of "
-            "noise.",
+            "corrected within its noise. Shown is the axis with the largest error in units of "
+            f"noise when {worst}.",
         )
 
 

@@ -29,6 +29,7 @@ from suite.diagnose.data.windows import LENGTH_S, SLICES, STATE, STATE_GROUPS, F
 from suite.diagnose.estimate.gauss_newton import Z95
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from tracks.common.figures import rounded
 
 DRAWS = 1000
 """Number of draws of a bootstrap."""
@@ -218,7 +219,8 @@ class EffectSize(NamedTuple):
     def words(self) -> str:
         """Return the size as text for people."""
         values = {"m/s²": self.force, "rad/s²": self.torque, "m after one second": self.drift}
-        parts = [f"{value:.2g} {unit}" for unit, value in values.items() if value] or ["nothing"]
+        parts = [f"{rounded(value, 2)} {unit}" for unit, value in values.items() if value]
+        parts = parts or ["nothing"]
         return " and ".join([*([", ".join(parts[:-1])] if parts[1:] else []), parts[-1]])
 
 

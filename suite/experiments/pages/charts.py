@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from eval.judging.statistics import wilson
 from eval.judging.tables import Tally
-from suite.common.charts import LINES, dots, legend, plain_axes, png, titled
+from suite.common.charts import LINES, dots, legend, percent_axis, plain_axes, png, titled
 from suite.common.curve import METRICS
 from suite.experiments.pages.paper import Ablated, sim_to_sim
 from suite.experiments.study.conditions import ConditionResult, Sweep
 from suite.experiments.study.training import Spread, Summary
 from tracks.families import JUDGED
-
-
-def _percent_axis(axes: Axes, low: float, vertical: bool = True) -> None:
-    """Limit an axis of percentages to the data, whose lowest value or interval end is `low`."""
-    limits = (max(-2.0, 5.0 * math.floor(low / 5.0) - 2.0), 101.5)
-    (axes.set_ylim if vertical else axes.set_xlim)(*limits)
 
 
 def level_chart(cells: Sequence[Tally]) -> bytes:
@@ -55,7 +47,7 @@ def level_chart(cells: Sequence[Tally]) -> bytes:
         plain_axes(lower)
         lower.set_xlabel("level", fontsize=9)
         lower.set_xticks(range(10))
-    _percent_axis(rows[0, 0], lowest)
+    percent_axis(rows[0, 0], lowest)
     rows[0, 0].set_ylabel("success [%]", fontsize=9)
     rows[1, 0].set_ylabel("v_max, median [m/s]", fontsize=9)
     legend(figure, rows[0, 0])
@@ -63,9 +55,9 @@ def level_chart(cells: Sequence[Tally]) -> bytes:
 
 
 def effects_chart(entries: Sequence[ConditionResult]) -> bytes:
-    """Return a chart of the success rate under each effect, the lowest on top.
+    """Return a chart of the success rate under each effect, in rising order from above.
 
-    The first of `entries` is the undisturbed condition: the lowest row, and dashed lines.
+    The first of `entries` is the undisturbed condition: the top row, and dashed lines.
     """
     undisturbed, *others = entries
     names = list(undisturbed.results)
@@ -84,7 +76,7 @@ def effects_chart(entries: Sequence[ConditionResult]) -> bytes:
         axes.errorbar(value, y - offset, xerr=bars, **style)
         axes.axvline(100 * undisturbed.success(name).value, color=colour, lw=1, ls="--", alpha=0.6)
     axes.set_yticks(y, [f"{e.condition.name}  {e.condition.size_text}".strip() for e in ordered])
-    _percent_axis(axes, min(100 * e.success(n).low for e in ordered for n in names), vertical=False)
+    percent_axis(axes, min(100 * e.success(n).low for e in ordered for n in names), vertical=False)
     axes.set_xlabel("success [%]", fontsize=9)
     titled(axes, "Success under one effect at a time, with 95 % Wilson intervals")
     axes.tick_params(axis="y", labelsize=7)
@@ -118,7 +110,7 @@ def sweeps_chart(grown: Mapping[Sweep, Sequence[ConditionResult]]) -> bytes:
         titled(axes, sweep.name)
         axes.set_xlabel(sweep.axis, fontsize=8)
         axes.set_ylabel("success [%]", fontsize=8)
-        _percent_axis(axes, min(100 * p.success(name).low for p in points for name in names))
+        percent_axis(axes, min(100 * p.success(name).low for p in points for name in names))
     legend(figure, panels[0])
     return png(figure)
 
@@ -188,6 +180,6 @@ def curves_chart(rows: Sequence[Summary], names: Sequence[str]) -> bytes:
             axes.set_xlabel(label, fontsize=9)
             titled(axes, METRICS[name].heading)
         if scale == 100:
-            _percent_axis(upper[column], min(100 * p[name].least for row in rows for p in row.at))
+            percent_axis(upper[column], min(100 * p[name].least for row in rows for p in row.at))
     legend(figure, upper[0])
     return png(figure)

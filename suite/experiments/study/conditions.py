@@ -24,6 +24,7 @@ from suite.common.console import Console
 from suite.experiments.study.cache import Workspace
 from suite.experiments.study.judging import TrialRequest, fly_trials
 from suite.experiments.study.options import select
+from tracks.common.figures import with_unit
 
 STATE_UNIT = {"position": 0.03, "velocity": 0.1, "attitude": math.radians(1.0)}
 """Errors of the estimated state at size 1 of its sweep: position [m], velocity [m/s], attitude
@@ -95,8 +96,7 @@ def _effect_condition(vehicle: Vehicle, effect: Effect, sign: int) -> Condition:
     flown = np.vdot(new - zero, direction) / np.vdot(direction, direction)
     value = _plain(new)
     number = "(" + ", ".join(f"{v:.3g}" for v in new) + ")" if new.ndim else f"{value:.3g}"
-    unit = "" if parameter.unit == "1" else parameter.unit
-    size_text = f"{parameter.name} {number} {unit}".strip()
+    size_text = with_unit(f"{parameter.name} {number}", parameter.unit)
     changed = with_effects(vehicle, {effect.name: values._replace(**{parameter.name: value})})
     return Condition(effect.name, float(f"{flown:.6g}"), size_text, changed)
 

@@ -12,7 +12,8 @@ import pytest
 
 from eval.judging.plans import over_plan, plans
 from eval.judging.results import Journal, read_trials, write_results
-from eval.judging.tables import NOTE, markdown_table, summarise
+from eval.judging.statistics import wilson
+from eval.judging.tables import NOTE, markdown_table, percent, summarise
 from eval.worlds.trial import TrialSpec, track_of
 from suite.common.errors import explain
 from tests.support.judged_cells import ROWS, result
@@ -20,6 +21,15 @@ from tracks.geometry.crossing import crossing
 
 COLUMNS = """track difficulty seed policy vehicle world success gates_passed ended_by collided_with
 pos_x pos_y pos_z time_s v_max v_mean gates_8s gates_035""".split()
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "text"),
+    [(299, 300, "99.7 % [98, 100]"), (1, 300, "0.3 % [0, 2]"), (298, 300, "99 % [98, 100]"),
+     (300, 300, "100 % [99, 100]"), (0, 300, "0 % [0, 1]")],
+)  # fmt: skip
+def test_only_a_rate_without_a_failure_is_printed_as_100_percent(successes, trials, text):
+    assert percent(wilson(successes, trials)) == text
 
 
 def test_files(tmp_path):

@@ -99,7 +99,7 @@ REFUSED = [
     ("effects", {"weak_motor": {"scale": 0.9}}, "index: missing; give index = 2 and scale = 0.9,"),
     ("effects", {"weak_motor": {"scale": [1.0, 0.9]}}, "one scale for each index"),
     ("effects", {"weak_motor": {"index": 1, "scale": 10**400}}, "scale = 1000.*finite number"),
-    ("effects", {"weak_motor": {"index": 1, "scale": -0.5}}, "from 0 to 1.5"),
+    ("effects", {"weak_motor": {"index": 1, "scale": -0.5}}, "from 0 to 1.5$"),
 ]
 
 

@@ -186,3 +186,15 @@ def test_what_is_missing_is_left_out(tmp_path):
     values = np.array(found["/flight_0/error_position/as\\ given", "Scalars:scalars"][1])[:, 0]
     assert len(values) == 201 and np.isnan(values[100])
     np.testing.assert_allclose(values[[0, 99, 101, 200]], [0.1, 0.1, 0.2, 0.2])
+
+
+def test_the_playback_begins_in_the_recorded_part_of_a_flight(tmp_path):
+    """Only the held-out end of a single flight is recorded."""
+    late = ComparedFlight("late", track(7.0, 9.0), [])
+    path = write_comparison(tmp_path / "late.rrd", [late])
+    (blueprint,) = rerun.chunk.RrdReader(path).blueprints()
+    found = columns(path, blueprint)
+    (shown,) = (v for (_, n), (_, v) in found.items() if n.endswith(":time_selection"))
+    span = shown[0][0]
+    assert span["min"] / 1e9 == pytest.approx(7.2, abs=0.01)
+    assert span["max"] / 1e9 == pytest.approx(8.99)

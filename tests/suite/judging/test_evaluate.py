@@ -3,6 +3,7 @@
 import json
 import shutil
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -336,3 +337,11 @@ def test_a_recording_shows_who_flew_and_asks_for_a_speed(pilots, tmp_path):
     assert (layout["width"], layout["height"]) == (36, 20)
     evaluation, *_ = view._choose_trials(view.Config(run="race", speed=0.4), Quiet())
     assert manners(evaluation.speed, monitor=False) == [Manner(speed=0.4)]
+
+
+def test_levels_beyond_the_count_are_said_to_be_left_out(capsys):
+    four = view.Config(run="race", track="ellipse,random", difficulty="1,8")
+    assert len(view._choose_trials(four, Console()).trials) == 3
+    assert "shown are 3 of 4 trials; --count shows more" in capsys.readouterr().err
+    view._choose_trials(replace(four, count=4), Console())
+    assert "shown" not in capsys.readouterr().err

@@ -162,7 +162,7 @@ def answer(effects):
     return {
         "verdict": "named" if effects else "unknown",
         "effects": effects,
-        "gap": {"before": 9.0, "after": 1.1, "noise_floor": 1.0},
+        "gap": {"before": 9.0, "after": 1.1, "noise_floor": 1.0, "unit": "times the noise"},
         "unexplained": {"share": 0.0, "where": None},
     }
 

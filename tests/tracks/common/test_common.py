@@ -22,6 +22,7 @@ from rich.console import Console
 
 from tracks.common import files, provenance
 from tracks.common import names as registry
+from tracks.common.figures import rounded, with_unit
 from tracks.common.grid import Cell, html_table, markdown, rich_table, table
 from tracks.common.masks import everywhere, nowhere, select
 from tracks.common.names import Registry, closest, unknown_name
@@ -310,3 +311,10 @@ def test_a_file_that_is_read_is_refused_as_one_to_write_by_whatever_name(tmp_pat
     for path in (given, link, tmp_path / "." / "a.toml"):
         with pytest.raises(ValueError, match="--out: .* is also an input .* give another --out"):
             files.check_no_input(path, [given])
+
+
+def test_a_number_for_people_has_no_power_of_ten_and_a_ratio_no_unit():
+    assert [rounded(value, 2) for value in (0.0123, 12.3, 99.7, 123.4, -1234.5)] == [
+        "0.012", "12", "100", "123", "-1,234"
+    ]  # fmt: skip
+    assert [with_unit("2", unit) for unit in ("1", "", "1/s")] == ["2", "2", "2 1/s"]

@@ -16,7 +16,7 @@ from suite.diagnose.identify.body import lag_unknowns
 from suite.diagnose.identify.fit import Fitted
 from suite.diagnose.identify.grid import ROTOR_NOISE, STEP_S, FlightGrid, grid_of
 from suite.diagnose.identify.identify import PARTS, Identified, identify
-from suite.diagnose.identify.numbers import Number, not_attempted, not_identified
+from suite.diagnose.identify.numbers import Number, not_attempted, not_identified, number_lines
 from suite.diagnose.identify.run import identify_files
 from tests.support import identified as known
 from tests.support.log_tables import level
@@ -282,3 +282,12 @@ def test_numbers_that_no_file_may_hold_are_printed_with_the_refusal(tmp_path, mo
         identify_files([tmp_path / "one.parquet"], "reference", out, [], Console())
     assert "motors.thrust[0] = 9: 8 to 10 N\nnot identifiable: the rest" in str(refused.value)
     assert not out.exists()
+
+
+def test_a_ratio_is_listed_without_a_unit():
+    scale = Number("effects.thrust_scale.scale", "1", [0.98], [(0.97, 0.99)])
+    mass = Number("mass", "kg", [0.75], [(0.7, 0.8)])
+    assert number_lines([scale, mass]) == [
+        "effects.thrust_scale.scale = 0.98: 0.97 to 0.99",
+        "mass = 0.75: 0.7 to 0.8 kg",
+    ]

@@ -7,26 +7,27 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from eval.effects.interface import Sample
 from suite.commands.diagnose import run as command
 from suite.common.console import Console
 from suite.common.report import html
 from suite.diagnose import run
 from suite.diagnose.config import Config
-from suite.diagnose.diagnose import Verdict, diagnose
+from suite.diagnose.diagnose import Verdict
 from suite.diagnose.estimate.parameters import Candidate, make_space
 from suite.diagnose.evidence.view_means import centred
-from suite.diagnose.identify.run import is_identified
 from suite.diagnose.report import charts, sections, summary
 from suite.diagnose.report import diagnosis_json as as_json
 from suite.diagnose.report.charts import series_chart
 from suite.diagnose.report.page import channels_grid, page
 from suite.diagnose.search.evaluation import NamedEffect
-from suite.diagnose.sources.source import FAR
+from suite.diagnose.sources.source import FITTED, GIVEN
 from suite.diagnose.verdict.actuators import actuator_mismatches
 from suite.diagnose.verdict.gap import Gap
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN, with_effects
 from tracks.common.files import plain
+from tracks.geometry.rotation import exp_rot, quat_to_rot
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +146,7 @@ def test_components_are_named_by_axis_and_shown_in_digits_that_the_interval_supp
     x, y, z = summary.components({"name": "com_offset", "parameters": {"offset": entry}})
     assert (x.label, x.texts()) == ("offset x [m]", ("0.01200", "0.01190 to 0.01210"))
     assert x.is_significant and not y.is_significant and not z.is_significant
-    assert y.texts() == ("not different from 0", "-0.0010 to 0.0018")
+    assert y.texts() == ("0.0004 (not different from 0)", "-0.0010 to 0.0018")
     assert z.texts() == ("not identifiable", "")
     small = {"value": 1.21e-6, "ci95": [1.1e-6, 1.3e-6], "unit": "kg/rad"}
     (only,) = summary.components({"name": "rotor_drag", "parameters": {"coefficient": small}})
@@ -196,7 +197,9 @@ def test_sections_show_the_numbers(drag, found):
     # A channel that no log measured is not in the table.
     none = {"before": 0.0, "after": 0.0, "noise_floor": 1e-12}
     every = found["gap"]["channels"].items()
+    none["repeatability"] = None
     table = channels_grid({horizon: {**groups, "velocity": none} for horizon, groups in every})
+    assert "repeatability" not in table.headers
     assert not any("velocity" in row[1] for row in texts(table)) and len(table.rows) > 3
 
 
@@ -220,173 +223,31 @@ def test_the_chart_shows_measured_next_to_simulated(drag, monkeypatch):
     assert named < 0.2 * given
 
 
-DRAG = {
-    "name": "linear_drag",
-    "alternatives": ["rotor_drag"],
-    "parameters": {"coefficient": {"value": [0.31, 0.302, 0.01], "unit": "1/s",
-                                   "ci95": [[0.3, 0.32], [0.29, 0.31], [-0.01, 0.03]]}},
-    "size": {"force": 0.8, "torque": 0.0, "drift": 0.4},
-    "view": "force",
-    "gap_removed": 0.9,
-}  # fmt: skip
+def test_what_remains_of_a_partly_explained_gap_is_in_the_chart(drag, flown, found):
+    search, rollouts = drag.main.search, flown.simulated(drag.main.search)
+    rollouts[1][FITTED][..., 2] += 30.0  # in the position along z
+    assert "world z" not in flown.series(search, rollouts).label
+    assert flown.series(search, rollouts, FITTED).label == "Position along world z [m]"
+    for verdict, worst in (("named", GIVEN), ("partly", FITTED)):
+        text = html(page(drag, {**found, "verdict": verdict}, "", set(), rollouts))
+        assert f"in units of noise when {worst}." in text
 
 
-def entries(verdict, effects=(), where=None, **more):
-    base = {"verdict": verdict, "effects": list(effects), "reference": [], "negligible": []}
-    base |= {"unexplained": {"where": where, "above_noise": []}, "identified": False}
-    advice = ["linear_drag from rotor_drag: bob up and down on a circle"]
-    base["separate_with"] = advice if effects else []
-    base["gap"] = {"before": 17.3, "after": 4.78, "offset": {}}
-    return {**base, **more}
-
-
-@pytest.mark.parametrize(
-    ("gap", "text"),
-    [(41_400.0, "41,400"), (328.4, "328"), (1.03, "1.03"), (1e-10, "less than 0.001")],
-)
-def test_a_gap_is_printed_without_powers_of_ten(gap, text):
-    assert summary.figure(gap) == text
-
-
-def test_an_answer_has_the_effect_its_values_and_its_size_or_what_is_too_small():
-    assert summary.answer(entries("named", [DRAG])) == (
-        "Wrong or missing in the vehicle file: Drag proportional to the airspeed (linear_drag or "
-        "rotor_drag): coefficient x 0.31 1/s, coefficient y 0.302 1/s. On these flights it causes "
-        "0.8 m/s² and 0.4 m after one second (RMS). This explains the gap between simulation and "
-        "flights."
-    )
-    arm = {**DRAG, "name": "lever_arm", "alternatives": [], "parameters": {}, "size": None}
-    both = summary.answer(entries("named", [arm, DRAG]))
-    assert both.index("in the vehicle file: Drag") < both.index(". Wrong in the logs: Position")
-    by_force = {**DRAG, "size": {**DRAG["size"], "drift": None}}
-    partly = summary.answer(entries("partly", [by_force]))
-    assert "causes 0.8 m/s² (RMS). This explains a part" in partly
-    changed = summary.answer(entries("named", [DRAG], reference=["a"]))
-    assert "has changed since the reference" in changed
-    left_out = [("torque_trim", False), ("inertia_scale", True)]
-    small = entries("no_gap", negligible=[{"name": n, "relevant": is_so} for n, is_so in left_out])
-    assert summary.answer(small).endswith(
-        "Significant but too small to matter: torque_trim. "
-        "Perhaps only an error of the model, or cancelled by another effect: inertia_scale."
-    )
-
-
-def measured(verdict, after, effects=(), reason=None, floor=0.15, offset=7.9, **more):
-    gap = {"of": "error of the torque", "unit": "rad/s^2", "before": 17.3, "after": after}
-    offsets = {"before": 9.0, "after": offset, "unit": "rad/s^2"}
-    gap |= {"noise_floor": floor, "offset": {"torque": offsets}}
-    rest = [{"reason": reason}] if reason else []
-    more |= {"relevance": {"torque": 0.5}, "unexplained": {"where": None, "above_noise": rest}}
-    return summary.headline(entries(verdict, effects, gap=gap, **more))
-
-
-def test_a_headline_states_the_floor_the_errors_that_remain_and_offsets_that_do_not_count():
-    text = measured("named", 4.78, [DRAG], "that logged signals hardly predict")
-    assert text.endswith(
-        "This explains the gap between simulation and flights, except for an error that logged "
-        "signals hardly predict. On held-out flights the error of the torque falls from 17.3 to "
-        "4.78 rad/s² (noise floor 0.15). A constant offset of each flight remains, which does not "
-        "count as a gap: 7.9 rad/s² (torque)."
-    )
-    # An offset below the threshold of relevance does not matter.
-    assert "offset" not in measured("named", 0.16, [DRAG], offset=0.4)
-    none = measured("no_gap", 17.3, (), "that is too small to matter", offset=0.4)
-    assert none == (
-        "Simulation and flights agree, except for an error that is too small to matter. On "
-        "held-out flights the error of the torque is 17.3 rad/s² (noise floor 0.15)."
-    )
-    assert "within the measurement noise." in measured("no_gap", 17.3)
-    assert "error" not in summary.answer(entries("no_gap", reference=["a"]))
-    # The unit of rollouts is the noise floor.
-    assert "floor" not in measured("unknown", 17.3, floor=1.0)
-
-
-def test_simulated_flights_that_stay_far_are_no_part_of_what_agrees():
-    text = measured("no_gap", 17.3, (), "that logged signals hardly predict", warnings=[FAR])
-    assert text.startswith(
-        "The forces and torques that were compared agree, except for an error that logged signals "
-        "hardly predict. But simulated flights of 1 s stay far from the measured ones."
-    )
-    named = measured("named", 4.78, [DRAG], warnings=[FAR])
-    assert "between simulation and flights. But simulated flights of 1 s stay far" in named
-
-
-def test_an_effect_that_lowers_the_offsets_alone_explains_no_gap():
-    agree, differ = (measured(verdict, 17.3, [DRAG]) for verdict in ("named", "partly"))
-    offset = "(RMS). This explains a constant offset of the flights. Simulation and flights"
-    assert f"{offset} agree within" in agree and f"{offset} differ, and no effect" in differ
-    # A random wind explains an error that no simulation lowers, and offsets may not fall either.
-    for effects, left in (([{**DRAG, "gap_removed": None}], 7.9), ([DRAG], 9.0)):
-        assert "explains the gap" in measured("named", 17.3, effects, offset=left)
-
-
-def test_a_drag_of_the_file_that_the_flights_do_not_show_is_not_said_to_be_missing():
-    interval = [[0.0, 0.01]] * 3
-    none = {"coefficient": {"value": [0.0, 1e-17, 0.004], "unit": "1/s", "ci95": interval}}
-    answer = summary.answer(entries("named", [{**DRAG, "parameters": none}]))
-    assert (
-        "(linear_drag or rotor_drag): coefficient x not different from 0, coefficient y" in answer
-    )
-
-
-def test_a_rotor_lag_alone_explains_no_gap_of_force_and_torque():
-    lag = {**DRAG, "name": "motor_lag", "parameters": {}, "size": None, "view": "commands"}
-    lag["alternatives"] = []
-    agree, differ = (measured(verdict, 17.3, [lag]) for verdict in ("named", "partly"))
-    rotors = "This explains how measured and commanded rotor speeds differ. "
-    assert f"{rotors}Simulation and flights agree within the measurement noise." in agree
-    assert f"{rotors}Simulation and flights differ, and no effect of the" in differ
-    assert "explains the gap" in measured("named", 4.78, [lag, DRAG])
-    far = measured("named", 17.3, [lag], warnings=[FAR])
-    assert "compared agree within" in far and "stay far" in far and "Simulation and" not in far
-    same = entries("partly", [lag], gap={"before": 17.3, "after": 17.3})
-    assert summary.next_steps(same)[0].endswith(" Its values are approximate.")
-
-
-@pytest.mark.parametrize(
-    ("verdict", "words"),
-    [
-        ("named", ["vehicle.toml", "do not separate linear_drag, rotor_drag", "expect no_gap"]),
-        ("partly", ["approximate", "do not separate", "suite check", "Remaining error"]),
-        ("unknown", ["suite check", "suite identify", "Remaining error", "suite delta"]),
-    ],
-)
-def test_every_verdict_says_what_to_do_next(verdict, words):
-    effects = [] if verdict == "unknown" else [DRAG]
-    steps = summary.next_steps(entries(verdict, effects, where="a swing at 1 Hz"))
-    assert all(word in step for word, step in zip(words, steps, strict=True))
-    assert " ".join(steps).count("bob up and down") == len(effects)
-
-
-def test_a_file_of_suite_identify_is_not_sent_back_to_it(tmp_path):
-    path, written = tmp_path / "mine.toml", "# From racer5 by suite identify, 2 flights (motors)\n"
-    path.write_text(written + 'name = "mine"\n')
-    assert is_identified(str(path)) and not is_identified("racer5")
-    path.write_text('name = "by suite identify"\n')
-    assert not is_identified(str(path))
-    steps = summary.next_steps(entries("unknown", identified=True))
-    assert "repeat it if the vehicle has changed" in steps[1]
-
-
-@pytest.mark.slow
-def test_flights_that_no_rollout_comes_near_do_not_agree():
-    log = fly(PLAIN, 0, duration_s=4.0, noise=0.1)
-    log = replace(log, rate_cmd_b=log.rate_cmd_b + [20.0, 0.0, 0.0])
-    found = as_json.diagnosis_json(diagnose([log], PLAIN))
-    assert found["verdict"] == "no_gap" and FAR in found["warnings"]
-    assert "stay far from the measured ones" in found["headline"]
-    assert "as it is" not in " ".join(summary.next_steps(found))
-
-
-def test_errors_of_the_logs_alone_send_nobody_to_the_trainer():
-    arm = {**DRAG, "name": "lever_arm", "alternatives": []}
-    (first, last) = summary.next_steps(entries("named", [arm]))
-    assert "to suite diagnose" in first and "train" not in first and "no_gap" in last
-    assert "eval, train" in summary.next_steps(entries("named", [arm, DRAG]))[0]
-
-
-@pytest.mark.parametrize("verdict", ["no_gap", "named", "partly"])
-def test_after_a_search_for_a_change_the_file_itself_counts_as_untested(verdict):
-    steps = summary.next_steps(entries(verdict, [DRAG], reference=["old"]))
-    assert "was not tested: for that, leave out --reference" in steps[0]
-    assert "as it is" not in steps[0]
+def test_a_simulation_that_turns_far_is_recorded_where_it_turned():
+    """The residual has the sine of the angle, which is the same for 60 and 120 degrees."""
+    row_s, axis = np.linspace(0.0, 1.0, 101), np.array([0.6, 0.0, 0.8])
+    turn = 1.5 * np.pi * np.sin(np.pi * row_s / 1.6)[:, None] * axis  # to 270 degrees and back
+    still = np.zeros((101, 3))
+    rot_w = np.tile(exp_rot(np.array([0.3, 1.0, -0.5])), (101, 1, 1))
+    residual = np.zeros((101, 19))
+    residual[:, 3:6] = -np.sin(1.5 * np.pi * np.sin(np.pi * row_s / 1.6))[:, None] * axis
+    residual[:, 9:12] = -np.gradient(turn, row_s, axis=0)
+    row = Sample(still, rot_w, still, still, still)
+    window = SimpleNamespace(start_s=2.0, row_s=row_s, row=row, valid=np.ones((101, 19), bool))
+    found = charts._rollout(cast(Any, window), residual)
+    assert found is not None
+    states, errors = found
+    angle = np.rad2deg(np.linalg.norm(turn, axis=1))
+    np.testing.assert_allclose(errors[:, 2], np.minimum(angle, 360.0 - angle), atol=0.2)
+    turned = quat_to_rot(states.quat_wxyz)
+    np.testing.assert_allclose(turned, rot_w @ exp_rot(turn), atol=0.004)
