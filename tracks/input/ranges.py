@@ -113,7 +113,7 @@ def check_number(name: str, value: Any, allowed: Range, text: str = "") -> None:
     Raises:
         ValueError: with the name, the value, or `text` in its place, and what is allowed.
     """
-    kind = Integral if allowed.whole else Real
+    kind: Any = Integral if allowed.whole else Real
     if isinstance(value, kind) and not isinstance(value, bool) and allowed.holds(value):
         return  # the texts below take longer than the check
     number = "a whole number" if allowed.whole else "a number"
