@@ -42,7 +42,7 @@ class Sky:
         monkeypatch.setattr("suite.judging.flying.usable_cores", lambda: 1)
 
     def fly(self, task, share):
-        options = replace(task.options, slots=8, rules=Rules(time_limit_s=0.1))
+        options = replace(task.options, slots=8, rules=Rules(time_limit_s=0.04))
         for index, result, flight in self._fly(replace(task, options=options), share):
             self.flown.append((task.policy.name, task.vehicle, options.sensors, result.trial))
             yield index, result, flight
