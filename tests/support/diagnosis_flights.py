@@ -11,8 +11,8 @@ from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from tracks.geometry.rotation import quat_to_rot, to_local, to_world
 
 NOISE = {"pos": 0.002, "att": 0.004, "vel": 0.02, "rate": 0.02, "motor": 4.0, "acc": 0.15}
-EVERY = 5
-"""Physics steps a row."""
+ROW_HZ = 100.0
+"""Rows a second, a whole number of physics steps each."""
 
 
 def curve(rng, speed):
@@ -66,6 +66,7 @@ def fly_all(
     """
     rngs = [np.random.default_rng(seed) for seed in seeds]
     dt = 1.0 / vehicles[0].controller.frequency
+    every = round(vehicles[0].controller.frequency / ROW_HZ)
     models = [compile_quadrotor(mujoco.MjSpec(), vehicle, dt) for vehicle in vehicles]
     datas = [mujoco.MjData(model) for model in models]
     drawn = [(*curve(rng, speed), rng.uniform(-0.8, 0.8)) for rng in rngs]
@@ -81,7 +82,7 @@ def fly_all(
     for k in range(round(duration_s / dt) + 1):
         qpos, qvel = np.array([d.qpos for d in datas]), np.array([d.qvel for d in datas])
         motion = Motion(qpos[:, :3], quat_to_rot(qpos[:, 3:]), qvel[:, :3], qvel[:, 3:])
-        if k % EVERY == 0:
+        if k % every == 0:
             yaw = turning * k * dt if headings is None else np.asarray(headings)
             command = track(on_curves(rate, phase, k * dt), yaw, motion)
             rows.append(np.column_stack([np.full(len(seeds), k * dt), qpos, qvel, command.thrust,

@@ -20,8 +20,8 @@ from tracks.geometry.rotation import to_world
 
 LAGGED = with_lag(PLAIN, 0.02)
 WAYS = (
-    Trajectory("figure_eight", 0.6, speed=4.0, size=2.0, turn="wobble"),
-    Trajectory("climb", 0.5, speed=2.0, size=1.5),
+    Trajectory("figure_eight", 0.3, speed=4.0, size=2.0, turn="wobble"),
+    Trajectory("climb", 0.2, speed=2.0, size=1.5),
 )
 SHORT = (Trajectory("figure_eight", 0.4, speed=2.0), Trajectory("hover", 0.2))
 CONDITIONS = Conditions(733.0, 90.0, 0.3, 1e-4, 0.01, 0.7, 0.05)
@@ -86,7 +86,7 @@ def test_the_loop_of_the_conditions_is_the_one_that_flies():
 
 
 def test_a_flight_is_not_checked_after_its_end():
-    stamp_s = np.array([[0.7, 0.7], [0.8, 0.8]])  # the log of the second one needs 0.75 s
+    stamp_s = np.array([[0.4, 0.4], [0.5, 0.5]])  # the log of the second one needs 0.45 s
     pilot = continuous_flight._Pilot(LAGGED, WAYS, stamp_s, None)
     level, still, off_m = np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), np.array([[0.0], [99.0]])
     before, after = (

@@ -68,7 +68,8 @@ def _commands(body):
             yield words
 
 
-def _check(words):
+@functools.cache
+def _check(*words):
     match words:
         case ["suite", ("--help" | "--version")]:
             pass
@@ -106,7 +107,7 @@ def test_every_command_is_one_that_exists():
     for where, (_, body) in BLOCKS.items():
         for words in _commands(body):
             with _named(f"{where}: {shlex.join(words)}"):
-                _check(words)
+                _check(*words)
 
 
 def test_no_page_gives_the_folder_of_another_run():
@@ -139,7 +140,7 @@ def _check_sentence(text):
         return
     assert name in cli.COMMANDS, f"no command {name!r}"
     if name == "reproduce" and words[1:]:  # its options are its experiment's
-        _check(["suite", name, *words])
+        _check("suite", name, *words)
         return
     for word in words:
         if re.fullmatch(r"--[a-z][a-z-]*", word) and word != "--help":
@@ -162,7 +163,7 @@ def test_what_does_not_exist_is_found():
             _check_sentence(text)
     for line in ("suite nothing", "suite info --x", "make tea"):
         with pytest.raises((AssertionError, SystemExit)):
-            _check(line.split())
+            _check(*line.split())
 
 
 @pytest.mark.parametrize("where", [where for where, (marked, _) in BLOCKS.items() if marked])

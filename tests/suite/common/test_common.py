@@ -7,7 +7,6 @@ import multiprocessing
 import os
 import struct
 import sys
-import time
 import traceback
 import types
 from concurrent.futures import ProcessPoolExecutor
@@ -15,13 +14,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 from suite.common import curve
 from suite.common.charts import DPI, png
-from suite.common.console import Console, Silent, duration, size
+from suite.common.console import Console, duration, size
 from suite.common.errors import FAILED, UNUSABLE, WorkFailed, explain
 from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.report import Details, Links, Picture, Report, Section, html
@@ -39,10 +37,10 @@ from suite.common.work import do_jobs, read_workers_option
 from suite.experiments.study.training import training_origin
 from suite.judging.requests import Collection, Evaluation
 from suite.judging.trials import parse_levels, parse_tracks
+from tests.support.jobs import die, diverge, double, pad_one_box
 from tracks.common.grid import Cell, Grid
 from tracks.common.provenance import stamp, stamp_text
 from tracks.common.work import core_shares, usable_cores
-from tracks.geometry.scene import Boxes, Counts, Gates, Rods, Scene, Spheres, pad
 
 GRID = Grid(
     "Speeds",
@@ -139,24 +137,15 @@ def test_a_cut_last_line_of_a_curve_is_left_out_and_another_damage_is_refused(tm
         curve.read(tmp_path)
 
 
-def _pad_one_box(to_boxes, center_w):
-    none = np.zeros((0, 3))
-    gates = Gates(none, np.zeros((0, 3, 3)), np.zeros((0, 4, 2)), np.zeros(0), np.zeros(0))
-    boxes = Boxes(np.array([center_w]), np.zeros((1, 3, 3)), np.ones((1, 3)))
-    rods, spheres = Rods(none, none, np.zeros(0), np.zeros(0)), Spheres(none, np.zeros(0))
-    scene = Scene(gates, boxes, rods, rods, spheres, np.zeros((0, 3, 3)))
-    return pad(scene, Counts(to_boxes, 0, 0, 0))
-
-
 def test_numpys_value_error_is_a_bug_and_one_raised_on_purpose_in_a_worker_process_a_message():
     with pytest.raises(ValueError) as met:
-        _pad_one_box(2, [0.0, 0.0])
+        pad_one_box(2, [0.0, 0.0])
     frames = traceback.extract_tb(met.value.__traceback__)
     assert frames[-1].filename.endswith("scene.py"), "the case is one with no frame of numpy's"
     assert explain(met.value) is None
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         with pytest.raises(ValueError, match="more than the 0") as met:
-            list(pool.map(_pad_one_box, [0], [[0.0, 0.0, 0.0]]))
+            list(pool.map(pad_one_box, [0], [[0.0, 0.0, 0.0]]))
     assert (explain(met.value) or (None,))[0] == UNUSABLE
 
 
@@ -334,24 +323,6 @@ class Recorded(Console):
         yield lambda done, note="": self.shown.append((done, total))
 
 
-def double(job, console):
-    assert type(console) is Silent
-    with console.progress("halves", 10) as update:
-        update(5)
-        # A process returns messages five times a second.
-        time.sleep(0.3)
-        update(9)
-    return 2 * job.task, sorted(os.sched_getaffinity(0))
-
-
-def die(job, console):
-    os._exit(7)
-
-
-def diverge(job, console):
-    raise WorkFailed(f"training {job.task} diverged")
-
-
 def test_more_processes_than_cores_are_refused_where_each_needs_some(monkeypatch):
     monkeypatch.setattr("suite.common.work.usable_cores", lambda: 2)
     assert read_workers_option("3") == 3 and read_workers_option("2", whole_cores=True) == 2
@@ -369,6 +340,6 @@ def test_jobs_come_back_in_order_from_processes_that_share_no_core_or_say_what_f
     amounts = [done for done, total in console.shown if total == 3]
     assert amounts == sorted(amounts) and amounts[0] == 0.5 and amounts[-1] == 3
     with pytest.raises(WorkFailed, match=r"dying: a process died; the products.*exit code 7"):
-        do_jobs(die, jobs(1, 2), 2, Console(), "dying")
+        do_jobs(die, jobs(1), 2, Console(), "dying")
     with pytest.raises(WorkFailed, match=r"^training 1 diverged$"):
         do_jobs(diverge, jobs(1), 2, Console(), "training")

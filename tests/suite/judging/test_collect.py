@@ -21,7 +21,7 @@ from tests.support.vehicles import with_effects
 GATE = "[[gates]]\ncenter = [{x}, 0.0, 1.3]\nwidth = 1.0\nheight = 1.0\n"
 COURSE = GATE.format(x=0.0) + GATE.format(x=5.0)
 SENSORS = 'name = "mine"\n[[state]]\nkind = "state_noise"\nvelocity = 1.0\n'
-TWO = "collect --track zigzag --difficulty 0 --trials 2 --seed 7 --time-limit-s 1.5"
+TWO = "collect --track zigzag --difficulty 0 --trials 2 --seed 7 --time-limit-s 1.1"
 
 
 def test_collect_writes_logs_that_read_back_and_goes_on(pilots, tmp_path, monkeypatch, capfd):
@@ -52,7 +52,7 @@ def test_an_interrupted_collection_names_the_setting_that_differs(
     for name, old, new in (
         ("seed", "7", "8"),
         ("trials", "2", "1"),
-        ("time_limit_s", "1.5", "9.5"),
+        ("time_limit_s", "1.1", "9.1"),
     ):
         option = f"--{name.replace('_', '-')} "
         said = refused(capfd, TWO.replace(option + old, option + new), *args)

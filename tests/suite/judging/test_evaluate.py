@@ -22,6 +22,14 @@ from tests.support.commands import answer, evaluate, refused, run
 from tests.support.judged_cells import cut_short
 from tests.support.recordings import columns
 
+COURSE = "[[gates]]\ncenter = [{}, 0.0, 1.3]\nwidth = 1.1\nheight = 1.0\n"
+
+
+@pytest.fixture
+def unpainted(monkeypatch):
+    """Draw no pictures, which take longer than short flights and have tests of their own."""
+    monkeypatch.setattr("eval.view.picture.write_picture", lambda path, *_: path)
+
 
 def printed(capture):
     return " ".join("".join(capture.readouterr()).split())
@@ -73,7 +81,7 @@ def test_what_a_folder_holds_is_not_written_over_without_a_word(pilots, tmp_path
 
 
 def test_an_interrupted_eval_goes_on_to_the_same_result(pilots, tmp_path, monkeypatch, capfd):
-    asked = ("--track circular,zigzag --trials 1 --time-limit-s 1 --policy", pilots["pursuit"])
+    asked = ("--track circular,zigzag --trials 1 --time-limit-s 0.4 --policy", pilots["pursuit"])
     whole, again = tmp_path / "whole", tmp_path / "again"
     assert evaluate(whole, *asked) == 0
     flown = cut_short(monkeypatch, stop_after=1)
@@ -184,7 +192,7 @@ def test_trials_that_are_not_asked_for_again_are_kept_and_said(pilots, tmp_path,
 ONE = "--track zigzag --trials 1 --policy"
 
 
-def test_view_flies_the_chosen_trials_again(pilots, tmp_path, monkeypatch, capfd):
+def test_view_flies_the_chosen_trials_again(pilots, tmp_path, monkeypatch, capfd, request):
     out, seen = tmp_path / "out", tmp_path / "seen"
     assert evaluate(out, "--track ellipse --trials 2 --seed 2 --policy", pilots["diver"]) == 0
     again = ("view --out", seen, out)
@@ -196,6 +204,7 @@ def test_view_flies_the_chosen_trials_again(pilots, tmp_path, monkeypatch, capfd
     assert "--pick passed" in refused(capfd, *again, "--pick", "passed")
     # A finished evaluation keeps trials of an earlier command in a journal.
     (out / "journal-0.jsonl").write_text("{}\n")
+    request.getfixturevalue("unpainted")
     assert run(*again, *"--count 1".split()) == 0
     assert "was judged as" not in capfd.readouterr().err
     cut_short(monkeypatch, seconds=0.1)  # as a machine on which the trial ends otherwise
@@ -220,7 +229,7 @@ def test_view_finds_the_trials_of_every_policy_of_a_run(pilots, tmp_path, capfd)
     assert "unknown --policy 'rac'" in refused(capfd, *again, "--policy", "rac")
 
 
-def test_view_flies_at_the_speed_of_the_shown_trials(pilots, tmp_path, monkeypatch):
+def test_view_flies_at_the_speed_of_the_shown_trials(pilots, tmp_path, monkeypatch, unpainted):
     out = tmp_path / "out"
     assert evaluate(out, "--trials 1 --track zigzag --speed 0.4 0.7 --policy", pilots["other"]) == 0
     flown, fly = [], eval.judging.judge.fly
@@ -232,12 +241,12 @@ def test_view_flies_at_the_speed_of_the_shown_trials(pilots, tmp_path, monkeypat
 
 
 def test_a_run_whose_files_have_changed_is_not_flown_again(
-    pilots, tmp_path, root, monkeypatch, capsys
+    pilots, tmp_path, root, monkeypatch, capsys, unpainted
 ):
     """It would show flights that nobody judged."""
-    files = {"policy": Path(pilots["diver"])}
+    files = {"policy": Path(pilots["diver"]), "track": tmp_path / "course.toml"}
+    files["track"].write_text(COURSE.format(0.0) + COURSE.format(5.0))
     files["vehicle"] = Path(shutil.copy(root / "eval/vehicles/racer5.toml", tmp_path))
-    files["track"] = shutil.copytree(root / "tracks/examples", tmp_path / "tracks") / "yard.toml"
     files["sensors"] = Path(shutil.copy(root / "eval/sensors/presets/vio.toml", tmp_path))
     flown = [text for name, file in files.items() for text in (f"--{name}", file)]
     out, again = tmp_path / "out", ("view --out", tmp_path / "seen", tmp_path / "out")
@@ -294,7 +303,9 @@ def test_a_run_does_not_say_itself_that_it_is_to_be_trusted(pilots, tmp_path, ca
     assert "pass --trust" not in capsys.readouterr().err
 
 
-def test_a_trial_ends_at_the_time_that_is_given_and_is_seen_so_again(pilots, tmp_path, capfd):
+def test_a_trial_ends_at_the_time_that_is_given_and_is_seen_so_again(
+    pilots, tmp_path, capfd, unpainted
+):
     out, logs = tmp_path / "out", tmp_path / "logs"
     asked = ("--time-limit-s 0.6", *ONE.split(), pilots["pursuit"])
     assert evaluate(out, *asked) == 0
@@ -328,7 +339,7 @@ def test_options_that_do_not_fit_and_what_is_no_finished_run_are_refused(tmp_pat
     assert "run.json" in refused(capsys, "view", tmp_path)
 
 
-def test_a_recording_shows_who_flew_and_asks_for_a_speed(pilots, tmp_path):
+def test_a_recording_shows_who_flew_and_asks_for_a_speed(pilots, tmp_path, unpainted):
     assert run("view --track zigzag --count 1 --out", tmp_path / "seen", pilots["other"]) == 0
     found = columns(tmp_path / "seen" / "trials.rrd")
     eye = "/trial_0/world/drone/camera"

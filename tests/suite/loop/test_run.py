@@ -32,6 +32,7 @@ from suite.loop.hidden_effect import LABELS, LOOP, describe_hidden, hidden_effec
 from tests.support.engines import STAND_IN
 from tests.support.judged_cells import results_of
 from tests.support.loops import Small, resolve
+from tracks.common.files import write_text
 
 EXAMPLE = "examples/hidden.toml"
 SIZES = "loop --recipe quick --track zigzag --difficulty 0 --trials 2 --flights 2"
@@ -176,7 +177,7 @@ NAMED = {
 
 
 class Stub(Small):
-    """Also in place of the diagnosis and the fits."""
+    """Also in place of the diagnosis, the fits and the pictures."""
 
     recorded_s = 2.0  # what is measured ends before a contact
 
@@ -185,6 +186,8 @@ class Stub(Small):
         self.effects, self.diagnosed, self.fitted = list(effects), [], []
         monkeypatch.setattr("suite.diagnose.run.diagnose_files", self.diagnose)
         monkeypatch.setattr(work, "fit_delta", self.fit)
+        drawn = lambda path, *_: write_text(path, "a picture")  # noqa: E731
+        monkeypatch.setattr("eval.view.picture.write_grid", drawn)
 
     def diagnose(self, config, console):
         vehicle, out = config.vehicle, config.out
@@ -224,9 +227,13 @@ def test_a_loop_with_a_hidden_effect_leaves_tables_report_and_recording(hidden):
     assert "<td>offset z [m]</td><td>not identifiable</td>" in rows
 
 
-def test_without_the_delta_none_is_fitted_and_two_policies_are_tuned(tmp_path, monkeypatch, root):
-    """As `make race` runs it."""
+def test_without_the_delta_none_is_fitted_and_two_policies_are_tuned(
+    hidden, tmp_path, monkeypatch, root
+):
+    """As `make race` runs it; the stages up to the diagnosis are those of the other loop."""
     monkeypatch.chdir(root)
+    for stage in DIAGNOSED:
+        shutil.copytree(hidden[0] / stage, tmp_path / stage)
     stub = Stub(monkeypatch)
     assert cli.main([*HIDDEN, "--no-delta", "--out", str(tmp_path)]) == 0
     stages = ["tuned-control", "tuned-named", "eval-control", "eval-named", "replays"]

@@ -181,20 +181,23 @@ def seen(config, steps=3):
 
 @pytest.fixture(scope="module")
 def shown():
-    """Return a function (worlds, start) of what is seen, and slopes by the pose of its sums.
+    """Return a function (worlds, start) of what is seen, and slopes of the sums of both parts.
 
-    The stereo camera does not round disparities: rounding would have no slope anyway.
+    These are along a change of all positions, then one of all attitudes: forwards, which compiles
+    faster. The stereo camera does not round disparities: rounding would have no slope anyway.
     """
     unrounded = ALL.seen.models["stereo"]._replace(step=0.0)
     of = seen(sensed(seen=replace(ALL.seen, models={**ALL.seen.models, "stereo": unrounded})))[0]
+    rng = np.random.default_rng(2)
+    way, turn = rng.normal(size=(BATCH, 3)), rng.normal(size=(BATCH, 3, 3))
 
-    def sums(pose, worlds, state):
-        found = of(worlds, state._replace(**pose))
+    def sums(along, worlds, state):
+        moved = {"pos_w": state.pos_w + along[0] * way, "rot_w": state.rot_w + along[1] * turn}
+        found = of(worlds, state._replace(**moved))
         return (found.state.sum(), found.image.sum()), found
 
-    both = jax.jit(jax.jacrev(sums, has_aux=True))
-    pose = ("pos_w", "rot_w")
-    return lambda worlds, state: both({k: getattr(state, k) for k in pose}, worlds, state)[::-1]
+    both = jax.jit(jax.jacfwd(sums, has_aux=True))
+    return lambda worlds, state: both(jnp.zeros(2), worlds, state)[::-1]
 
 
 def test_at_magnitude_nothing_the_truth_is_seen(shown):
@@ -211,11 +214,9 @@ def test_at_magnitude_nothing_the_truth_is_seen(shown):
 
 def test_the_state_carries_a_finite_gradient_and_the_image_none(shown):
     _, worlds, state = seen(sensed(perfect_share=0.0, magnitude=(2.0, 2.0)))
-    of_state, of_image = shown(worlds, state)[1]
-    for name in ("pos_w", "rot_w"):
-        slope = np.array(of_state[name])
-        assert np.isfinite(slope).all() and np.abs(slope).max() > 0.1
-        assert not np.array(of_image[name]).any(), name
+    of_state, of_image = map(np.asarray, shown(worlds, state)[1])
+    assert np.isfinite(of_state).all() and np.abs(of_state).min() > 0.1
+    assert not of_image.any()
 
 
 def test_magnitudes_are_drawn_per_world_and_model_from_the_range():

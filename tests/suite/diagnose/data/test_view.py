@@ -48,7 +48,10 @@ def test_views_and_identification_use_the_log_without_the_faults_of_the_vehicle_
         leaves = (jax.tree.leaves(one.smoothed[view][0].rows) for one in (wanted, found))
         for expected, series in zip(*leaves, strict=True):
             np.testing.assert_allclose(series, expected, atol=1e-9)
-    numbers, others = (identify([one], v).numbers for one, v in ((log, VEHICLE), (faulty, vehicle)))
+    numbers, others = (
+        identify([one], v, leave=("lag", "loop")).numbers
+        for one, v in ((log, VEHICLE), (faulty, vehicle))
+    )
     assert len(numbers) > 3
     for number, other in zip(numbers, others, strict=True):
         assert number.key == other.key and np.allclose(number.value, other.value, rtol=1e-6)

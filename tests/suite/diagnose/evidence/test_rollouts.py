@@ -150,7 +150,7 @@ GROUP = "attitude"
 
 @pytest.fixture(scope="module")
 def windows():
-    found, _ = cut(fly_all([PLAIN] * 3, range(3), duration_s=6.0), PLAIN, False)
+    found, _ = cut(fly_all([PLAIN] * 8, range(8), duration_s=2.5), PLAIN, False)
     return found
 
 

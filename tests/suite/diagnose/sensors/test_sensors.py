@@ -22,7 +22,7 @@ from suite.diagnose.sensors.identify import fit_sensors, held_out, identify_sens
 from tracks.geometry.camera import Camera
 from tracks.geometry.rotation import exp_rot, rot_to_quat
 
-STEP_S, LONG_S, FLIGHTS = 0.02, 40.0, 6
+STEP_S, LONG_S, FLIGHTS = 0.02, 40.0, 4
 TRUE = {
     **{f"position_{a}": 0.03 for a in "xyz"},
     **{f"position_{a}_fast": 0.3 for a in "xyz"},

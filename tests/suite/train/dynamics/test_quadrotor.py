@@ -219,7 +219,8 @@ def test_draws_stay_within_what_a_vehicle_can_have_and_move_no_other_draw():
 def test_effects_of_every_kind_fly_in_training_together():
     drawn = drawn_effects(np.random.default_rng(0)).effects
     effects = {name: values for name, values in drawn.items() if EFFECTS[name].in_flight}
-    config = QuadrotorConfig(replace(PLAIN, effects=effects), **{**ALIKE, "drag_spread": 0.3})
+    alike = {**ALIKE, "drag_spread": 0.3}
+    config = QuadrotorConfig(replace(PLAIN, effects=effects), 60.0, 60.0, **alike)
     pos_w, plainly_w = (
         fly_trainer(one, lively_actions(7), 15.0)[0]
         for one in (config, replace(config, vehicle=PLAIN))

@@ -266,7 +266,7 @@ def test_a_world_that_crashed_starts_again_as_it_started():
     assert not np.allclose(seen[again, 1], seen[0, 1])
 
 
-QUAD = QuadrotorConfig(load_vehicle("racer5"), attitude_hz=30.0, physics_hz=60.0)
+QUAD = QuadrotorConfig(load_vehicle("racer5"), attitude_hz=30.0, physics_hz=30.0)
 ENV = JaxRace(replace(small_config(), quadrotor=QUAD), time_limit_s=0.1)
 KEYS = jax.random.split(jax.random.key(1), 3)
 reset = jax.jit(jax.vmap(ENV.reset, (0, None)))
