@@ -36,7 +36,7 @@ def delayed(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> tuple[
     """
     step = float(np.median(np.diff(time_s)))
     value = smooth(time_s, command, WIDTH_S)
-    has_value, has_rate = (np.isfinite(part).all(axis=1) for part in (value, rate))
+    has_value, has_rate = (np.asarray(np.isfinite(x).all(axis=1)) for x in (value, rate))
     best: dict[tuple[int, ...], tuple[float, int]] = {}
     for late in np.arange(0.0, REACH_S + 1e-9, max(STEP_S, step)):
         count = round(late / step)
