@@ -36,7 +36,7 @@ def multiply(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the products (..., 4) of quaternions wxyz: rotation by `second`, then by `first`."""
     w1, v1 = first[..., :1], first[..., 1:]
     w2, v2 = second[..., :1], second[..., 1:]
-    vector = w1 * v2 + w2 * v1 + np.cross(v1, v2)
+    vector = w1 * v2 + w2 * v1 + _cross(v1, v2)
     return np.concatenate([w1 * w2 - np.sum(v1 * v2, axis=-1, keepdims=True), vector], axis=-1)
 
 
@@ -48,8 +48,15 @@ def conjugate(quat_wxyz: np.ndarray) -> np.ndarray:
 def rotate(quat_wxyz: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Return `vector` (..., 3) rotated by unit quaternions wxyz (..., 4)."""
     w, v = quat_wxyz[..., :1], quat_wxyz[..., 1:]
-    twice_cross = 2.0 * np.cross(v, vector)
-    return vector + w * twice_cross + np.cross(v, twice_cross)
+    twice_cross = 2.0 * _cross(v, vector)
+    return vector + w * twice_cross + _cross(v, twice_cross)
+
+
+def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the cross products (..., 3), several times faster than `np.cross` on short arrays."""
+    a, b, c = first[..., 0], first[..., 1], first[..., 2]
+    x, y, z = second[..., 0], second[..., 1], second[..., 2]
+    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=-1)
 
 
 def world_vector(vector: np.ndarray, world: str) -> np.ndarray:

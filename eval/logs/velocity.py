@@ -40,23 +40,25 @@ def velocity_from_position(time_s: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
     nearest = np.searchsorted(time, time_s)
     first = np.clip(nearest - count // 2, 0, max(len(time) - count, 0))
     moment = np.zeros((7, len(time_s)))
-    right = np.zeros((4, len(time_s), 3))
+    right = np.zeros((4, 3, len(time_s)))
     used = np.zeros(len(time_s))
-    origin = pos[np.clip(nearest, 0, len(time) - 1)]  # keeps digits where positions are large
+    origin = pos[np.clip(nearest, 0, len(time) - 1)].T  # keeps digits where positions are large
     # Sums of the normal equations, in u = time from the row over `reach` (from -1 to 1).
     for offset in range(min(count, len(time))):
         k = first + offset
         u = (time[k] - time_s) / reach
-        weight = (np.abs(u) <= 1).astype(np.float64)
-        powers = np.cumprod([weight, u, u, u, u, u, u], axis=0)
+        powers = np.empty_like(moment)
+        powers[0] = np.abs(u) <= 1
+        for n in range(6):
+            powers[n + 1] = powers[n] * u
         moment += powers
-        right += powers[:4, :, None] * (pos[k] - origin)
-        used += weight
+        right += powers[:4, None] * (pos[k].T - origin)
+        used += powers[0]
     degree = np.minimum(used - 1, 3)
     for n in (1, 2, 3):
         rows = np.flatnonzero(degree == n)
         index = np.arange(n + 1)
         normal = np.moveaxis(moment[index[:, None] + index], -1, 0)[rows]
-        coefficient = np.linalg.solve(normal, np.moveaxis(right[: n + 1], 1, 0)[rows])
+        coefficient = np.linalg.solve(normal, np.moveaxis(right[: n + 1], -1, 0)[rows])
         velocity[rows] = coefficient[:, 1] / reach
     return velocity

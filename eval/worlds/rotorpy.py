@@ -24,6 +24,7 @@ from eval.quadrotor.stepper import rotor_command
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import rotorpy_vehicle
 from eval.worlds.scene_slots import TO_CONTACTS, SceneSlots
+from tracks.common.masks import make_contiguous
 from tracks.geometry.rotation import quat_to_rot, to_local
 
 XYZW = [1, 2, 3, 0]
@@ -96,7 +97,7 @@ class RotorpyWorld(SceneSlots):
             plant, loops.plant, loops.command, motion.rate_b, motor_action
         )
         winds, air_vel_w = winds_on(plant, state.wind, motion, noise)
-        loops = loops._replace(plant=state._replace(wind=winds))
+        loops = make_contiguous(loops._replace(plant=state._replace(wind=winds)))
         return loops, StepInput(speed_cmd, motion.vel_w - air_vel_w)
 
     def _move(self, flying: np.ndarray, motion: Motion, push: StepInput) -> np.ndarray:

@@ -158,7 +158,8 @@ class SceneSlots(Slots, ABC):
         motion = self._motion()
         camera, slots = self._camera, np.flatnonzero(wanted)
         depth = np.full((self.slots, camera.height, camera.width), camera.range_m)
-        depth[slots] = self._images(slots, *take(motion[:2], slots))
+        if len(slots):
+            depth[slots] = self._images(slots, *take(motion[:2], slots))
         gate = next_gate(self._course, self._progress.gates)
         second_gate = next_gate(self._course, self._progress.gates + 1)
         return view_of(motion.pos_w, motion.rot_w, motion.vel_w, gate, second_gate, depth)
@@ -184,7 +185,8 @@ class SceneSlots(Slots, ABC):
         """Return the autopilot's state after a physics step, and its output for `_move`.
 
         The arguments are those of `eval.quadrotor.autopilot.autopilot_step`, for all slots, and
-        the output is its force and torque on the body.
+        the output is its force and torque on the body. The state has contiguous arrays; see
+        `make_contiguous`.
         """
         return autopilot_step(self._autopilot, self._loops, motion, action_b, gate_w, step, noise)
 
@@ -210,7 +212,7 @@ class SceneSlots(Slots, ABC):
             rotor_speed = self._loops.plant.rotor_speed
             draws = self._draws_at(step + 1)
             loops, push = self._control(motion, action_b, gate_w, step, draws)
-            before, self._loops = self._loops, make_contiguous(select(flying, loops, self._loops))
+            before, self._loops = self._loops, select(flying, loops, self._loops)
             if record:
                 due = flying & has_new_command(self._autopilot, before, loops, step)
                 rows += self._rows(due, rotor_speed)

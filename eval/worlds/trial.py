@@ -234,8 +234,8 @@ def judge_state(
     flying = progress.ended == FLYING
     live = flying & ~diverged
     live_without_contact = live & ~contact
-    gate = next_gate(course, progress.gates)
-    passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, progress.pos_w, pos_w)
+    center_w, rot_of_gate_w, opening_g = _select_gate(course, progress.gates, course.gates[:3])
+    passed, _ = crossing(center_w, rot_of_gate_w, opening_g, progress.pos_w, pos_w)
     gates = progress.gates + (passed & live_without_contact & (progress.gates < course.count))
     is_at_next_centre = is_near(next_centre(course, progress.gates_035), pos_w)
     gates_035 = progress.gates_035 + (

@@ -54,12 +54,18 @@ def make_contiguous(tree: Any) -> Any:
     of its parts. So without this function, the last bit of a row could depend on the other rows.
     JAX arrays have only one layout and are returned unchanged.
     """
-    return _mapped(lambda x: np.ascontiguousarray(x) if isinstance(x, np.ndarray) else x, tree)
+    return _mapped(_contiguous, tree)
 
 
 def take(tree: Any, rows: Any) -> Any:
     """Return an array, or nested tuples and dicts of arrays, indexed with `rows`."""
     return _mapped(lambda x: x[rows], tree)
+
+
+def _contiguous(array: Array) -> Array:
+    if isinstance(array, np.ndarray) and not array.flags.c_contiguous:
+        return np.ascontiguousarray(array)
+    return array
 
 
 def _mapped(function: Callable[[Any], Any], tree: Any) -> Any:

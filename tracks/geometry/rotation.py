@@ -111,8 +111,8 @@ def exp_rot(vector: Array) -> Array:
     angle = xp.sqrt(xp.where(small, 1.0, squared))
     sine_factor = xp.where(small, 1.0 - squared / 6.0, xp.sin(angle) / angle)
     cosine_factor = xp.where(small, 0.5 - squared / 24.0, (1.0 - xp.cos(angle)) / angle**2)
-    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    x, y, z = (vector[..., i : i + 1] for i in range(3))
     zero = xp.zeros_like(x)
-    rows = ((zero, -z, y), (z, zero, -x), (-y, x, zero))
-    skew = xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+    parts = [zero, -z, y, z, zero, -x, -y, x, zero]
+    skew = xp.concatenate(parts, axis=-1).reshape(*vector.shape[:-1], 3, 3)
     return xp.eye(3) + sine_factor * skew + cosine_factor * xp.matmul(skew, skew)

@@ -110,6 +110,8 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
     rate = 0.0 if gyro is None else rms(gyro)
     found, level = [], 0.0
     for steps in _attitudes():
+        positions = [pos for pos in POSITIONS if not steps or pos not in SWAPS]
+        lengths = [length for length in LENGTHS if not steps or length <= 1.0]
         base = "+".join(step for step in steps.split("+") if step not in ("ned", "frd"))
         frames = {"ned", "frd"} & set(steps.split("+"))
         read, frd = read_as("quat", quat, steps) if steps else quat, "frd" in frames
@@ -123,13 +125,13 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
         turns = None if seen is None else seen.misfit(seen.alike)
         forces: dict[tuple[str, float], tuple[float, float]] = {}
         if path is not None:
-            forces = _force_misfits(axes_of(time_s, read, every), path)
+            forces = _force_misfits(axes_of(time_s, read, every), path, positions, lengths)
         # A wrong frame is one mistake, of the attitude alone or of attitude and gyro.
         count = sum(step not in ("", "ned", "frd") for step in steps.split("+")) + bool(frames)
         axes = "x,y,z" if seen is None else seen.axes
         taken = count + (axes != "x,y,z" and not ("frd" in frames and axes == "x,-y,-z"))
-        for pos, length in product(POSITIONS, LENGTHS) if path is not None else [("", 1.0)]:
-            if (steps and pos in SWAPS) or (length > 1.0 and (steps or pos)):
+        for pos, length in product(positions, lengths) if path is not None else [("", 1.0)]:
+            if length > 1.0 and pos:
                 continue
             force, size = forces.get((pos, length), (None, 0.0))
             # The whole log is north-east-down: one mistake.
@@ -290,7 +292,10 @@ def is_usual(acc_size: np.ndarray) -> np.ndarray:
 
 
 def _force_misfits(
-    axes: np.ndarray, path: tuple[np.ndarray, np.ndarray]
+    axes: np.ndarray,
+    path: tuple[np.ndarray, np.ndarray],
+    positions: Sequence[str],
+    lengths: Sequence[float],
 ) -> dict[tuple[str, float], tuple[float, float]]:
     """Return the misfit of the force and its level for each reading (step, unit) of a position.
 
@@ -302,9 +307,9 @@ def _force_misfits(
     good = np.isfinite(axes).all(axis=(1, 2)) & np.isfinite(path[1]).all(axis=1)
     if good.sum() < 20:
         return {}
-    changes = np.stack([axes_matrix(pos or "x,y,z") for pos in POSITIONS])
+    changes = np.stack([axes_matrix(pos or "x,y,z") for pos in positions])
     acc_size, found = np.linalg.norm(path[1][good], axis=1), {}
-    for length in LENGTHS:
+    for length in lengths:
         usual = is_usual(length * acc_size)
         body = np.moveaxis(axes[good][usual], 0, -1)  # (3, 3, N), rows are contiguous
         vel, acc = (length * np.ascontiguousarray(x[good][usual].T) for x in path)
@@ -323,7 +328,7 @@ def _force_misfits(
         # A velocity may be unknown where the acceleration is not; the misfit is then 0.
         misfit = np.nan_to_num(rms_of_squares(wrong)) / np.maximum(level, CALM_ACC)
         pairs = zip(misfit.tolist(), level.tolist(), strict=True)
-        found |= {(pos, length): pair for pos, pair in zip(POSITIONS, pairs, strict=True)}
+        found |= {(pos, length): pair for pos, pair in zip(positions, pairs, strict=True)}
     return found
 
 

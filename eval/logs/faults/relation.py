@@ -6,7 +6,7 @@ the signal to check (`given`), such as the gyro, whose axes may be swapped or in
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import permutations
 from typing import NamedTuple
 
@@ -25,6 +25,8 @@ the first value and is more than the second factor times the share with the best
 CLEAR = 0.1
 """Another order of axes is chosen only if the sum of its squared correlations exceeds that of the
 given order by this: on a straight line two axes are proportional, and noise alone would decide."""
+AT_ONCE = 2**16
+"""Number of values of a signal that are shifted at once."""
 LEAST = 20
 """Least rows for a comparison."""
 SEEN = 0.5
@@ -233,6 +235,21 @@ def interpolate(time_s: np.ndarray, known_s: np.ndarray, value: np.ndarray) -> n
     It is linear between two samples, and constant before the first and after the last.
     """
     return np.stack([np.interp(time_s, known_s, column) for column in value.T], axis=1)
+
+
+def shifted(
+    time_s: np.ndarray, trials_s: np.ndarray, known_s: np.ndarray, value: np.ndarray
+) -> Iterator[tuple[slice, np.ndarray]]:
+    """Yield `value` (N, C), known at `known_s` (N,), at `time_s` (T,) plus each of `trials_s`.
+
+    Each item has the trials (a slice of K) and their values (C, K, T), interpolated linearly. A
+    long log has few trials in an item, so that all arrays stay small.
+    """
+    count = max(1, AT_ONCE // len(time_s))
+    for first in range(0, len(trials_s), count):
+        some = slice(first, first + count)
+        at_s = trials_s[some, None] + time_s
+        yield some, np.stack([np.interp(at_s, known_s, column) for column in value.T])
 
 
 def forward_mean(value: np.ndarray, count: int) -> np.ndarray:

@@ -132,7 +132,7 @@ def test_positions_that_stand_still_in_flight_are_left_out(tmp_path):
     ],
 )
 def test_order_and_unit_of_euler_angles_are_found(tmp_path, columns, unit, words):
-    parts = flight()
+    parts = flight(end=6.0)
     angles = Rotation.from_quat(parts["quat"], scalar_first=True).as_euler("ZYX")[:, ::-1]
     table = dict(zip(["roll", "pitch", "yaw"], angles.T, strict=True)) | {"time": parts["time"]}
     mapping = f'[euler]\ncolumns = {columns}\nunit = "{unit}"\n[time]\ncolumn = "time"\n'

@@ -203,7 +203,7 @@ def test_the_next_trial_of_a_slot_begins_with_nothing():
 
 
 def test_recording_changes_nothing():
-    options, flights = JudgeOptions(slots=3, rules=Rules(time_limit_s=1.0)), {}
+    options, flights = JudgeOptions(slots=3, rules=RULES), {}
     trials, policy = TRIALS[:4], random_network()
     found = fly(
         policy, trials, VEHICLE, "mujoco", options,

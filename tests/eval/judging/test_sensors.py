@@ -159,7 +159,7 @@ def filtered_flights(wanted, trials, monkeypatch, slots=40, seconds=1.6):
 
 
 @pytest.mark.parametrize(
-    ("believed", "trials", "least", "most"), [(1.0, 40, 0.9, 1.0), (0.25, 10, 0.0, 0.5)]
+    ("believed", "trials", "least", "most"), [(1.0, 20, 0.9, 1.0), (0.25, 5, 0.0, 0.5)]
 )
 def test_nees_is_within_its_bounds_if_the_corners_variance_is_right(
     monkeypatch, believed, trials, least, most
@@ -189,8 +189,8 @@ def test_an_ideal_imu_reads_nothing_in_free_fall_and_the_turn():
 
 
 def test_a_trials_outcome_is_the_same_at_any_batch(monkeypatch):
-    together, _ = filtered_flights(filtering(), TWO_TRACKS[:2], monkeypatch, 2, 0.6)
-    alone, _ = filtered_flights(filtering(), TWO_TRACKS[:2], monkeypatch, 1, 0.6)
+    together, _ = filtered_flights(filtering(), TWO_TRACKS[:2], monkeypatch, 2, 0.3)
+    alone, _ = filtered_flights(filtering(), TWO_TRACKS[:2], monkeypatch, 1, 0.3)
     assert together == alone
 
 

@@ -29,7 +29,7 @@ SMALL = VideoOptions(size=(160, 96), fps=10, hold_s=0.3)
 
 
 def test_a_diverged_flight_can_still_be_seen(tmp_path):
-    track, flight, result = rollout()
+    track, flight, result = rollout("finished", 1.5)
     pos, vel = flight.pos_w.copy(), flight.vel_w.copy()
     pos[-3:], vel[-2:] = np.nan, np.nan
     lost = flight._replace(pos_w=pos, vel_w=vel)
@@ -222,7 +222,7 @@ def test_bad_video_requests_are_refused(tmp_path):
 def test_a_video_plays_the_whole_flight(tmp_path, kind):
     done = []
     path = tmp_path / f"a.{kind}"
-    track, flight, result = rollout()
+    track, flight, result = rollout("finished", 1.5)
     write_video(path, track, flight, result, SMALL, done.append)
     expected = len(frame_times(flight, SMALL))
     assert done == list(range(1, expected + 1))

@@ -254,7 +254,7 @@ def test_distances_to_boxes_are_trimeshs_inside_too():
     rng = np.random.default_rng(3)
     inside_b = rng.uniform(-0.9, 0.9, boxes.half_size.shape) * boxes.half_size
     inside = boxes.center_w + (boxes.rot_w @ inside_b[..., None])[..., 0]
-    point = np.concatenate([inside, random_points(track, 60, 4)])
+    point = np.concatenate([inside, random_points(track, 20, 4)])
     distance, _ = all_distances(unbatched(track.scene), jnp.asarray(point))
     number = len(boxes.center_w)
     for i, (_, mesh) in enumerate(solid_meshes(track)[:number]):

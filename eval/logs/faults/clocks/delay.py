@@ -9,7 +9,7 @@ estimates that leave out one block of the flight at a time (jackknife).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from eval.importers.frames import rates_between, rotate
 from eval.logs.faults.clocks.rotation import fit_rotation, rotation_findings
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import SPAN_S, WIDTH_S, Rows, turns_of
-from eval.logs.faults.relation import interpolate, jackknife_error, smooth
+from eval.logs.faults.relation import interpolate, jackknife_error, shifted, smooth
 from eval.logs.velocity import velocity_from_position
 from eval.vehicles.vehicle import Vehicle
 
@@ -174,16 +174,13 @@ def late_against(
     if min(known.sum(), inside.sum()) < 100:
         return None
     time_s = time_s[inside]
-    wanted = wanted[inside] - wanted[inside].mean(axis=0)
-    block = np.arange(len(time_s)) * BLOCKS // len(time_s)
+    wanted = (wanted[inside] - wanted[inside].mean(axis=0)).T[:, None]
     trials = far_s + np.arange(-REACH_S, REACH_S + 0.5 * STEP_S, STEP_S)
     cost = np.empty((BLOCKS, len(trials)))
-    for k, late_s in enumerate(trials):
-        tried = interpolate(time_s + late_s, known_s, given)
-        tried = tried - tried.mean(axis=0)
-        scale = np.sum(wanted * tried) / max(float(np.sum(tried**2)), 1e-12)
-        residual = np.sum((wanted - scale * tried) ** 2, axis=1)
-        cost[:, k] = np.bincount(block, weights=residual, minlength=BLOCKS)
+    for some, tried in shifted(time_s, trials, known_s, given):
+        tried = tried - tried.mean(axis=-1, keepdims=True)
+        scale = np.sum(wanted * tried, axis=(0, 2)) / np.maximum(np.sum(tried**2, (0, 2)), 1e-12)
+        cost[:, some] = block_sums(np.sum((wanted - scale[:, None] * tried) ** 2, axis=0))
     return best_delay(trials, cost)
 
 
@@ -257,14 +254,14 @@ def _far_delay(
     inside &= size <= 4.0 * np.quantile(size, 0.9)
     if inside.sum() < 100:
         return 0.0
-    time_s, wanted = time_s[inside], wanted[inside] - wanted[inside].mean(axis=0)
+    time_s, wanted = time_s[inside], (wanted[inside] - wanted[inside].mean(axis=0)).T[:, None]
     trials = np.arange(-FAR_S, FAR_S + 0.5 * FAR_STEP_S, FAR_STEP_S)
     unlike = np.ones(len(trials))
-    for k, late_s in enumerate(trials):
-        tried = interpolate(time_s + late_s, known_s, given)
-        tried = tried - tried.mean(axis=0)
-        norm = float(np.linalg.norm(wanted) * np.linalg.norm(tried))
-        unlike[k] = 1.0 - max(float(np.sum(wanted * tried)) / max(norm, 1e-12), 0.0) ** 2
+    for some, tried in shifted(time_s, trials, known_s, given):
+        tried = tried - tried.mean(axis=-1, keepdims=True)
+        norm = np.linalg.norm(wanted) * np.sqrt(np.sum(tried**2, axis=(0, 2)))
+        alike = np.sum(wanted * tried, axis=(0, 2)) / np.maximum(norm, 1e-12)
+        unlike[some] = 1.0 - np.maximum(alike, 0.0) ** 2
     best, is_small = int(np.argmin(unlike)), np.abs(trials) <= 0.5 * REACH_S
     is_clear = unlike[best] < FAR_SHARE * unlike[is_small].min()
     return float(trials[best]) if is_clear and abs(trials[best]) > 0.75 * REACH_S else 0.0
@@ -296,31 +293,31 @@ def _near_delay(
 
     middle, duration = 0.5 * float(last[-1] + first[0]), float(last[-1] - first[0])
 
-    def gyro(late_s: float, drift: float) -> np.ndarray:
-        """Return the gyro's mean rates over the same times for a trial delay and drift."""
-        before, after = (
-            interpolate(t - late_s - drift * (t - middle), rate_time, integral)
-            for t in (first, last)
-        )
-        return (after - before) / (last - first)[:, None]
+    def gyros(trials: np.ndarray, drift: float) -> Iterator[tuple[slice, np.ndarray]]:
+        """Yield (trials, the gyro's mean rates (3, trials, N)) over the same times, at a drift."""
+        ends = (t - drift * (t - middle) for t in (first, last))
+        both = (shifted(end_s, -trials, rate_time, integral) for end_s in ends)
+        for (some, before), (_, after) in zip(*both, strict=True):
+            yield some, (after - before) / (last - first)
 
-    if np.sqrt(np.mean(np.sum(gyro(0.0, 0.0) ** 2, axis=1))) < CALM or not turns.any():
+    ((_, gyro),) = gyros(np.zeros(1), 0.0)
+    if np.sqrt(np.mean(np.sum(gyro**2, axis=0))) < CALM or not turns.any():
         return None
     trials = np.arange(-REACH_S, REACH_S + 0.5 * STEP_S, STEP_S)
-    rotation, turned = fit_rotation(turns, [gyro(late_s, 0.0) for late_s in trials])
-    turns = turns @ rotation.T
-    block = np.arange(len(first)) * BLOCKS // len(first)
+    rotation, turned = fit_rotation(turns, (gyro for _, gyro in gyros(trials, 0.0)))
+    turns = (rotation @ turns.T)[:, None]
 
     def costs(drift: float) -> np.ndarray:
         """Return the misfit (BLOCKS, trials) of every block and trial delay."""
         cost = np.empty((BLOCKS, len(trials)))
-        for k, late_s in enumerate(trials):
-            residual = turns - gyro(late_s, drift)
-            size = np.linalg.norm(residual - np.median(residual, axis=0), axis=1)
+        for some, gyro in gyros(trials, drift):
+            residual = turns - gyro
+            residual = residual - np.median(residual, axis=-1, keepdims=True)
+            size = np.sqrt(np.sum(residual**2, axis=0))
             # Huber's loss limits the influence of outliers.
-            limit = 3.0 * np.median(size)
+            limit = 3.0 * np.median(size, axis=-1, keepdims=True)
             loss = np.where(size < limit, 0.5 * size**2, limit * (size - 0.5 * limit))
-            cost[:, k] = np.bincount(block, weights=loss, minlength=BLOCKS)
+            cost[:, some] = block_sums(loss)
         return cost
 
     cost = costs(0.0)
@@ -361,6 +358,12 @@ def _drift(trials: np.ndarray, cost: np.ndarray, duration_s: float) -> tuple[flo
         return 0.0, np.inf
     apart_s = 0.5 * duration_s
     return (last[0] - first[0]) / apart_s, float(np.hypot(first[1], last[1])) / apart_s
+
+
+def block_sums(value: np.ndarray) -> np.ndarray:
+    """Return the sums (BLOCKS, K) of `value` (K, N) over equal blocks of its N rows."""
+    starts = -(-PLACE * value.shape[-1] // BLOCKS)
+    return np.add.reduceat(value, starts, axis=-1).T
 
 
 def best_delay(trials: np.ndarray, cost: np.ndarray) -> tuple[float, float] | None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.logs.faults.clocks.delay import BLOCKS, best_delay, delay_of
+from eval.logs.faults.clocks.delay import BLOCKS, best_delay, block_sums, delay_of
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import (
     BIAS,
@@ -24,7 +24,7 @@ from eval.logs.faults.pose import (
     is_usual,
     path_of,
 )
-from eval.logs.faults.relation import interpolate, rms
+from eval.logs.faults.relation import rms, shifted
 
 REACH_S, STEP_S = 0.5, 0.02
 """Largest delay that is tried, in both directions, and the step between trials [s]."""
@@ -101,17 +101,16 @@ def delay_of_path(
     if level < CALM_ACC:
         return None
     known_s, path = time_s[known], np.concatenate([vel_w, acc_w], axis=1)[known]
-    block = np.arange(len(at_s)) * BLOCKS // len(at_s)
+    sides = np.ascontiguousarray(body[:, :, :2].transpose(1, 2, 0))[:, :, None]  # (3, 2, 1, N)
     trials = np.arange(-REACH_S, REACH_S + 0.5 * STEP_S, STEP_S)
     cost = np.empty((BLOCKS, len(trials)))
-    for k, late_s in enumerate(trials):
-        vel, acc = np.split(interpolate(at_s + late_s, known_s, path), 2, axis=1)
-        force = acc + [0.0, 0.0, GRAVITY]
-        side, speed = (np.einsum("tij,ti->tj", body[:, :, :2], x) for x in (force, vel))
-        speed = speed - speed.mean(axis=0)
-        drag = np.sum(speed * side, axis=0) / np.maximum(np.sum(speed**2, axis=0), 1e-9)
-        side = side - np.clip(drag, -DRAG, 0.0) * speed
-        side = side - np.clip(side.mean(axis=0), -BIAS, BIAS)
-        cost[:, k] = np.bincount(block, np.sum(side**2, axis=1), BLOCKS)
+    for some, values in shifted(at_s, trials, known_s, path):
+        vel, force = values[:3], values[3:] + [[[0.0]], [[0.0]], [[GRAVITY]]]
+        side, speed = (np.sum(sides * x[:, None], axis=0) for x in (force, vel))  # (2, trials, N)
+        speed = speed - speed.mean(axis=-1, keepdims=True)
+        drag = np.sum(speed * side, axis=-1) / np.maximum(np.sum(speed**2, axis=-1), 1e-9)
+        side = side - np.clip(drag, -DRAG, 0.0)[..., None] * speed
+        side = side - np.clip(side.mean(axis=-1, keepdims=True), -BIAS, BIAS)
+        cost[:, some] = block_sums(np.sum(side**2, axis=0))
     misfit = float(np.sqrt(cost.sum(axis=0).min() / len(at_s))) / level
     return best_delay(trials, cost) if misfit < GOOD else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -16,11 +16,11 @@ HALF, PRIOR = 0.5, 0.03
 the share of the rates for which the axes are equal, since few axes may turn."""
 
 
-def fit_rotation(turns: np.ndarray, gyros: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def fit_rotation(turns: np.ndarray, gyros: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return the rotation (3, 3) from the rates `turns` (N, 3) to the gyro's, and its vector [deg].
 
-    `gyros` are the gyro's rates (N, 3) for each trial delay. It is 0 where a delay alone fits about
-    as well (Kabsch 1976, for every delay).
+    `gyros` are the gyro's rates (3, K, N) for K trial delays each. It is 0 where a delay alone fits
+    about as well (Kabsch 1976, for every delay).
     """
     from scipy.spatial.transform import Rotation
 
@@ -30,13 +30,17 @@ def fit_rotation(turns: np.ndarray, gyros: Sequence[np.ndarray]) -> tuple[np.nda
     source /= max(float(np.linalg.norm(source)), 1e-12)
     alone, least, best = np.inf, np.inf, np.eye(3)
     for gyro in gyros:
-        target = gyro[kept] - gyro[kept].mean(axis=0)
-        product = target.T @ source / max(float(np.linalg.norm(target)), 1e-12)
+        target = gyro[..., kept] - gyro[..., kept].mean(axis=-1, keepdims=True)
+        size = np.sqrt(np.sum(target**2, axis=(0, 2)))
+        product = np.moveaxis(target, 1, 0) @ source / np.maximum(size, 1e-12)[:, None, None]
         u, _, vt = np.linalg.svd(product + PRIOR * np.eye(3))
-        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-        alone = min(alone, 2.0 - 2.0 * float(np.trace(product)))
-        if (misfit := 2.0 - 2.0 * float(np.sum(rotation * product))) < least:
-            least, best = misfit, rotation
+        u[..., 2] *= np.linalg.det(u @ vt)[:, None]
+        rotation = u @ vt
+        alone = min(alone, 2.0 - 2.0 * float(np.trace(product, axis1=1, axis2=2).max()))
+        misfit = 2.0 - 2.0 * np.sum(rotation * product, axis=(1, 2))
+        k = int(np.argmin(misfit))
+        if misfit[k] < least:
+            least, best = float(misfit[k]), rotation[k]
     vector = np.rad2deg(Rotation.from_matrix(best).as_rotvec())
     angle = float(np.linalg.norm(vector))
     if least > HALF * alone or not NOTED_DEG < angle < LIMIT_DEG:
@@ -47,7 +51,10 @@ def fit_rotation(turns: np.ndarray, gyros: Sequence[np.ndarray]) -> tuple[np.nda
 def rotated_to(turns: np.ndarray, given: np.ndarray) -> np.ndarray:
     """Return the rates `turns` (N, 3) in the body axes of the rates `given` (N, 3)."""
     known = np.isfinite(turns).all(axis=1) & np.isfinite(given).all(axis=1)
-    return turns @ fit_rotation(turns[known], [given[known]])[0].T if known.any() else turns
+    if not known.any():
+        return turns
+    rotation, _ = fit_rotation(turns[known], [given[known].T[:, None]])
+    return turns @ rotation.T
 
 
 def rotation_findings(rotation: np.ndarray) -> list[Finding]:

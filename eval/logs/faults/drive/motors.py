@@ -263,10 +263,15 @@ Scores = dict[tuple[int, ...], np.ndarray]
 
 def scores_of(mean: np.ndarray, turning: np.ndarray, mixer: np.ndarray) -> Scores:
     """Return the correlations of every order of the motors."""
-    return {
-        order: _correlations(mean[:, order] @ mixer.T, turning).diagonal()
-        for order in permutations(range(4))
-    }
+    mean, turning = _centred(mean, turning)
+    products, moments, size = mean.T @ turning, mean.T @ mean, np.linalg.norm(turning, axis=0)
+    scores = {}
+    for order in permutations(range(4)):
+        mix = mixer[:, np.argsort(order)]  # of the columns as given
+        squares = np.maximum(np.sum((mix @ moments) * mix, axis=1), 0.0)
+        sizes = np.maximum(np.sqrt(squares) * size, 1e-12)
+        scores[order] = np.sum(mix * products.T, axis=1) / sizes
+    return scores
 
 
 def _best(scores: Scores) -> tuple[int, ...]:
@@ -276,10 +281,16 @@ def _best(scores: Scores) -> tuple[int, ...]:
 
 def _correlations(mean: np.ndarray, turning: np.ndarray) -> np.ndarray:
     """Return the correlation of each column of `mean` with each of `turning`."""
-    good = np.isfinite(mean).all(axis=1) & np.isfinite(turning).all(axis=1)
-    a, b = mean[good] - mean[good].mean(axis=0), turning[good] - turning[good].mean(axis=0)
+    a, b = _centred(mean, turning)
     size = np.outer(np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0))
     return (a.T @ b) / np.maximum(size, 1e-12)
+
+
+def _centred(mean: np.ndarray, turning: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows where both are known, less their means."""
+    good = np.isfinite(mean).all(axis=1) & np.isfinite(turning).all(axis=1)
+    mean, turning = mean[good], turning[good]
+    return mean - mean.mean(axis=0), turning - turning.mean(axis=0)
 
 
 def check_lift(rows: Rows, vehicle: Vehicle | None, doubtful: bool = False) -> list[Finding]:

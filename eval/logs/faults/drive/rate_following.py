@@ -36,24 +36,28 @@ def delayed(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> tuple[
     """
     step = float(np.median(np.diff(time_s)))
     value = smooth(time_s, command, WIDTH_S)
-    best: dict[tuple[int, ...], tuple[float, float, np.ndarray]] = {}
+    has_value, has_rate = (np.asarray(np.isfinite(x).all(axis=1)) for x in (value, rate))
+    best: dict[tuple[int, ...], tuple[float, int]] = {}
     for late in np.arange(0.0, REACH_S + 1e-9, max(STEP_S, step)):
         count = round(late / step)
-        moved = shift_rows(value, count)
-        both = np.isfinite(moved).all(axis=1) & np.isfinite(rate).all(axis=1)
+        before, after = slice(max(0, len(value) - count)), slice(count, None)
+        both = has_value[before] & has_rate[after]
         if both.sum() < 30:
             break
         # Correlation of each axis, weighted by how much the axis turns.
-        a, b = moved[both] - moved[both].mean(axis=0), rate[both] - rate[both].mean(axis=0)
-        norms = np.outer(np.linalg.norm(b, axis=0), np.linalg.norm(a, axis=0))
-        shares = (b.std(axis=0) / b.std(axis=0).sum())[:, None]
-        correlations = shares * np.abs(b.T @ a) / np.maximum(norms, 1e-12)
+        a, b = value[before][both].T, rate[after][both].T
+        a, b = (part - part.mean(axis=1, keepdims=True) for part in (a, b))
+        size_a, size_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
+        shares = (size_b / size_b.sum())[:, None]
+        correlations = shares * np.abs(b @ a.T) / np.maximum(np.outer(size_b, size_a), 1e-12)
+        table = correlations.tolist()
         for order in permutations(range(3)):
-            score = float(correlations[range(3), order].sum())
+            score = sum(row[k] for row, k in zip(table, order, strict=True))
             if score > best.get(order, (-1.0,))[0] + 1e-6:
-                best[order] = score, count * step, moved
+                best[order] = score, count
     order = max(best, key=lambda o: best[o][0] + CLEAR * (o == (0, 1, 2)), default=None)
-    return (0.0, value) if order is None else best[order][1:]
+    count = 0 if order is None else best[order][1]
+    return count * step, shift_rows(value, count)
 
 
 def bend(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> float:
@@ -125,7 +129,9 @@ def loop_gain(
         late = np.concatenate([np.repeat(command[:1], count, axis=0), command])[: len(grid)]
         wanted = np.asarray(lfilter(top, bottom, late - command[0], axis=0))[settled]
         wanted = wanted - wanted.mean(axis=0)
-        gain = np.sum(wanted * rate[settled], axis=0) / np.sum(wanted**2, axis=0)
+        # The filtered command may be constant in these rows.
+        squares = np.maximum(np.sum(wanted**2, axis=0), 1e-12)
+        gain = np.sum(wanted * rate[settled], axis=0) / squares
         residual = np.sum((rate[settled] - gain * wanted) ** 2, axis=0)
         gains = np.where(residual < least_residual, gain, gains)
         least_residual = np.minimum(residual, least_residual)

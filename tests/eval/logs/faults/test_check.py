@@ -1,6 +1,7 @@
 """Readings of a log, and findings that an import stored in it."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -25,11 +26,17 @@ from eval.logs.faults.sensors import check_barometer
 from eval.logs.flight_log import FlightLog, columns_from_log, log_from_columns, write_flight
 from suite.commands.check import Config, run
 from suite.common.console import Console
-from tests.support.diagnosis_flights import fly
+from tests.support.diagnosis_flights import fly, fly_all
 from tests.support.imported import flight
 from tests.support.vehicles import PLAIN
 
 ROOT = Path(__file__).resolve().parents[4]
+
+
+@cache
+def flown(duration_s=3.0):
+    """A flight without a fault, made once: no test writes into its arrays."""
+    return fly(PLAIN, 0, duration_s=duration_s)
 
 
 def flight_at_rest(time_s):
@@ -71,9 +78,9 @@ def test_a_time_takes_a_unit_or_a_positive_factor(text):
     )
 
 
-@pytest.mark.parametrize("factor", [0.92, 0.95, 1.05, 1.08])
+@pytest.mark.parametrize("factor", [0.95, 1.08])
 def test_a_small_error_of_a_clocks_rate_needs_gyro_and_velocity(factor):
-    log = fly(PLAIN, 0, duration_s=8.0)
+    log = flown(8.0)
     scaled = {
         "clock": {"time_s": factor * log.time_s},
         "gyro": {"rate_b": factor * log.rate_b},
@@ -88,7 +95,7 @@ def test_a_small_error_of_a_clocks_rate_needs_gyro_and_velocity(factor):
         assert noted <= {name} and (noted or name in ("clock", "position"))
 
 
-@pytest.mark.parametrize("factor", [0.5, 0.8, 1.25, 2.0])
+@pytest.mark.parametrize("factor", [0.5, 1.25])
 def test_a_clock_of_another_rate_is_one_fault(factor):
     parts = flight(100.0, 10.0, 0.3)
     parts["time"] = factor * parts["time"]
@@ -124,9 +131,7 @@ def test_a_stored_finding_on_another_vehicle_file_is_not_repeated_and_one_on_the
         Finding("doubt", "motor map", "the file gives twice the thrust", "motor_map", fix="t1"),
         Finding("doubt", "voltage", "0 V", "voltage"),
     ]
-    log = replace(
-        fly(PLAIN, 0, duration_s=3.0), about={"findings": [one._asdict() for one in stored]}
-    )
+    log = replace(flown(), about={"findings": [one._asdict() for one in stored]})
 
     def faults(context):
         return [one.fault for one in check_log(log, context)[0] if one.status == "doubt"]
@@ -148,7 +153,7 @@ def test_a_barometer_without_samples_around_the_start_is_not_checked(lost):
 
 
 def test_a_throttle_that_begins_late_does_not_start_the_motors():
-    log, rng = fly(PLAIN, 0, duration_s=3.0), np.random.default_rng(0)
+    log, rng = flown(), np.random.default_rng(0)
     throttle = np.where(np.arange(301) % 3 == 1, 0.4 + 0.02 * rng.normal(size=301), np.nan)
     sinking = {"throttle": throttle, "baro": log.pos_w[:, 2] - 5.0 * log.time_s}
     rows = rows_of(replace(log, extra=sinking))
@@ -159,7 +164,7 @@ def test_a_throttle_that_begins_late_does_not_start_the_motors():
 
 
 def test_a_long_pause_of_the_rows_has_a_note():
-    log = fly(PLAIN, 0, duration_s=3.0)
+    log = flown()
     for pause_s, notes in ((4.0, 0), (60.0, 1)):
         paused = replace(log, time_s=log.time_s + pause_s * (log.time_s > 1.5))
         found = [f for f in check_log(paused)[0] if f.signal == "rows"]
@@ -169,10 +174,10 @@ def test_a_long_pause_of_the_rows_has_a_note():
 
 def test_a_copy_of_a_flight_is_refused(tmp_path):
     """One copy could be held out to test the fit to the other."""
-    log = fly(PLAIN, 0, duration_s=3.0)
+    log = flown()
     rounded = replace(log, name="copy", rate_b=np.round(log.rate_b, 6))
     with pytest.raises(ValueError, match=f"{log.name} and copy are the same flight"):
-        check_flights([log, fly(PLAIN, 1, duration_s=3.0), rounded], CheckContext())
+        check_flights([log, fly(PLAIN, 1, duration_s=1.5), rounded], CheckContext())
     unknown = replace(log, rate_b=np.full_like(log.rate_b, np.nan))
     moved = replace(unknown, pos_w=log.pos_w + [0.0, 0.0, 1.0])
     check_flights([log, unknown, moved], CheckContext(), list(FAULTS))
@@ -180,7 +185,7 @@ def test_a_copy_of_a_flight_is_refused(tmp_path):
 
 def test_rows_in_bursts_are_one_fault():
     """Their median step is far below the mean one: usual steps may seem to be jumps."""
-    log = fly(PLAIN, 0, duration_s=4.0)
+    log = flown(4.0)
     place = np.arange(len(log.time_s))
     last = np.minimum(place // 4 * 4 + 3, len(place) - 1)
     log = replace(log, time_s=log.time_s[last] + 1e-4 * (place % 4))
@@ -189,7 +194,7 @@ def test_rows_in_bursts_are_one_fault():
 
 
 def test_logs_of_two_vehicles_are_refused_and_a_log_without_a_name_is_not():
-    flights = [fly(PLAIN, seed, duration_s=3.0) for seed in range(3)]
+    flights = fly_all([PLAIN] * 3, range(3), duration_s=1.5)
     logs = [
         replace(log, name=f"{k}.csv", about={"vehicle": "other" if k == 2 else "mine"})
         for k, log in enumerate(flights)
@@ -217,7 +222,7 @@ def test_logs_of_two_vehicles_are_refused_and_a_log_without_a_name_is_not():
 )
 @pytest.mark.parametrize("missing", [slice(0), slice(140, 150)])
 def test_a_jump_of_the_position_is_named(rows, moved_m, status, missing):
-    log = fly(PLAIN, 0, duration_s=3.0)
+    log = flown()
     assert not check_jumps(log.time_s, log.pos_w)
     pos = log.pos_w.copy()
     pos[rows] += [moved_m, 0.0, 0.0]
@@ -258,7 +263,7 @@ def test_another_vehicles_name_is_a_note_and_an_implausible_file_is_in_doubt():
 
 
 def test_the_rate_of_slow_commands_is_that_of_their_own_rows():
-    log = fly(PLAIN, 0, duration_s=3.0)
+    log = flown()
     has_command = np.arange(len(log.time_s)) % 5 == 0
     held = np.repeat(log.rate_cmd_b[::10], 10, axis=0)[: len(log.time_s)]
     slow = replace(log, rate_cmd_b=np.where(has_command[:, None], held, np.nan))
@@ -273,7 +278,7 @@ def test_the_rate_of_slow_commands_is_that_of_their_own_rows():
 
 @pytest.mark.parametrize("per_s", [1.0, 1e3])
 def test_a_wrong_unit_of_time_hides_no_jump_and_is_no_other_rate(per_s):
-    log = fly(PLAIN, 0, duration_s=4.0)
+    log = flown(4.0)
     pos_w = log.pos_w + [3.0, 0.0, 0.0] * (log.time_s > 2.0)[:, None]
     held = np.repeat(log.rate_cmd_b[::10], 10, axis=0)[: len(log.time_s)]
     row_hz = 1.0 / float(np.median(np.diff(log.time_s)))
@@ -284,7 +289,7 @@ def test_a_wrong_unit_of_time_hides_no_jump_and_is_no_other_rate(per_s):
 
 
 def test_a_log_that_is_too_slow_to_check_has_no_clean_bill(tmp_path, capsys):
-    log = fly(PLAIN, 0, duration_s=8.0)
+    log = flown(8.0)
     every = round(0.2 / float(np.median(np.diff(log.time_s))))
     columns = {name: value[::every] for name, value in columns_from_log(log).items()}
     path = write_flight(tmp_path / "slow.csv", log_from_columns(columns, {}, "slow"))
