@@ -24,7 +24,6 @@ from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.source import FITTED, GIVEN
 from suite.diagnose.verdict.actuators import actuator_mismatches
 from suite.diagnose.verdict.gap import Gap
-from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN, with_effects
 from tracks.common.files import plain
 from tracks.geometry.rotation import exp_rot, quat_to_rot
