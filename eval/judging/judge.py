@@ -339,7 +339,7 @@ class _Slots:
             **columns,
             policy=self._policy.name,
             vehicle=task.vehicle.name,
-            world=self._world.name,
+            world=task.world,
             collided_with=self._world.collided_with(slot) if is_collision else None,
             **self._outputs.columns(slot),
         )

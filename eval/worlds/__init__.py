@@ -23,6 +23,15 @@ from policies.spec import ActionSpec
 from tracks.common.names import Registry
 from tracks.track import Track
 
+
+def _registration_error(name: str, world: Any) -> str | None:
+    """Return why `world` cannot be registered, or None."""
+    methods = ("load", "view", "advance", "collided_with")
+    if callable(world) and all(hasattr(world, method) for method in methods):
+        return None
+    return f"{world!r}; must be a class with the methods {', '.join(methods)} (`World`)"
+
+
 WORLDS: Registry[Any] = Registry(
     "simulator",
     "diffracing_suite.worlds",
@@ -31,7 +40,7 @@ WORLDS: Registry[Any] = Registry(
         "mjx": "eval.worlds.mjx:MjxWorld",
         "rotorpy": "eval.worlds.rotorpy:RotorpyWorld",
     },
-    lambda name, world: None if callable(world) else f"{world!r}; must be a class (`World`)",
+    _registration_error,
 )
 """Name of a simulator -> class (a `World`), called with (vehicle, camera, layout, rules, slots=,
 threads=)."""
@@ -98,7 +107,6 @@ class World(Protocol):
     - `nearest(vehicle)` returns the vehicle file that describes the simulated vehicle best.
     """
 
-    name: str
     slots: int
     """Number of trials that fly at the same time."""
     dt: float

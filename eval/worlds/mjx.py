@@ -81,7 +81,6 @@ class SlotStates(NamedTuple):
 class MjxWorld(Slots):
     """A world that simulates all slots in one compiled JAX program, for GPUs."""
 
-    name = "mjx"
     integrator = "euler"
     compiles = True
     dtype = np.float32

@@ -16,7 +16,6 @@ class MujocoWorld(SceneSlots):
     Each step also computes the contacts at the new state, which may end the trial.
     """
 
-    name = "mujoco"
     integrator = "euler"
 
     def _move(self, flying: np.ndarray, motion: Motion, push: Wrench) -> np.ndarray:

@@ -64,7 +64,6 @@ class RotorpyWorld(SceneSlots):
     It has no attribute `integrator`, so its flight logs count as continuous in time.
     """
 
-    name = "rotorpy"
     cost = 6.0
     """Computing time of a trial relative to MuJoCo's."""
 

@@ -58,8 +58,6 @@ class SceneSlots(Slots, ABC):
     autopilot gives to it).
     """
 
-    name: str
-
     def __init__(self, vehicle: Vehicle, camera: Camera, *arguments: Any, **settings: Any) -> None:
         """Make the world; the arguments are those of `Slots`."""
         super().__init__(vehicle, camera, *arguments, **settings)

@@ -83,8 +83,6 @@ def read(path: Path, options: ImportOptions) -> Recording:
 class CoarseWorld(MujocoWorld):
     """MuJoCo with half as many physics steps a second."""
 
-    name = "coarse"
-
     def __init__(self, vehicle: Vehicle, *args: Any, **options: Any) -> None:
         """Make the world; the arguments are those of `MujocoWorld`."""
         slower = replace(vehicle.controller, frequency=vehicle.controller.frequency / 2)

@@ -139,7 +139,8 @@ def test_a_world_that_compiles_has_the_same_slots_for_any_number_of_trials(monke
     monkeypatch.setitem(WORLDS._values, "compiling", make)
     monkeypatch.setitem(WORLDS._entries, "compiling", make)
     for trials in TRIALS[:1], TRIALS:
-        results(trials, slots=70, world="compiling")
+        found = results(trials, slots=70, world="compiling")
+        assert {result.world for result in found} == {"compiling"}  # not the name of what it wraps
     assert slots == {70}
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import suite
 from eval.effects.slung_load import SlungLoad
 from eval.judging.judge import JudgeOptions, Record
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -25,6 +26,12 @@ from tracks.geometry.camera import Camera
 VEHICLE = load_vehicle(Path(scene_slots.__file__).parent.parent / "vehicles" / "reference.toml")
 WORLDS = ["mujoco", "reference"]
 RULES = Rules()
+
+
+@pytest.mark.parametrize("unfit", [object, scene_slots.SceneSlots.load, "a text"])
+def test_what_has_not_the_methods_of_a_simulator_is_refused(unfit):
+    with pytest.raises(ValueError, match="with the methods load, view, advance, collided_with"):
+        suite.register_simulator("unfit", unfit)
 
 
 def one(policy, track, world, rules=RULES):

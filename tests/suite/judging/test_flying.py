@@ -19,6 +19,7 @@ from eval.effects import EFFECTS
 from eval.judging.results import read_trials
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.worlds import WORLDS
+from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.trial import TrialSpec
 from policies import shipped
 from policies.contract import contract_of
@@ -365,7 +366,7 @@ def test_files_come_back_and_a_program_registers_names_for_its_process(tmp_path,
     for registry, value, register in (
         (EFFECTS, effect, suite.register_effect),
         (FAMILIES, lambda difficulty, rng: None, partial(suite.register_track, "mine")),
-        (WORLDS, type("Mine", (), {}), partial(suite.register_simulator, "mine")),
+        (WORLDS, type("Mine", (MujocoWorld,), {}), partial(suite.register_simulator, "mine")),
     ):
         for held in ("_entries", "_values"):
             monkeypatch.setattr(registry, held, dict(getattr(registry, held)))
