@@ -22,8 +22,8 @@ from eval.effects import (
     weak_motor,
     wind,
 )
-from eval.effects.interface import Effect, as_arrays, neutral
-from tracks.common.names import Registry
+from eval.effects.interface import SIGNALS, Effect, as_arrays, neutral
+from tracks.common.names import Registry, name_problem
 
 if TYPE_CHECKING:
     from eval.vehicles.vehicle import Vehicle
@@ -35,6 +35,10 @@ def _registration_error(name: str, effect: Any) -> str | None:
         return f"a {type(effect).__name__}; must be an eval.effects.interface.Effect"
     if effect.name != name:
         return f"its Effect is called {effect.name!r}; both names must be the same"
+    if problem := name_problem(name):
+        return problem
+    if unknown := [signal for signal in effect.needs if signal not in SIGNALS]:
+        return f"needs {unknown}; allowed is a tuple of {', '.join(SIGNALS)}"
     if (effect.start is None) != (effect.carry is None):
         return "a memory with only one of `start` and `carry`; it needs both"
     if not effect.in_flight and any(callable(p.neutral) for p in effect.parameters):

@@ -50,10 +50,15 @@ def parameter_problem(effect: Effect) -> str | None:
     """Return which bounds of the parameters contradict each other, or None."""
     for parameter in effect.parameters:
         low, absent, high = (bound_value(bound, EXAMPLE) for bound in _bounds(parameter))
-        if not (low < high and (low <= absent <= high or parameter.whole)):
+        if not (-np.inf < low < high < np.inf and (low <= absent <= high or parameter.whole)):
             return (
                 f"parameter {parameter.name!r} is from {low:g} to {high:g} and neutral at "
-                f"{absent:g}; needed is low <= neutral <= high, with low < high"
+                f"{absent:g}; needed is low <= neutral <= high, with low < high, all finite"
+            )
+        if not set(parameter.unseen) <= set(range(parameter.size)):
+            return (
+                f"parameter {parameter.name!r} has the unseen components {parameter.unseen}; "
+                f"allowed are numbers from 0, below its size ({parameter.size})"
             )
         if not 0.0 < parameter.typical[0] <= parameter.typical[1] < np.inf:
             return (

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 GRAVITY = 9.81
 """Magnitude of gravity [m/s^2]."""
+SIGNALS = ("acc_b", "command")
+"""Signals that an effect may need: an accelerometer; commands, for an effect between these and the
+rotor speeds."""
 
 
 class Constants(NamedTuple):
@@ -207,8 +210,7 @@ class Effect:
     """Whether the effect belongs to the log instead of the vehicle, even if it acts in the
     simulated flight (a tilted world frame)."""
     needs: tuple[str, ...] = ()
-    """Signals that a log must contain so that the effect is identifiable: `acc_b`, or `command` for
-    an effect between commands and rotor speeds."""
+    """Signals of `SIGNALS` that a log must contain so that the effect is identifiable."""
     rotor_acc: bool = False
     """Whether it uses `Flow.rotor_acc`."""
     slow: bool = False

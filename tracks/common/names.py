@@ -6,6 +6,7 @@ There are registries of effects, sensors, track families, log formats and simula
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -52,6 +53,13 @@ def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> ValueError:
     similar = [guess] if (guess := closest(name, allowed)) else _containing(name, allowed)
     hint = f" Did you mean {', '.join(map(repr, similar))}?" if similar else ""
     return ValueError(f"unknown {kind} {name[:LONGEST]!r}.{hint} Known: {', '.join(allowed)}.")
+
+
+def name_problem(name: str) -> str | None:
+    """Return why `name` cannot stand in files and lists on the command line, or None."""
+    if re.fullmatch(r"[A-Za-z0-9_-]+", name):
+        return None
+    return "its name is written into files; allowed are letters without accents, digits, _ and -"
 
 
 def _containing(name: str, allowed: list[str]) -> list[str]:

@@ -14,7 +14,7 @@ from numbers import Integral
 
 import numpy as np
 
-from tracks.common.names import Registry
+from tracks.common.names import Registry, name_problem
 from tracks.families import judged, random
 from tracks.families.layout import GATE_COUNT, Layout
 from tracks.geometry.scene import Counts, counts
@@ -31,7 +31,9 @@ FAMILIES: Registry[Callable[[float, np.random.Generator], Layout]] = Registry(
         "ellipse": judged.ellipse,
         "random": random.make,
     },
-    lambda _, make: None if callable(make) else f"{make!r}; must be a function (d, rng) -> Layout",
+    lambda name, make: (
+        name_problem(name) if callable(make) else f"{make!r}; must be a function (d, rng) -> Layout"
+    ),
 )
 """Name of a family -> function that draws its tracks."""
 JUDGED = ("zigzag", "circular", "ellipse")

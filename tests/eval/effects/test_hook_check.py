@@ -97,6 +97,8 @@ def test_a_hook_that_would_give_wrong_numbers_is_refused(force, said):
     ("changes", "said"),
     [
         ({"low": 1.0, "high": 0.0}, "from 1 to 0"),
+        ({"high": np.inf}, "all finite"),
+        ({"unseen": (3,)}, r"unseen components \(3,\)"),
         ({"neutral": -1.0}, "neutral at -1"),
         ({"neutral": np.nan}, "neutral at nan"),
         ({"typical": (0.2, 0.02)}, "usual sizes"),

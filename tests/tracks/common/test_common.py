@@ -27,6 +27,7 @@ from tracks.common.grid import Cell, html_table, markdown, rich_table, table
 from tracks.common.masks import everywhere, nowhere, select
 from tracks.common.names import Registry, closest, unknown_name
 from tracks.common.toml_table import read_toml, to_toml
+from tracks.families import FAMILIES, make_track
 
 KEYS = st.text("abcdefgh_", min_size=1, max_size=6)
 
@@ -205,6 +206,11 @@ def test_unknown_broken_and_wrong_entries_say_what_to_do(monkeypatch):
         found["a"]
     with pytest.raises(ValueError, match="thing 'nil'.*nothing there"):
         found.register("nil", 0)
+
+
+def test_a_family_whose_name_a_command_would_divide_is_refused():
+    with pytest.raises(ValueError, match="track family 'a,b' .*allowed are letters"):
+        FAMILIES.register("a,b", make_track)
 
 
 @pytest.mark.parametrize("replacing", [files.replacing_file, files.replacing_folder])
