@@ -131,7 +131,12 @@ _EXTRAS = {
 
 
 def contract_of(spec: PolicySpec, memory: tuple[int, ...] | None = None) -> Contract:
-    """Return the contract of a policy with `spec`; `memory` is the shape of its hidden state."""
+    """Return the contract of a policy with `spec`; `memory` is the shape of its hidden state.
+
+    Raises:
+        ValueError: for an impossible spec.
+    """
+    check_spec(spec)
     state = [
         Entry("velocity", 3, "m/s", BODY),
         Entry("world_z", 3, "1", BODY),

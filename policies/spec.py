@@ -14,7 +14,7 @@ import numpy as np
 
 from tracks.common.names import unknown_name
 from tracks.geometry.camera import Camera
-from tracks.input.ranges import Range, check_ranges
+from tracks.input.ranges import Range, check_ranges, check_type
 
 STATE_SIZE = 12
 """Number of numbers in the state of Su et al. 2026: velocity in body axes (3), third row of the
@@ -144,6 +144,14 @@ def check_spec(spec: PolicySpec, where: str = "spec.") -> None:
     Raises:
         ValueError: naming the key, its value and what is allowed.
     """
+    for key, kind in (("camera", Camera), ("depth", DepthEncoding), ("action", ActionSpec)):
+        check_type(f"{where}{key}", getattr(spec, key), (kind,), f"an object {kind.__name__}")
+    for key in ("scale", "offset"):
+        numbers = getattr(spec.action, key)
+        allowed = "a tuple of numbers, such as (20.0,)"
+        check_type(f"{where}action.{key}", numbers, (tuple,), allowed)
+    for key in EXTRAS:
+        check_type(f"{where}{key}", getattr(spec, key), (bool,), "True or False")
     check_ranges(spec, where)
     camera = spec.camera
     across, down = camera.rays * camera.width, camera.rays * camera.height

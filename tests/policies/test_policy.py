@@ -7,6 +7,7 @@ import os
 import shutil
 import sys
 from dataclasses import replace
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -139,6 +140,26 @@ def test_a_contract_comes_back_with_its_digest_and_gives_the_spec(spec):
     again = read_contract(contract.text, "here")
     assert again == contract and again.digest == contract.digest
     assert spec_of(again, "here") == dataclasses.replace(spec, hidden_size=4)
+
+
+@pytest.mark.parametrize(
+    ("said", "changes"),
+    [
+        (
+            r"action.scale is 20.0, allowed is a tuple",
+            {"action": ActionSpec(scale=cast(Any, 20.0))},
+        ),
+        (r"action.offset is \[0\], allowed is a tu", {"action": ActionSpec(offset=cast(Any, [0]))}),
+        ("kind of action 'CTBR'. Did you mean 'ctbr'", {"action": ActionSpec("CTBR")}),
+        ("action is 'ctbr', allowed is an object Act", {"action": "ctbr"}),
+        (r"camera is \(32, 24\), allowed is an object", {"camera": (32, 24)}),
+        ("second_gate is 'no', allowed is True or F", {"second_gate": "no"}),
+        ("rate_hz is '50', allowed is a number", {"rate_hz": "50"}),
+    ],
+)
+def test_an_impossible_spec_has_no_contract(said, changes):
+    with pytest.raises(ValueError, match=f"^spec.*{said}"):
+        contract_of(PolicySpec(**changes))
 
 
 def test_the_digest_is_one_for_one_meaning():
