@@ -103,10 +103,12 @@ def checked_act(
 ) -> tuple[np.ndarray, Hidden]:
     """Return what `Policy.act` returns; its actions are unchecked.
 
+    The policy gets copies of `state` and `image`, as it may write into them.
+
     Raises:
         ValueError: where that is not a tuple of two, or the action is a tensor with a gradient.
     """
-    output = policy.act(hidden, state, image, fresh)
+    output = policy.act(hidden, state.copy(), image.copy(), fresh)
     if not isinstance(output, tuple) or len(output) != 2:
         kind = f"{len(output)} values" if isinstance(output, tuple) else type(output).__name__
         raise ValueError(

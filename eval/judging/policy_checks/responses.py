@@ -9,7 +9,7 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.judging.guard import ActionLimits
 from policies.observation import encode_depth
-from policies.policy import Policy
+from policies.policy import Policy, checked_act
 from policies.spec import ACTION_SIZE, EXTRAS, STATE_SIZE, PolicySpec
 
 VEL_B, UP_B, GATE_B = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -115,8 +115,8 @@ def run(policy: Policy, state: np.ndarray, image: np.ndarray) -> tuple[np.ndarra
     hidden, outputs, action = policy.start(len(state)), [], flown
     for step in range(STEPS):
         fresh = np.full(len(state), step == 0)
-        output, hidden = policy.act(hidden, state, image, fresh)
-        outputs.append(output)
+        output, hidden = checked_act(policy, hidden, state, image, fresh)
+        outputs.append(np.array(output))  # it may write the next one into the same array
         action = np.asarray(spec.action.to_si(output), np.float32)
         norm = np.linalg.norm(action, axis=-1, keepdims=True)
         flown[:] = action * np.minimum(1.0, ActionLimits().size / np.maximum(norm, 1e-6))

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 import pytest
@@ -193,6 +194,30 @@ class Filtered(Pursuit):
 )
 def test_a_memory_that_outlives_a_trial_is_named(kept, fault):
     assert [note.fault for note in check_rows(Filtered(kept=kept))] == ([fault] if fault else [])
+
+
+class InPlace(Pursuit):
+    """Pursuit that scales its inputs, and gives its answers, each time in the same array."""
+
+    answer: Any = None
+
+    def act(self, hidden, state, image, fresh):
+        state *= np.float32(0.5)
+        image -= image.mean()
+        action, hidden = super().act(hidden, 2 * state, image, fresh)
+        if self.answer is None:
+            self.answer = action
+        self.answer[:] = action
+        return self.answer, hidden
+
+
+def test_a_policy_may_write_into_its_inputs():
+    expected, found = responses(Pursuit(gain=8.0)), responses(InPlace(gain=8.0))
+    for one, other in zip(expected, found, strict=True):
+        np.testing.assert_array_equal(one, other)
+    state, image = np.ones((1, 12), np.float32), np.ones((1, 24, 32), np.float32)
+    checked_act(InPlace(), np.zeros((1, 3)), state, image, np.ones(1, bool))
+    assert (state == 1.0).all() and (image == 1.0).all()
 
 
 def test_a_tensor_with_a_gradient_is_refused_by_name():
