@@ -108,8 +108,14 @@ def save_vehicle(vehicle: Vehicle, path: str | os.PathLike[str], comment: str = 
 
 
 def vehicle_table(vehicle: Vehicle) -> dict[str, Any]:
-    """Return `vehicle` as the nested table of its file: strings, numbers, lists and dicts."""
+    """Return `vehicle` as the nested table of its file: strings, numbers, lists and dicts.
+
+    Raises:
+        ValueError: for an unknown effect.
+    """
     camera, effects = vehicle.camera, {}
+    for name in vehicle.effects:
+        EFFECTS.find(name)
     for name in EFFECTS:
         if name in vehicle.effects:
             values = vehicle.effects[name]

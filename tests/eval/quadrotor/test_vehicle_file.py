@@ -8,10 +8,13 @@ import mujoco
 import numpy as np
 import pytest
 
+import suite
+from eval.effects import EFFECTS
 from eval.quadrotor import vehicle_file
 from eval.quadrotor.model import BODY, CAMERA, COLLIDES, compile_quadrotor, rotor_name
 from eval.vehicles.vehicle import MotorMap, command_of_thrust, motor_speed, motor_thrust
 from eval.vehicles.vehicle_check import check_vehicle
+from tests.support.pilots import Pursuit
 from tests.support.vehicles import PLAIN, drawn_effects, with_effects
 from tracks.common.provenance import stamp, stamp_text
 from tracks.common.toml_table import to_toml
@@ -125,6 +128,24 @@ def test_unreadable_files_are_refused(tmp_path):
         vehicle_file.load_vehicle(tmp_path)
     with pytest.raises(ValueError, match="Did you mean 'racer5'"):
         vehicle_file.load_vehicle("racer")
+
+
+@pytest.mark.parametrize(
+    ("effect", "drag", "said"),
+    [
+        ("linear_dragg", 0.3, "unknown effect 'linear_dragg'. Did you mean 'linear_drag'"),
+        ("linear_drag", -0.3, "must be from 0 to 5 1/s"),
+        ("linear_drag", np.nan, "is nan, allowed is a finite number"),
+    ],
+)
+def test_a_vehicle_of_a_program_is_checked_as_a_file_is(tmp_path, effect, drag, said):
+    values = EFFECTS["linear_drag"].values((drag,) * 3)
+    vehicle = replace(PLAIN, effects={effect: values})
+    with pytest.raises(ValueError, match=said):
+        suite.save_vehicle(vehicle, tmp_path / "it.toml")
+    with pytest.raises(ValueError, match=said):
+        suite.evaluate_policy(Pursuit(), trials=1, vehicle=vehicle)
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_weak_motor_has_an_index_or_a_scale_for_each_rotor():
