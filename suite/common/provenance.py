@@ -137,6 +137,7 @@ def write_run_record(
         **stamp(schema=1, seed=seed),
         "python": platform.python_version(),
         "packages": package_versions(),
+        "plugins": added_digest(),
         "machine": machine(),
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "config_type": _type_name(config),

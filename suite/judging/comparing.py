@@ -34,7 +34,7 @@ class Run(NamedTuple):
     inputs: dict[str, str]
     """Name of each input, such as the vehicle -> its SHA-256, which must be the same as well."""
     versions: dict[str, Any]
-    """Versions of the suite and of MuJoCo, which may change results."""
+    """Versions of the suite, of MuJoCo and of plugins, which may change results."""
     manner: str
     """End of the policy's label that says how it flew, such as "@0.5+monitor"; see `Manner`."""
     digest: str
@@ -58,7 +58,8 @@ def read_runs(folder: Path) -> list[Run]:
     conditions = {key: judged.get(key) for key in CONDITIONS}
     versions = {key: summary.get(key) for key in ("suite_version", "git_commit")}
     if (record := folder / "run.json").is_file():
-        versions["mujoco"] = read_json(record, packages=dict)["packages"].get("mujoco")
+        run = read_json(record, packages=dict)
+        versions |= {"mujoco": run["packages"].get("mujoco"), "plugins": run.get("plugins")}
     names = list(dict.fromkeys(row.policy for row in results))
     flown = manners(judged.get("speed") or (), bool(judged.get("monitor")))
     endings = sorted((manner.label("") for manner in flown), key=len, reverse=True)

@@ -252,11 +252,15 @@ def test_an_estimate_is_said_in_figures_for_people_and_missing_memory_is_warned_
     assert [size(b) for b in (5, 812e3, 2.06e9)] == ["5 B", "812 kB", "2.1 GB"]
 
 
-def test_a_run_record_holds_what_is_needed_to_repeat_it(tmp_path):
+def test_a_run_record_holds_what_is_needed_to_repeat_it(tmp_path, monkeypatch):
     config = Estimate(seconds=1.0, memory_bytes=2.0)
+    monkeypatch.setattr("suite.common.provenance.added_digest", lambda: "of a plugin")
     write_run_record(tmp_path, config, seed=3)
     record = json.loads((tmp_path / "run.json").read_text())
-    assert record["config"] == {"seconds": 1.0, "memory_bytes": 2.0}
+    assert record["plugins"] == "of a plugin" and record["config"] == {
+        "seconds": 1.0,
+        "memory_bytes": 2.0,
+    }
     assert record["seed"] == 3 and record["schema"] == 1
     assert set(record) >= {"suite_version", "git_commit", "python", "packages", "machine"}
     assert record["config_type"] == "suite.common.stages.Estimate"

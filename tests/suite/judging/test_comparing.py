@@ -179,9 +179,11 @@ def test_rows_of_other_speeds_or_the_monitor_are_no_training_seeds(tmp_path):
 def test_other_versions_are_noted(tmp_path, capsys):
     folders = [run_of(tmp_path / name, [True, False]) for name in "ab"]
     for folder, version in zip(folders, ("3.3.0", "3.4.0"), strict=True):
-        (folder / "run.json").write_text(json.dumps({"packages": {"mujoco": version}}))
+        run = {"packages": {"mujoco": version}, "plugins": version[2]}
+        (folder / "run.json").write_text(json.dumps(run))
     compare.run(compare.Config(tuple(folders)), Quiet())
-    assert "(mujoco: 3.3.0, 3.4.0)" in " ".join(capsys.readouterr().err.split())
+    words = " ".join(capsys.readouterr().err.split())
+    assert "(mujoco: 3.3.0, 3.4.0)" in words and "(plugins: 3, 4)" in words
 
 
 def test_runs_of_one_policy_or_of_other_speeds_are_noted(tmp_path, capsys):
