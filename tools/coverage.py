@@ -39,6 +39,7 @@ from eval.flights.trajectory import Trajectory
 from eval.judging.statistics import wilson
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import MotorMap
+from suite.diagnose.identify.drive import KNOWN_MOTORS, torque_ratios
 from suite.diagnose.identify.identify import identify
 from tracks.geometry.rotation import exp_rot, rot_to_quat
 
@@ -124,7 +125,8 @@ def truths(fleet: Fleet, drive: str, identified: str = "xyz") -> Mapping[str, tu
     Only ratios of some numbers are identifiable. So the torque coefficient is the one that belongs
     to the file's other numbers. If the inertia about z is not among the axes `identified`, it is
     scaled like those that are. The thrust coefficient is identifiable from rotor speeds only. The
-    coefficient of flapping depends on the rotor speeds, and so on the thrust coefficient.
+    coefficient of flapping depends on the rotor speeds, and so on the thrust coefficient. A scale
+    of the thrust in the file scales the torques of its rate loop too.
     """
     true, begun = fleet.truth, start()
     assert true.motors is not None
@@ -138,6 +140,7 @@ def truths(fleet: Fleet, drive: str, identified: str = "xyz") -> Mapping[str, tu
     if drive != "rotors":
         ratio_t = begun.rotors.thrust_coefficient / true.rotors.thrust_coefficient
         twist, flapping = twist * ratio_t, flapping * ratio_t**0.5
+    ratios = torque_ratios(1.0 if drive in KNOWN_MOTORS else fleet.scale)
     return {
         "motors.thrust": true.motors.thrust,
         "motors.voltage_exponent": (true.motors.voltage_exponent,),
@@ -149,7 +152,7 @@ def truths(fleet: Fleet, drive: str, identified: str = "xyz") -> Mapping[str, tu
         "rotors.thrust_coefficient": (true.rotors.thrust_coefficient,),
         "rotors.torque_coefficient": (twist,),
         "rotors.time_constant": (true.rotors.time_constant,),
-        "controller.rate_gain": true.controller.rate_gain,
+        "controller.rate_gain": tuple(true.controller.rate_gain / ratios),
     }
 
 

@@ -11,6 +11,7 @@ from dm_control.mujoco import wrapper
 from dm_control.rl import control
 from dm_env import specs
 
+from eval.effects import without_signal
 from eval.envs.race import ACTION_LIMIT, Race
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
@@ -115,6 +116,7 @@ def load(
     rules = Rules() if rules is None else rules
     check_rules(rules)
     vehicle = vehicle or load_vehicle("reference")
+    warn_of(without_signal(vehicle))
     if track is not None:
         warn_of(course_notes(track.family, track, vehicle))
     track = track or make_track(family, level, seed)

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from eval.effects import without_signal
 from eval.envs.race import (
     ACTION_LIMIT,
     CRASH_REWARD,
@@ -231,6 +232,7 @@ class Races:
         if not self._file_track:
             check_family(self._track)
         vehicle = self._vehicle = resolved_vehicle(config, np.random.default_rng(0))
+        warn_of(without_signal(vehicle))
         self.spec = resolved_spec(config, vehicle)
         check_spec(self.spec)
         check_rate("the spec", self.spec.rate_hz, vehicle.controller.frequency)
@@ -350,8 +352,7 @@ class Races:
         )  # fmt: skip
         reward = np.zeros(self.slots)
         for name, (default, term) in REWARDS.items():
-            weight = self.config.rewards.get(name, default)
-            if weight:
+            if weight := self.config.rewards.get(name, default):
                 reward = reward + weight * term(moments)
         return reward
 

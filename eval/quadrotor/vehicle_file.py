@@ -41,6 +41,9 @@ KEYS = (
 )
 """Keys and tables at the top of a file."""
 
+UNUSED_GAIN = (1.0, 1.0, 1.0)
+"""The nominal loop's gain of a vehicle with a firmware's loop, where its file gives none [1/s]."""
+
 
 class VehicleFileError(ValueError):
     """A vehicle file is refused; the message has the key and what is allowed."""
@@ -104,6 +107,8 @@ def save_vehicle(vehicle: Vehicle, path: str | os.PathLike[str], comment: str = 
     check_type("comment", comment, (str,), "a text")
     table = vehicle_table(vehicle)
     parse_vehicle(table)
+    if "kind" in table["controller"] and vehicle.controller.rate_gain == UNUSED_GAIN:
+        del table["controller"]["rate_gain"]  # a number that nobody gave, should `kind` become p
     write_text(as_path("path", path), toml_head(comment, SCHEMA) + to_toml(table))
 
 
@@ -200,7 +205,7 @@ def _controller(table: Table) -> Controller:
         settings_table, extra_keys = table.table(module.GROUP, {}), [module.GROUP]
         settings_table.expect(keys)
     # A firmware's loop does not use the nominal loop's gain, so the key may be missing.
-    fixed = {} if table.has("rate_gain") else {"rate_gain": (1.0, 1.0, 1.0)}
+    fixed = {} if table.has("rate_gain") else {"rate_gain": UNUSED_GAIN}
     controller = table.read(Controller, ["kind", *extra_keys], kind=kind, settings=None, **fixed)
     settings = {key: settings_table.value(key, float) for key in keys if settings_table.has(key)}
     for key, value in settings.items():

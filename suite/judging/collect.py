@@ -87,9 +87,10 @@ def collect(
         Journal(out / JOURNAL, identity).close()
     _refuse_other_logs(out, trial_set)
     with Journal(out / JOURNAL, identity) as journal:
-        as_flown = _write_vehicle(collection, trial_set.vehicle, out, console)
+        described = _write_vehicle(collection, trial_set.vehicle, out, console)
+        as_flown = None if described is trial_set.vehicle else AS_FLOWN
         rows |= {t: row for t, r in journal.done.items() if (row := _row(out, r)) is not None}
-        _fly_missing(collection, trial_set, policy, out, rows, journal, console, workers)
+        _fly_missing(collection, trial_set, policy, described, out, rows, journal, console, workers)
         flights = [rows[trial] for trial in trial_set.trials]
         made = {"as_flown": as_flown, "flights": flights}
         listing = {**stamp(1, collection.seed), **settings, **made}
@@ -114,20 +115,20 @@ def collect(
 
 def _write_vehicle(
     collection: Collection, vehicle: Vehicle, out: Path, console: Console
-) -> str | None:
-    """Write the vehicle file that describes the flights, if `vehicle` does not; return its name.
+) -> Vehicle:
+    """Return the vehicle that describes the flights; write its file if it is not `vehicle`.
 
-    It is not written, with a warning, if a value is beyond the bounds of vehicle files.
+    With a value beyond the bounds of vehicle files it is `vehicle` too, with a warning.
     """
     described = nearest(collection.simulator, vehicle)
     if vehicle_table(described) == vehicle_table(vehicle):
-        return None
+        return vehicle
     try:
         save_vehicle(described, out / AS_FLOWN, f"flights of the simulator {collection.simulator}")
     except ValueError as error:
         console.note(f"warning: no vehicle file describes these flights: {error}")
-        return None
-    return AS_FLOWN
+        return vehicle
+    return described
 
 
 Row = dict[str, Any]
@@ -138,13 +139,14 @@ def _fly_missing(
     collection: Collection,
     trial_set: TrialSet,
     policy: Policy,
+    described: Vehicle,
     out: Path,
     rows: dict[TrialSpec, Row],
     journal: Journal,
     console: Console,
     workers: Workers | None,
 ) -> None:
-    """Fly the trials that are missing in `rows`.
+    """Fly the trials that are missing in `rows`; the vehicle `described` is that of the logs.
 
     When a flight ends, write its log, its line in the journal and its row.
     """
@@ -159,7 +161,7 @@ def _fly_missing(
         def keep(result: TrialResult, flight: Flight | None) -> None:
             name = None
             if flight is not None and result.time_s >= DURATION_MIN:
-                name = _write_log(out, result, flight, trial_set.vehicle, console)
+                name = _write_log(out, result, flight, described, console)
             if name is None:  # a log of an earlier collection may have this name
                 _log_path(out, result.trial).unlink(missing_ok=True)
             rows[result.trial] = {"file": name, **result._asdict()}
@@ -190,11 +192,12 @@ def _log_path(out: Path, trial: TrialSpec) -> Path:
 def _write_log(
     out: Path, result: TrialResult, flight: Flight, vehicle: Vehicle, console: Console
 ) -> str | None:
-    """Write a log, with the log faults of `vehicle`, and return its name.
+    """Write a log, with the name and the log faults of `vehicle`, and return its name.
 
     It is None, with a warning, if the log is refused.
     """
     path = _log_path(out, result.trial)
+    flight = flight._replace(about={**flight.about, "vehicle": vehicle.name})
     logged = flight._replace(**apply_log_faults(vehicle.effects, flight._asdict()))
     try:
         write_flight(path, log_from_flight(logged, path.name))

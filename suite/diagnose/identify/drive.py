@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from eval.effects import EFFECTS
+from eval.quadrotor.loops import NOMINAL
 from eval.quadrotor.plant import Wrench, accelerations, make_plant
 from eval.vehicles.vehicle import MotorMap, Vehicle, motor_speed
 from eval.vehicles.vehicle_check import check_vehicle
@@ -41,10 +42,6 @@ LEAST_VOLTS = 0.1
 """Lower measured voltages are raised to this, so that a power of them is finite [V]."""
 Accelerations = Callable[[FlightGrid, FlightRows], tuple[np.ndarray, np.ndarray]]
 """Function that returns dv/dt in world axes and dw/dt in body axes on each row, (G, 3) each."""
-MERGED = ("motor_lag", "inertia_scale", "rate_gain")
-"""Effects that scale or replace a fitted number."""
-FITTED = ("linear_drag", "blade_flapping", "command_delay", "thrust_scale")
-"""Effects whose parameters are fitted themselves, starting from their values in the file."""
 
 
 def common_drive(flights: Sequence[FlightGrid]) -> str:
@@ -246,30 +243,37 @@ def filled(values: np.ndarray) -> np.ndarray:
 def with_merged_effects(vehicle: Vehicle, known_motors: bool) -> Vehicle:
     """Return `vehicle` with its effects that scale a fitted number merged into that number.
 
-    It flies as before. Otherwise they would scale the fitted number once more. With `known_motors`,
-    `thrust_scale` is one of them.
+    Otherwise they would scale the fitted number once more. With `known_motors`, `thrust_scale` is
+    one of them. The same rotor speeds turn and lift the vehicle as before, and the nominal rate
+    loop responds as before. The gain of a firmware's loop is not fitted, so its effect stays.
 
     Raises:
         ValueError: if a merged number is not allowed in a vehicle file, such as the thrust of
             rotors that are too weak to hover.
     """
-    names = (*MERGED, "thrust_scale") if known_motors else MERGED
+    controller = vehicle.controller
+    names = [*(["rate_gain"] if controller.kind == NOMINAL else []), "motor_lag", "inertia_scale"]
+    names += ["thrust_scale"] if known_motors else []
     merged = {name: values for name, values in vehicle.effects.items() if name in names}
     if not merged:
         return vehicle
     rotors, motors = vehicle.rotors, vehicle.motors
-    scaled = make_plant(vehicle, 1.0 / vehicle.controller.frequency, merged).constants
+    scaled = make_plant(vehicle, 1.0 / controller.frequency, merged).constants
     thrust_coefficient = float(scaled.thrust_coefficient[0])
+    thrust_ratio = thrust_coefficient / rotors.thrust_coefficient
     if motors is not None:
-        thrust_ratio = thrust_coefficient / rotors.thrust_coefficient
         first, second = np.asarray(motors.thrust) * thrust_ratio
         motors = replace(motors, thrust=(float(first), float(second)))
+    if controller.kind == NOMINAL:
+        # The loop multiplies by the file's inertia, which was another than the body's.
+        torque_ratio = torque_ratios(thrust_ratio) * vehicle.inertia / scaled.inertia
+        controller = replace(controller, rate_gain=_triple(scaled.rate_gain * torque_ratio))
     lag_s = float(scaled.time_constant)
     result = replace(
         vehicle,
         rotors=replace(rotors, thrust_coefficient=thrust_coefficient, time_constant=lag_s),
         motors=motors,
-        controller=replace(vehicle.controller, rate_gain=_triple(scaled.rate_gain)),
+        controller=controller,
         effects=MappingProxyType({n: v for n, v in vehicle.effects.items() if n not in merged}),
     )
     try:
@@ -279,13 +283,20 @@ def with_merged_effects(vehicle: Vehicle, known_motors: bool) -> Vehicle:
     return replace(result, inertia=_triple(possible_inertia(scaled.inertia)))
 
 
+def torque_ratios(thrust_scale: float) -> np.ndarray:
+    """Return the ratios (3,) of true to commanded torque with this scale of all thrusts.
+
+    The torque about z does not come from the thrusts.
+    """
+    return np.array([thrust_scale, thrust_scale, 1.0])
+
+
 def unmodelled_effects(vehicle: Vehicle) -> list[str]:
     """Return the vehicle's effects that the fits of force and torque do not model, by name."""
     return [
         name
         for name in vehicle.effects
-        if (not EFFECTS[name].by_state or EFFECTS[name].late is not None)
-        and name not in (*MERGED, *FITTED)
+        if not EFFECTS[name].by_state or EFFECTS[name].late is not None
     ]
 
 

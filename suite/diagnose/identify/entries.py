@@ -14,7 +14,12 @@ from eval.effects import EFFECTS
 from eval.effects.interface import bound_value
 from eval.vehicles.vehicle import Vehicle
 from eval.vehicles.vehicle_check import check_vehicle
-from suite.diagnose.identify.drive import DrivenVehicle, possible_inertia
+from suite.diagnose.identify.drive import (
+    KNOWN_MOTORS,
+    DrivenVehicle,
+    possible_inertia,
+    torque_ratios,
+)
 from suite.diagnose.identify.fit import Z95, Fitted
 from suite.diagnose.identify.numbers import DELAY, Number
 from tracks.common.figures import with_unit
@@ -49,7 +54,12 @@ def entries_of(driven: DrivenVehicle, fitted: Fitted, log_thrust: float = 0.0) -
         return possible_inertia(driven.vehicle(n).inertia)
 
     def rate_gain(n: Mapping[str, float]) -> np.ndarray:
-        return np.asarray(driven.start.controller.rate_gain) * np.exp([n[name] for name in GAINS])
+        gains = np.asarray(driven.start.controller.rate_gain) * np.exp([n[name] for name in GAINS])
+        if driven.drive in KNOWN_MOTORS:
+            return gains
+        # The effect `thrust_scale` of the file scales the torques as well.
+        fits = [fitted.identifies(name) for name in GAINS]
+        return np.where(fits, gains / torque_ratios(float(np.exp(log_thrust))), gains)
 
     def twist(n: Mapping[str, float]) -> float:
         numbers = {name: n[name] for name in (*identified, "yaw")}

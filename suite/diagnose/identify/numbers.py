@@ -225,6 +225,9 @@ def notes_on(
             f"no voltage in {', '.join(sorted(without_voltage))}: these flights do not count where "
             "the motors' thrust does"
         )
+    merged = [name for name in start.effects if name not in {*identified.effects, "command_delay"}]
+    if merged:
+        lines.append(f"effects merged into other numbers of the new file: {', '.join(merged)}")
     motors, before = identified.motors, start.motors
     has_voltage = any(flight.has("voltage") for flight in flights)
     if has_voltage and motors is not None and (before is None or motors.voltage != before.voltage):

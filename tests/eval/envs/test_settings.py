@@ -14,6 +14,7 @@ import pytest
 
 import suite
 import tracks
+from eval.effects.thrust import BatterySag
 from eval.effects.wind import Gusts
 from eval.envs.gymnasium_env import RaceEnv, RaceVectorEnv
 from eval.quadrotor.vehicle_file import load_vehicle
@@ -161,6 +162,13 @@ def test_a_probable_mistake_in_a_track_file_is_a_warning(tmp_path):
             make()
     path.write_text(text.format(1.0))
     RaceEnv(track=path), load(track=load_track(path))  # a warning is an error here
+
+
+def test_what_acts_on_no_flight_is_a_warning_as_in_suite_eval():
+    sagging = with_effects(VEHICLE, {"battery_sag": BatterySag(0.0, 0.1)})
+    for make in (lambda: RaceEnv(vehicle=sagging), lambda: load(vehicle=sagging)):
+        with pytest.warns(UserWarning, match="battery_sag: acts only on logs with a voltage"):
+            make()
 
 
 @pytest.mark.parametrize("seed", [(1, 2), np.array([1, 2]), [1, 2]])

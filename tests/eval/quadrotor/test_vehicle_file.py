@@ -50,6 +50,23 @@ def test_every_effect_survives_a_round_trip(tmp_path):
     assert f"# {stamp_text(stamp(1, None))}\n" in (tmp_path / "v.toml").read_text()
 
 
+def test_a_gain_that_a_file_lacks_is_not_made_up_when_it_is_written(tmp_path):
+    """With `kind` p again, a gain of 1 that nobody gave would fly."""
+    path, crazyflie = tmp_path / "v.toml", vehicle_file.load_vehicle("crazyflie21")
+    vehicle_file.save_vehicle(crazyflie, path)
+    assert vehicle_file.load_vehicle(path) == crazyflie
+    table = vehicle_file.vehicle_table(crazyflie)
+    del table["controller"]["rate_gain"]
+    without = vehicle_file.parse_vehicle(table)
+    vehicle_file.save_vehicle(without, path)
+    assert vehicle_file.load_vehicle(path) == without
+    path.write_text(
+        path.read_text().partition("[controller.pid_rate]")[0].replace("crazyflie", "p")
+    )
+    with pytest.raises(vehicle_file.VehicleFileError, match=r"\[controller\] has no 'rate_gain'"):
+        vehicle_file.load_vehicle(path)
+
+
 def test_arrays_are_written_as_numbers(tmp_path):
     vehicle = with_effects(linear_drag=(np.array([0.1, 0.2, 0.3]),), mass_offset=(np.array(0.1),))
     vehicle_file.save_vehicle(vehicle, tmp_path / "v.toml")

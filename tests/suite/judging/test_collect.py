@@ -118,6 +118,10 @@ def test_a_simulator_that_differs_from_the_vehicle_file_writes_the_file_that_des
     assert described.effects.keys() == flown.effects.keys() >= {"hub_drag"}
     for name, values in described.effects.items():
         np.testing.assert_array_equal(np.hstack(values), np.hstack(flown.effects[name]), name)
+    monkeypatch.setattr("suite.judging.collect.nearest", lambda *_: flown)
+    assert run(TWO, "--policy", pilots["pursuit"], "--out", tmp_path / "named") == 0
+    log = read_flight(tmp_path / "named" / "zigzag-0-7.parquet")
+    assert log.about["vehicle"] == flown.name, "a diagnosis by this file has nothing to warn of"
     beyond = with_effects(flown, rotor_drag=(1.0,))
     monkeypatch.setattr("suite.judging.collect.nearest", lambda *_: beyond)
     assert run(*line, "--policy", pilots["diver"], "--out", tmp_path / "beyond") == 0

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from eval.logs.flight_log import write_flight
-from eval.quadrotor.plant import make_plant
+from eval.quadrotor.loops import KINDS
+from eval.quadrotor.plant import Command, make_plant
+from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import MotorMap
 from suite.common.console import Console
 from suite.diagnose.identify import drive, entries, run
@@ -146,18 +148,53 @@ def test_flights_without_a_common_drive_or_a_scale_that_cannot_hover_are_refused
     assert drive.with_merged_effects(slow, False) == slow
 
 
-def test_effects_that_are_part_of_a_number_are_merged_and_the_vehicle_flies_as_before():
-    effects = {"motor_lag": (0.05,), "thrust_scale": (0.9,), "clock_offset": (0.01,)}
-    scales = {"inertia_scale": ((1.2, 0.9, 1.1),), "rate_gain": ((0.8, 1.0, 1.3),)}
-    before = with_effects(**effects, **scales)
+def turn_b(vehicle):
+    """The angular acceleration of a body at rest by its rate loop, for a small command."""
+    plant, at_rest = make_plant(vehicle, 0.002), np.zeros(3)
+    command = Command(np.asarray(9.81), np.array([0.3, -0.2, 0.1]))
+    speed = np.tile(wanted_speed(plant, command, at_rest), (400, 1))
+    flight = FlightGrid("made", TIME, {"rotor_speed": speed})
+    return drive.DrivenVehicle(vehicle, "rotors").accelerations({})(flight, flight.rows(False))[1]
+
+
+MERGED = {
+    **{"motor_lag": (0.05,), "thrust_scale": (0.9,), "clock_offset": (0.01,)},
+    **{"inertia_scale": ((1.2, 0.9, 1.1),), "rate_gain": ((0.8, 1.0, 1.3),)},
+}
+
+
+def test_effects_that_are_part_of_a_number_are_merged_and_the_vehicle_turns_as_before():
+    before = with_effects(**MERGED)
     after = drive.with_merged_effects(before, True)
     assert list(after.effects) == ["clock_offset"] == list(drive.unmodelled_effects(after))
     old, new = (make_plant(vehicle, 0.002).constants for vehicle in (before, after))
-    names = ("inertia", "time_constant", "rate_gain", "thrust_coefficient", "torque_coefficient")
-    for name in names:
+    for name in ("inertia", "time_constant", "thrust_coefficient", "torque_coefficient"):
         np.testing.assert_allclose(getattr(new, name), getattr(old, name))
+    np.testing.assert_allclose(turn_b(after), turn_b(before), rtol=1e-9)
     # A scale of the commanded thrust stays where no motor is known.
-    assert "thrust_scale" in drive.with_merged_effects(before, False).effects
+    commanded = drive.with_merged_effects(before, False)
+    assert "thrust_scale" in commanded.effects
+    np.testing.assert_allclose(turn_b(commanded), turn_b(before), rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_the_loop_of_a_firmware_keeps_its_settings_and_its_effect(kind):
+    """Its gain has no key that the effect could be merged into; `rate_gain` is another loop's."""
+    loop = replace(PLAIN.controller, kind=kind, settings=KINDS[kind].Settings())
+    del (effects := dict(MERGED))["thrust_scale"]
+    before = with_effects(replace(PLAIN, controller=loop), **effects)
+    after = drive.with_merged_effects(before, True)
+    assert list(after.effects) == ["clock_offset", "rate_gain"] and after.controller == loop
+    np.testing.assert_allclose(turn_b(after), turn_b(before), rtol=1e-9)
+
+
+@pytest.mark.parametrize(("driven_by", "gains"), [("rates", (25, 20, 8)), ("rotors", (20, 20, 8))])
+def test_the_gain_in_the_file_allows_for_the_thrust_scale_there(driven_by, gains):
+    """A thrust of 0.8 turns the body 0.8 times as fast, and a gain that is not seen stays."""
+    axes = known.fitted(entries.GAINS, left=["gain_y"])
+    (found,) = entries.entries_of(drive.DrivenVehicle(PLAIN, driven_by), axes, np.log(0.8))
+    assert found.key == "controller.rate_gain"
+    np.testing.assert_allclose(found.value, gains)
 
 
 @pytest.mark.slow
