@@ -14,6 +14,7 @@ import numpy as np
 
 from eval.judging.results import read_trials
 from eval.judging.statistics import Interval, over_seeds, paired_success, wilson
+from eval.judging.tables import rate_text
 from eval.worlds.trial import TrialResult, TrialSpec
 from suite.judging.flying import manners
 from tracks.input.reading import read_json
@@ -170,7 +171,7 @@ def paired_sentence(name_a: str, name_b: str, a: np.ndarray, b: np.ndarray) -> s
     difference = paired_success(a, b)
     value, low, high = (100 * number for number in difference[:3])
     return (
-        f"{name_a} succeeded in {100 * a.mean():.1f} % and {name_b} in {100 * b.mean():.1f} % "
+        f"{name_a} succeeded in {rate_text(a.mean(), 1)} % and {name_b} in {rate_text(b.mean(), 1)} % "
         f"of the same {len(a)} trials: {name_a} minus {name_b} is {value:+.1f} percentage points "
         f"(paired, 95 % interval {low:+.1f} to {high:+.1f}, Newcombe 1998; exact McNemar test, "
         f"p = {difference.p_value:.2g})."
@@ -238,7 +239,7 @@ def _seeds_sentence(
     value, low, high = (100 * number for number in interval)
     count = " and ".join(str(len(group)) for group in rates)
     means = " and ".join(
-        f"{100 * np.mean(group):.1f} % (standard deviation over seeds "
+        f"{rate_text(np.mean(group), 1)} % (standard deviation over seeds "
         f"{100 * np.std(group, ddof=1):.1f} percentage points)"
         for group in rates
     )

@@ -11,7 +11,7 @@ from eval.judging.results import write_results
 from eval.judging.statistics import over_seeds, paired_success, wilson
 from suite.commands import compare
 from suite.common.console import Quiet
-from suite.judging.comparing import compare_runs, compare_seeds, read_runs
+from suite.judging.comparing import compare_runs, compare_seeds, paired_sentence, read_runs
 from suite.judging.requests import Evaluation
 from tests.support import commands
 from tests.support.judged_cells import result
@@ -174,6 +174,12 @@ def test_rows_of_other_speeds_or_the_monitor_are_no_training_seeds(tmp_path):
     for run in unlike:
         with pytest.raises(ValueError, match="are no training seeds of one method"):
             compare_seeds([plain, run])
+
+
+def test_a_sentence_prints_no_rate_with_a_failure_as_100_percent():
+    failed_once = np.arange(3000) > 0
+    said = paired_sentence("a", "b", failed_once, ~failed_once)
+    assert "a succeeded in 99.97 % and b in 0.03 % of the same 3000 trials" in said
 
 
 def test_other_versions_are_noted(tmp_path, capsys):
