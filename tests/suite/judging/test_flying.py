@@ -205,12 +205,12 @@ def test_trials_and_slow_worlds_take_more_processes_and_seconds(monkeypatch):
     assert slow.seconds > 3 * quick.seconds
 
 
-def test_a_cluster_is_given_the_policy_and_this_machines_processes_its_name(policy):
+def test_other_processes_are_given_the_content_of_the_policy(policy):
+    content = PolicyContent.of("race-paper")
     alone, here, there = (
-        flying.policy_for_workers(policy, "race-paper", False, workers)
-        for workers in (1, 2, "tcp://a:1")
+        flying.policy_for_workers(policy, content, workers) for workers in (1, 2, "tcp://a:1")
     )
-    assert alone is policy and len(pack(here)) < 1000 < 100_000 < len(pack(there))
+    assert alone is policy and pack(here) == pack(there) and len(pack(here)) > 100_000
 
 
 def test_what_a_world_flies_otherwise_is_said_once_and_written(
@@ -298,6 +298,23 @@ def test_a_digest_changes_with_any_byte_of_what_flies_and_no_other(tmp_path):
         (tmp_path / "w.bin").write_bytes(np.full(300, scale, np.float32).tobytes())
         seen.append(policy_digest(str(path)))
     assert len(set(seen)) == 2
+
+
+def test_trainings_that_differ_in_the_seed_only_have_the_same_settings(tmp_path):
+    (tmp_path / "weights.safetensors").touch()
+    digests = []
+    for training in (
+        {"config": {"seed": 0, "rate": 1.0}, "iteration": 9},
+        {"config": {"seed": 1, "rate": 1.0}, "iteration": 9},
+        {"config": {"seed": 0, "rate": 2.0}, "iteration": 9},
+        {"config": {"seed": 0, "rate": 1.0}, "iteration": 8},
+        {},
+        [],
+    ):
+        (tmp_path / "config.json").write_text(json.dumps({"training": training}))
+        digests.append(PolicyContent.of(tmp_path).settings_digest)
+    assert digests[0] == digests[1] and len(set(digests[1:4])) == 3 and digests[4:] == [None] * 2
+    assert PolicyContent.of("race").settings_digest
 
 
 def test_an_onnx_file_behind_a_link_comes_with_its_weights(tmp_path):
