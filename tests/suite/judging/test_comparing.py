@@ -60,10 +60,10 @@ def test_the_interval_of_a_small_layout_is_that_of_its_mean_squares_and_one_seed
             over_seeds(*values)
 
 
-def run_of(folder, successes, judged=None, policy="ours", weights=None, **digests):
+def run_of(folder, successes, judged=None, policy="ours", weights=None, settings=None, **digests):
     rows = [result(seed, bool(success), policy) for seed, success in enumerate(successes)]
     summary = {"judged": judged or Evaluation(), "sha256": {"vehicle": "a", **digests}}
-    summary["policies"] = [{"sha256": weights or str(folder)}]
+    summary["policies"] = [{"sha256": weights or str(folder), "settings_sha256": settings}]
     write_results(folder, rows, table_markdown="", summary=summary, seed=0)
     return folder
 
@@ -180,6 +180,22 @@ def test_a_sentence_prints_no_rate_with_a_failure_as_100_percent():
     failed_once = np.arange(3000) > 0
     said = paired_sentence("a", "b", failed_once, ~failed_once)
     assert "a succeeded in 99.97 % and b in 0.03 % of the same 3000 trials" in said
+
+
+def test_seeds_of_several_settings_are_noted(tmp_path, capsys):
+    unknown, a, b, other = (
+        run_of(tmp_path / f"{index}", [True, False], settings=settings)
+        for index, settings in enumerate((None, "x", "x", "y"))
+    )
+    for config, is_noted in (
+        (compare.Config((unknown, a, b), seeds=True), False),
+        (compare.Config((unknown, a, other), seeds=True), True),
+        (compare.Config((a, b), against=(other, unknown)), False),
+        (compare.Config((a, other)), False),
+    ):
+        compare.run(config, Quiet())
+        said = " ".join(capsys.readouterr().err.split())
+        assert ("1 and " in said and "trained with different settings" in said) == is_noted
 
 
 def test_other_versions_are_noted(tmp_path, capsys):
