@@ -12,6 +12,7 @@ from eval.judging.statistics import over_seeds, paired_success, wilson
 from suite.commands import compare
 from suite.common.console import Quiet
 from suite.judging.comparing import compare_runs, compare_seeds, paired_sentence, read_runs
+from suite.judging.content import PolicyContent
 from suite.judging.requests import Evaluation
 from tests.support import commands
 from tests.support.judged_cells import result
@@ -180,6 +181,23 @@ def test_a_sentence_prints_no_rate_with_a_failure_as_100_percent():
     failed_once = np.arange(3000) > 0
     said = paired_sentence("a", "b", failed_once, ~failed_once)
     assert "a succeeded in 99.97 % and b in 0.03 % of the same 3000 trials" in said
+
+
+def test_trainings_that_differ_in_the_seed_only_have_the_same_settings(tmp_path):
+    (tmp_path / "weights.safetensors").touch()
+    digests = []
+    for training in (
+        {"config": {"seed": 0, "rate": 1.0}, "iteration": 9},
+        {"config": {"seed": 1, "rate": 1.0}, "iteration": 9},
+        {"config": {"seed": 0, "rate": 2.0}, "iteration": 9},
+        {"config": {"seed": 0, "rate": 1.0}, "iteration": 8},
+        {},
+        [],
+    ):
+        (tmp_path / "config.json").write_text(json.dumps({"training": training}))
+        digests.append(PolicyContent.of(tmp_path).settings_digest)
+    assert digests[0] == digests[1] and len(set(digests[1:4])) == 3 and digests[4:] == [None] * 2
+    assert PolicyContent.of("race").settings_digest
 
 
 def test_seeds_of_several_settings_are_noted(tmp_path, capsys):

@@ -300,23 +300,6 @@ def test_a_digest_changes_with_any_byte_of_what_flies_and_no_other(tmp_path):
     assert len(set(seen)) == 2
 
 
-def test_trainings_that_differ_in_the_seed_only_have_the_same_settings(tmp_path):
-    (tmp_path / "weights.safetensors").touch()
-    digests = []
-    for training in (
-        {"config": {"seed": 0, "rate": 1.0}, "iteration": 9},
-        {"config": {"seed": 1, "rate": 1.0}, "iteration": 9},
-        {"config": {"seed": 0, "rate": 2.0}, "iteration": 9},
-        {"config": {"seed": 0, "rate": 1.0}, "iteration": 8},
-        {},
-        [],
-    ):
-        (tmp_path / "config.json").write_text(json.dumps({"training": training}))
-        digests.append(PolicyContent.of(tmp_path).settings_digest)
-    assert digests[0] == digests[1] and len(set(digests[1:4])) == 3 and digests[4:] == [None] * 2
-    assert PolicyContent.of("race").settings_digest
-
-
 def test_an_onnx_file_behind_a_link_comes_with_its_weights(tmp_path):
     folder = tmp_path / "real"
     folder.mkdir()
