@@ -100,6 +100,7 @@ def evaluate_policy(
     from eval.vehicles.vehicle import Vehicle
     from eval.worlds.engine import warn_of
     from policies.policy import check_is_policy, load_policy
+    from suite.judging.content import PolicyContent
     from suite.judging.flying import fly_trials, policy_for_workers
     from suite.judging.requests import Evaluation
     from suite.judging.trials import read_trial_set
@@ -131,7 +132,7 @@ def evaluate_policy(
     warn_of([*vehicle_doubts(trial_set.vehicle), *trial_set.differences, *notes])
     flown, processes = loaded, 1 if workers is None else workers
     if is_source:
-        flown = policy_for_workers(loaded, os.fspath(policy), False, processes)
+        flown = policy_for_workers(loaded, PolicyContent.of(policy), processes)
     results = fly_trials(flown, evaluation, trial_set, processes)
     # An object is probed after its flights, so that the probe cannot change them.
     doubts = () if before or hasattr(loaded, "notes") else object_faults(loaded)

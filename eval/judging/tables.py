@@ -129,14 +129,22 @@ def _pairing(rows: Sequence[TrialResult], others: Sequence[TrialResult]) -> Pair
     return Pairing(policy, against, track, level, len(rows), interval, success.p_value, speed)
 
 
-def percent(interval: Interval) -> str:
-    """Return a rate with its interval: "94 % [88, 97]".
+def rate_text(rate: float, digits: int = 0) -> str:
+    """Return a rate in per cent, with more decimal places where it would be rounded to 0 or 100."""
+    while rate not in (0.0, 1.0) and round(100 * rate, digits) in (0.0, 100.0):
+        digits += 1
+    return f"{100 * rate:.{digits}f}"
 
-    A rate has a decimal place where it would be rounded to 0 or 100 %: "99.7 % [98, 100]".
+
+def percent(interval: Interval) -> str:
+    """Return a rate with its interval: "94 % [88, 97]", "99.7 % [98, 100]".
+
+    The ends have decimal places where the rounded interval would not contain the rate.
     """
-    value, low, high = (100 * x for x in interval)
-    digits = int(0.0 < value < 100.0 and round(value) in (0, 100))
-    return f"{value:.{digits}f} % [{low:.0f}, {high:.0f}]"
+    value, (low, high) = rate_text(interval.value), (100 * x for x in interval[1:])
+    contains = round(low) <= float(value) <= round(high)
+    digits = 0 if contains else len(value.partition(".")[2])
+    return f"{value} % [{low:.{digits}f}, {high:.{digits}f}]"
 
 
 def with_interval(interval: Interval, scale: float = 1.0, form: str = ".2f") -> str:
@@ -195,7 +203,7 @@ def _pair_grid(paired: Sequence[Pairing]) -> Grid:
         ("track", lambda pair: pair.track),
         ("level", lambda pair: str(pair.difficulty)),
         ("pairs", lambda pair: str(pair.trials)),
-        ("success", lambda pair: f"{with_interval(pair.success, 100, '+.0f')} points"),
+        ("success", lambda pair: f"{with_interval(pair.success, 100, '+.1f')} points"),
         ("p (McNemar)", lambda pair: f"{pair.p_value:.3g}"),
         ("v_mean [m/s]", lambda pair: with_interval(pair.v_mean, form="+.2f")),
         note=PAIR_NOTE,

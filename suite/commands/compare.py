@@ -38,6 +38,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         compare_seeds,
         policy_notes,
         read_runs,
+        seed_notes,
         version_notes,
     )
 
@@ -55,9 +56,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         )
     if config.seeds or (others and max(len(runs), len(others)) > 1):
         comparisons = [compare_seeds(runs, others)]
+        notes = [note for group in (runs, others) for note in seed_notes(group)]
     else:
         comparisons = [compare_runs(runs[0], other) for other in (others or runs[1:])]
-    for note in [*version_notes([*runs, *others]), *policy_notes(runs, others)]:
+        notes = []
+    for note in [*notes, *version_notes([*runs, *others]), *policy_notes(runs, others)]:
         console.note(note)
     for comparison in comparisons:
         console.say(comparison["sentence"])

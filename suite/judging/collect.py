@@ -23,6 +23,7 @@ from policies.policy import Policy
 from suite.common.console import Console
 from suite.common.provenance import engines, refuse_other_run, write_run_record
 from suite.common.stages import announce
+from suite.judging.content import PolicyContent
 from suite.judging.flying import (
     Manner,
     default_policy,
@@ -68,12 +69,13 @@ def collect(
     refuse_equal_names({trial.track for trial in trial_set.trials})
     source = collection.policy or default_policy()
     policy = load_in_manner(source, collection.trust, manner)
+    content = PolicyContent.of(source, collection.trust)
     out = Path(out)
     refuse_other_run(out, collection)
     # What must be the same for a list or a journal to be continued.
     settings = {
         "collection": collection,
-        "policy": policy_record(source, policy),
+        "policy": policy_record(source, policy, content),
         "vehicle": trial_set.vehicle,
         "sensors": trial_set.sensors,
         "tracks": trial_set.tracks,
@@ -90,7 +92,9 @@ def collect(
         described = _write_vehicle(collection, trial_set.vehicle, out, console)
         as_flown = None if described is trial_set.vehicle else AS_FLOWN
         rows |= {t: row for t, r in journal.done.items() if (row := _row(out, r)) is not None}
-        _fly_missing(collection, trial_set, policy, described, out, rows, journal, console, workers)
+        _fly_missing(
+            collection, trial_set, policy, content, described, out, rows, journal, console, workers
+        )
         flights = [rows[trial] for trial in trial_set.trials]
         made = {"as_flown": as_flown, "flights": flights}
         listing = {**stamp(1, collection.seed), **settings, **made}
@@ -139,6 +143,7 @@ def _fly_missing(
     collection: Collection,
     trial_set: TrialSet,
     policy: Policy,
+    content: PolicyContent,
     described: Vehicle,
     out: Path,
     rows: dict[TrialSpec, Row],
@@ -155,7 +160,7 @@ def _fly_missing(
     title = f"{len(missing)} flights in {collection.simulator}"
     announce(console, title, flying_estimate(len(missing), workers, collection.simulator))
     show_notes(console, collection.simulator, trial_set)
-    source, manner = collection.policy or default_policy(), Manner(speed=collection.speed)
+    flown = policy_for_workers(policy, content, workers, Manner(speed=collection.speed))
     with console.progress("flights", len(trial_set.trials), begun=len(rows)) as update:
 
         def keep(result: TrialResult, flight: Flight | None) -> None:
@@ -169,7 +174,6 @@ def _fly_missing(
             update(len(rows), result.ended_by)
 
         if missing:
-            flown = policy_for_workers(policy, source, collection.trust, workers, manner)
             fly_trials(flown, collection, trial_set, workers, missing, keep, Record())
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from eval.judging.results import read_trials
 from eval.judging.statistics import Interval, over_seeds, paired_success, wilson
+from eval.judging.tables import rate_text
 from eval.worlds.trial import TrialResult, TrialSpec
 from suite.judging.flying import manners
 from tracks.input.reading import read_json
@@ -39,6 +40,8 @@ class Run(NamedTuple):
     """End of the policy's label that says how it flew, such as "@0.5+monitor"; see `Manner`."""
     digest: str
     """SHA-256 of the policy's files."""
+    settings: str | None
+    """SHA-256 of the settings of its training, without the seed; None if not recorded."""
 
 
 def read_runs(folder: Path) -> list[Run]:
@@ -65,7 +68,11 @@ def read_runs(folder: Path) -> list[Run]:
     endings = sorted((manner.label("") for manner in flown), key=len, reverse=True)
     # The summary has an entry for each label, in the order of the rows.
     policies = [one for one in summary["policies"] if isinstance(one, dict)]
-    digests = [one["sha256"] for one in policies if isinstance(one.get("sha256"), str)]
+    digests = [
+        (one["sha256"], one.get("settings_sha256"))
+        for one in policies
+        if isinstance(one.get("sha256"), str)
+    ]
     if len(digests) < max(len(names), len(summary["policies"])):
         raise ValueError(
             f"{folder / 'summary.json'}: has no SHA-256 for each of the {len(names)} policies in "
@@ -79,7 +86,7 @@ def read_runs(folder: Path) -> list[Run]:
             summary["sha256"],
             versions,
             next((ending for ending in endings if name.endswith(ending)), ""),
-            digest,
+            *digest,
         )
         for name, digest in zip(names, digests, strict=False)
     ]
@@ -142,6 +149,18 @@ def policy_notes(runs: Sequence[Run], others: Sequence[Run] = ()) -> list[str]:
     return notes
 
 
+def seed_notes(runs: Sequence[Run]) -> list[str]:
+    """Return a warning if `runs` are no training seeds of one method, by the recorded settings."""
+    known = [run for run in runs if run.settings]
+    return [
+        f"warning: {known[0].name} and {run.name}: were trained with different settings or for "
+        "different numbers of iterations, which the spread over seeds includes; compare "
+        "config.json of the two policies"
+        for run in known
+        if run.settings != known[0].settings
+    ][:1]
+
+
 def compare_runs(first: Run, other: Run) -> dict[str, Any]:
     """Return the difference of two runs on the same trials, as numbers and as a sentence.
 
@@ -171,10 +190,10 @@ def paired_sentence(name_a: str, name_b: str, a: np.ndarray, b: np.ndarray) -> s
     difference = paired_success(a, b)
     value, low, high = (100 * number for number in difference[:3])
     return (
-        f"{name_a} succeeded in {100 * a.mean():.1f} % and {name_b} in {100 * b.mean():.1f} % "
-        f"of the same {len(a)} trials: {name_a} minus {name_b} is {value:+.1f} percentage points "
-        f"(paired, 95 % interval {low:+.1f} to {high:+.1f}, Newcombe 1998; exact McNemar test, "
-        f"p = {difference.p_value:.2g})."
+        f"{name_a} succeeded in {rate_text(a.mean(), 1)} % and {name_b} in "
+        f"{rate_text(b.mean(), 1)} % of the same {len(a)} trials: {name_a} minus {name_b} is "
+        f"{value:+.1f} percentage points (paired, 95 % interval {low:+.1f} to "
+        f"{high:+.1f}, Newcombe 1998; exact McNemar test, p = {difference.p_value:.2g})."
     )
 
 
@@ -239,7 +258,7 @@ def _seeds_sentence(
     value, low, high = (100 * number for number in interval)
     count = " and ".join(str(len(group)) for group in rates)
     means = " and ".join(
-        f"{100 * np.mean(group):.1f} % (standard deviation over seeds "
+        f"{rate_text(float(np.mean(group)), 1)} % (standard deviation over seeds "
         f"{100 * np.std(group, ddof=1):.1f} percentage points)"
         for group in rates
     )

@@ -1,4 +1,4 @@
-"""The files of which a policy consists: their SHA-256, and their content for other machines.
+"""The files of which a policy consists: their SHA-256, and their content for other processes.
 
 A policy is a folder (checkpoint or export in C) or a single file with the files that it refers to.
 """
@@ -15,6 +15,8 @@ from pathlib import Path
 
 from policies import shipped
 from policies.policy import Policy, load_policy
+from tracks.common.files import digest_of
+from tracks.input.reading import parse_json
 
 
 def policy_files(name_or_path: str | Path) -> dict[str, Path]:
@@ -42,10 +44,7 @@ def policy_files(name_or_path: str | Path) -> dict[str, Path]:
 
 def policy_digest(name_or_path: str | Path) -> str:
     """Return the SHA-256 of the files of which a policy consists, in hexadecimal digits."""
-    digest = hashlib.sha256()
-    for file in policy_files(name_or_path).values():
-        digest.update(file.name.encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()
+    return PolicyContent.of(name_or_path).digest
 
 
 @dataclass(frozen=True)
@@ -70,6 +69,29 @@ class PolicyContent:
         files = tuple((name, entry.read_bytes()) for name, entry in contents)
         real = folder.resolve()
         return cls(str(Path(real.parent.name, real.name)), file, files, trust)
+
+    @property
+    def digest(self) -> str:
+        """The SHA-256 of the files, in hexadecimal digits."""
+        digest = hashlib.sha256()
+        for name, data in self.files:
+            digest.update(Path(name).name.encode() + b"\0" + data)
+        return digest.hexdigest()
+
+    @property
+    def settings_digest(self) -> str | None:
+        """The SHA-256 of the training's settings without the seed; None if they are not recorded.
+
+        It includes the number of finished iterations.
+        """
+        from policies.formats.checkpoint import CONFIG
+
+        text = dict(self.files).get(CONFIG, b"{}")
+        training = parse_json(text, CONFIG).get("training")
+        settings = training.get("config") if isinstance(training, dict) else None
+        if not isinstance(settings, dict):
+            return None
+        return digest_of([{**settings, "seed": None}, training.get("iteration")])
 
     def __call__(self) -> Policy:
         """Return the policy.

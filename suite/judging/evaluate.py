@@ -26,6 +26,7 @@ from suite.common.console import Console
 from suite.common.provenance import engines, refuse_other_run, write_run_record
 from suite.common.stages import announce, refuse_other_options
 from suite.judging.comparing import paired_sentence
+from suite.judging.content import PolicyContent
 from suite.judging.flying import (
     Manner,
     default_policy,
@@ -54,6 +55,8 @@ class Entry(NamedTuple):
     """Name or path of the policy, as the user gave it."""
     policy: Policy
     """The loaded policy, which flies in this manner."""
+    content: PolicyContent
+    """Its files as they were loaded."""
     label: str
     """Label of the entry in tables."""
     manner: Manner
@@ -84,11 +87,12 @@ def evaluate(
         refuse_other_options(out, evaluation)
     sources = tuple(evaluation.policies or (default_policy(),))
     policies = [load_in_manner(source, evaluation.trust) for source in sources]
+    contents = [PolicyContent.of(source, evaluation.trust) for source in sources]
     labels = policy_labels(sources, [policy.name for policy in policies])
     entries = [
-        Entry(source, manner(policy), manner.label(label), manner)
+        Entry(source, manner(policy), content, manner.label(label), manner)
         for manner in manners(evaluation.speed, evaluation.monitor)
-        for source, policy, label in zip(sources, policies, labels, strict=True)
+        for source, policy, content, label in zip(sources, policies, contents, labels, strict=True)
     ]
     names = [entry.label for entry in entries]
     if repeated := next((name for name in names if names.count(name) > 1), None):
@@ -121,13 +125,12 @@ def evaluate(
         "actions": actions,
         "sentences": _sentences(results),
         "judged": evaluation,
-        "policies": [policy_record(entry.source, entry.policy) for entry in entries],
+        "policies": [policy_record(*entry[:3]) for entry in entries],
         "sha256": file_digests(trial_set),
         "flown_otherwise": trial_set.differences,
     }
-    write_results(
-        out, results, table_markdown=markdown_table(summary), summary=summary, seed=evaluation.seed
-    )
+    table = f"{_caption(evaluation)}\n\n{markdown_table(summary)}"
+    write_results(out, results, table_markdown=table, summary=summary, seed=evaluation.seed)
     write_run_record(out, evaluation, evaluation.seed)
     # A journal stays if it has trials that this command does not request.
     unfinished = {journal.path for journal in journals if journal.others(trial_set.trials)}
@@ -135,6 +138,7 @@ def evaluate(
         if path not in unfinished:
             path.unlink()
     # Print the results.
+    console.say(_caption(evaluation))
     for grid in grids(summary):
         console.show(rich_table(grid))
     for sentence in summary["sentences"]:
@@ -151,6 +155,17 @@ def evaluate(
         trust = " --trust" * evaluation.trust
         console.say(f"next: suite view {out} --pick failed{trust} shows what went wrong")
     return {**stamp(1, evaluation.seed), **summary, "out": str(out)}
+
+
+def _caption(evaluation: Evaluation) -> str:
+    """Return the conditions of all trials, for the text above the tables."""
+    last, deadline = evaluation.seed + evaluation.trials - 1, evaluation.deadline_s
+    return (
+        f"Vehicle {evaluation.vehicle}, sensors {evaluation.sensors}, simulator "
+        f"{evaluation.simulator}, seeds {evaluation.seed} to {last}, time limit "
+        f"{evaluation.time_limit_s:g} s"
+        + ("." if deadline is None else f", deadline of an action {deadline:g} s.")
+    )
 
 
 def _laps_over_plan(results: Sequence[TrialResult], trial_set: TrialSet) -> list[OverPlan]:
@@ -220,7 +235,7 @@ def _open_journals(
         settings = {
             **stamp(1, None),
             "engines": engines(),
-            "policy": policy_record(entry.source, entry.policy),
+            "policy": policy_record(*entry[:3]),
             "speed": entry.manner.speed,
             "vehicle": trial_set.vehicle,
             "sensors": trial_set.sensors,
@@ -263,9 +278,7 @@ def _fly_entry(
                 flown, won = flown + 1, won + result.success
                 update(flown, f"{won / flown:.0%} success")
 
-            policy = policy_for_workers(
-                entry.policy, entry.source, evaluation.trust, workers, entry.manner
-            )
+            policy = policy_for_workers(entry.policy, entry.content, workers, entry.manner)
             fly_trials(policy, evaluation, trial_set, workers, missing, keep)
         # An earlier command may have had other policies, and another label for this one.
         return [journal.done[trial]._replace(policy=label) for trial in trials]

@@ -17,7 +17,7 @@ from policies.formats.checkpoint import CONFIG
 from policies.policy import Policy
 from policies.spec import PolicyError
 from suite.common.stages import Estimate
-from suite.judging.content import PolicyContent, policy_digest
+from suite.judging.content import PolicyContent
 from suite.judging.requests import SimulatedFlights
 from suite.judging.trials import TrialSet
 from tracks.common.files import plain
@@ -163,17 +163,13 @@ def workers_for(trials: int, workers: Workers | None, simulator: str) -> Workers
 
 
 def policy_for_workers(
-    policy: Policy, name_or_path: str, trust: bool, workers: Workers, manner: Manner = PLAIN
+    policy: Policy, content: PolicyContent, workers: Workers, manner: Manner = PLAIN
 ) -> Policy | Callable[[], Policy]:
-    """Return the loaded policy, or for several processes a function that loads it.
+    """Return the loaded policy, or for several processes a function that loads its `content`.
 
-    Processes of this machine read the policy's files; those of a cluster get the files' content.
+    They do not read its files, which a training may replace while they fly.
     """
-    if workers == 1:
-        return policy
-    if isinstance(workers, int):
-        return partial(load_in_manner, name_or_path, trust, manner)
-    return partial(_load_content, PolicyContent.of(name_or_path, trust), manner)
+    return policy if workers == 1 else partial(_load_content, content, manner)
 
 
 def _load_content(content: PolicyContent, manner: Manner) -> Policy:
@@ -223,12 +219,13 @@ def fly_trials(
     )  # fmt: skip
 
 
-def policy_record(name_or_path: str, policy: Policy) -> dict[str, Any]:
-    """Return name, source and SHA-256 of a policy for a result file."""
+def policy_record(source: str, policy: Policy, content: PolicyContent) -> dict[str, Any]:
+    """Return name, source (name or path), and SHA-256 of files and settings, for a result file."""
     return {
         "name": policy.name,
-        "source": str(name_or_path),
-        "sha256": policy_digest(str(name_or_path)),
+        "source": source,
+        "sha256": content.digest,
+        "settings_sha256": content.settings_digest,
     }
 
 

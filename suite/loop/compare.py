@@ -15,7 +15,7 @@ from eval.judging.statistics import (
     paired_success,
     wilson,
 )
-from eval.judging.tables import with_interval
+from eval.judging.tables import percent, with_interval
 from eval.worlds.trial import TrialResult
 from tracks.common.grid import Cell, Grid, table
 
@@ -116,12 +116,12 @@ def overall_grid(
 
     Each of the `references` has two columns, in which the others are compared with it.
     """
-    headers = ["policy", "success [%]"]
+    headers = ["policy", "success"]
     for reference in references:
         headers += [f"minus {labels[reference]}", "p"]
     rows = []
     for result in results:
-        row: list[str | Cell] = [labels[result.name], with_interval(result.success, 100, ".0f")]
+        row: list[str | Cell] = [labels[result.name], percent(result.success)]
         differences = {difference.against: difference for difference in result.differences}
         for reference in references:
             difference = differences.get(reference)
@@ -138,10 +138,10 @@ def cell_grid(results: Sequence[PolicyResult], labels: Mapping[str, str]) -> Gri
     """Return the table of success rates, with a row per track and level and a column per policy."""
     headers = ["track and level", *(labels[result.name] for result in results)]
     rows = [
-        [cell, *(with_interval(result.by_cell[cell], 100, ".0f") for result in results)]
+        [cell, *(percent(result.by_cell[cell]) for result in results)]
         for cell in results[0].by_cell
     ]
-    return table(headers, rows, "Success by track and level [%]")
+    return table(headers, rows, "Success by track and level")
 
 
 def difference_cell(interval: Interval | PairedDifference) -> Cell:

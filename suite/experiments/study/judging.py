@@ -9,7 +9,7 @@ pages share the journals.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -71,15 +71,14 @@ def fly_trials(
         ValueError: for a policy that cannot be loaded, before the first flight.
     """
     # 1. Find the journal of each request. Requests with the same setup share one.
-    policies = {request.policy for request in requests.values()}
-    digests = {policy: policy_digest(policy) for policy in policies}
+    policies = {request.policy: PolicyContent.of(request.policy) for request in requests.values()}
     names: dict[Key, str] = {}
     setups: dict[str, TrialRequest] = {}
     inputs: dict[str, dict[str, Any]] = {}
     for key, request in requests.items():
         # Everything except the trial that determines the outcome of a flight.
         entry = {
-            "policy_sha256": digests[request.policy],
+            "policy_sha256": policies[request.policy].digest,
             "vehicle": request.vehicle,
             "sensors": request.sensors,
             "world": request.simulator,
@@ -119,12 +118,8 @@ def fly_trials(
                     all_journals[journal_number].close()
                     update(next(trial_numbers))
 
-                # Other machines lack the files of the policies, so they get the content.
-                local = isinstance(workers, int)
-                loaders = {p: partial(load_policy, p) if local else PolicyContent.of(p)
-                           for p in policies}  # fmt: skip
                 pieces = _pieces(missing, worker_count(workers))
-                run_pieces(partial(_fly_piece, loaders), pieces, workers, keep)
+                run_pieces(partial(_fly_piece, policies), pieces, workers, keep)
     # 3. Collect the results of each request.
     return {
         key: [journals[names[key]].done[trial] for trial in request.trials]
@@ -194,7 +189,7 @@ def _pieces(requests: Sequence[TrialRequest], processes: int) -> list[list[Share
 
 
 def _fly_piece(
-    loaders: Mapping[str, Callable[[], Policy]], piece: Sequence[Share]
+    loaders: Mapping[str, PolicyContent], piece: Sequence[Share]
 ) -> Iterator[tuple[int, TrialResult]]:
     """Fly a piece and yield (number of the setup, result) of each trial; load each policy once."""
     loaded: dict[str, Policy] = {}

@@ -22,6 +22,7 @@ from policies.spec import PolicyError
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.provenance import refuse_other_run, write_run_record
+from suite.judging.content import PolicyContent
 from suite.judging.flying import (
     default_policy,
     fly_trials,
@@ -99,7 +100,7 @@ def fly_over_link(
     name = policy or default_policy()
     # The commanded speed is part of how the policy is loaded; the monitor is added below.
     (plain,) = manners(evaluation.speed, monitor=False)
-    loaded = load_in_manner(name, evaluation.trust, plain)
+    loaded, content = load_in_manner(name, evaluation.trust, plain), PolicyContent.of(name)
     if loaded.spec.action.kind == "motors":
         raise PolicyError(
             f"{name}: commands motors, but a link carries body rates and thrust; fly a policy with "
@@ -111,7 +112,9 @@ def fly_over_link(
     flying = for_one_row(loaded) if isinstance(loaded, BlockPolicy) else loaded
     if evaluation.monitor:
         loaded, flying = Monitored(loaded), Monitored(flying)
-    settings = LinkFlights(evaluation, policy_record(name, loaded), limits, link or "simulated")
+    settings = LinkFlights(
+        evaluation, policy_record(name, loaded, content), limits, link or "simulated"
+    )
     refuse_other_run(out, settings)
     if (out / FLY).is_file() or any(out.glob("*.parquet")):
         raise ValueError(

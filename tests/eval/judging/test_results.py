@@ -26,7 +26,8 @@ pos_x pos_y pos_z time_s v_max v_mean gates_8s gates_035""".split()
 @pytest.mark.parametrize(
     ("successes", "trials", "text"),
     [(299, 300, "99.7 % [98, 100]"), (1, 300, "0.3 % [0, 2]"), (298, 300, "99 % [98, 100]"),
-     (300, 300, "100 % [99, 100]"), (0, 300, "0 % [0, 1]")],
+     (300, 300, "100 % [99, 100]"), (0, 300, "0 % [0, 1]"), (2999, 3000, "99.97 % [99.81, 99.99]"),
+     (4990, 5000, "99.8 % [99.6, 99.9]"), (5, 5000, "0.1 % [0.0, 0.2]")],
 )  # fmt: skip
 def test_only_a_rate_without_a_failure_is_printed_as_100_percent(successes, trials, text):
     assert percent(wilson(successes, trials)) == text
@@ -134,7 +135,8 @@ def test_paired_differences_are_on_the_same_trials():
     assert pair.success.value == pytest.approx(1 / 3) and pair.p_value == 1.0
     assert pair.v_mean.value == -1.0 and np.isnan(pair.v_mean[1:]).all(), "three pairs are too few"
     text = markdown_table(summary)
-    assert "| theirs - ours |" in text and "| -1.00 |" in text and "nan" not in text
+    assert "| theirs - ours |" in text and "| +33.3 [" in text and "nan" not in text
+    assert "| -1.00 |" in text
 
 
 def test_cells_do_not_depend_on_what_else_is_in_the_table_and_count_late_answers():

@@ -11,7 +11,8 @@ from eval.judging.results import write_results
 from eval.judging.statistics import over_seeds, paired_success, wilson
 from suite.commands import compare
 from suite.common.console import Quiet
-from suite.judging.comparing import compare_runs, compare_seeds, read_runs
+from suite.judging.comparing import compare_runs, compare_seeds, paired_sentence, read_runs
+from suite.judging.content import PolicyContent
 from suite.judging.requests import Evaluation
 from tests.support import commands
 from tests.support.judged_cells import result
@@ -60,10 +61,10 @@ def test_the_interval_of_a_small_layout_is_that_of_its_mean_squares_and_one_seed
             over_seeds(*values)
 
 
-def run_of(folder, successes, judged=None, policy="ours", weights=None, **digests):
+def run_of(folder, successes, judged=None, policy="ours", weights=None, settings=None, **digests):
     rows = [result(seed, bool(success), policy) for seed, success in enumerate(successes)]
     summary = {"judged": judged or Evaluation(), "sha256": {"vehicle": "a", **digests}}
-    summary["policies"] = [{"sha256": weights or str(folder)}]
+    summary["policies"] = [{"sha256": weights or str(folder), "settings_sha256": settings}]
     write_results(folder, rows, table_markdown="", summary=summary, seed=0)
     return folder
 
@@ -174,6 +175,45 @@ def test_rows_of_other_speeds_or_the_monitor_are_no_training_seeds(tmp_path):
     for run in unlike:
         with pytest.raises(ValueError, match="are no training seeds of one method"):
             compare_seeds([plain, run])
+
+
+def test_a_sentence_prints_no_rate_with_a_failure_as_100_percent():
+    failed_once = np.arange(3000) > 0
+    said = paired_sentence("a", "b", failed_once, ~failed_once)
+    assert "a succeeded in 99.97 % and b in 0.03 % of the same 3000 trials" in said
+
+
+def test_trainings_that_differ_in_the_seed_only_have_the_same_settings(tmp_path):
+    (tmp_path / "weights.safetensors").touch()
+    digests = []
+    for training in (
+        {"config": {"seed": 0, "rate": 1.0}, "iteration": 9},
+        {"config": {"seed": 1, "rate": 1.0}, "iteration": 9},
+        {"config": {"seed": 0, "rate": 2.0}, "iteration": 9},
+        {"config": {"seed": 0, "rate": 1.0}, "iteration": 8},
+        {},
+        [],
+    ):
+        (tmp_path / "config.json").write_text(json.dumps({"training": training}))
+        digests.append(PolicyContent.of(tmp_path).settings_digest)
+    assert digests[0] == digests[1] and len(set(digests[1:4])) == 3 and digests[4:] == [None] * 2
+    assert PolicyContent.of("race").settings_digest
+
+
+def test_seeds_of_several_settings_are_noted(tmp_path, capsys):
+    unknown, a, b, other = (
+        run_of(tmp_path / f"{index}", [True, False], settings=settings)
+        for index, settings in enumerate((None, "x", "x", "y"))
+    )
+    for config, is_noted in (
+        (compare.Config((unknown, a, b), seeds=True), False),
+        (compare.Config((unknown, a, other), seeds=True), True),
+        (compare.Config((a, b), against=(other, unknown)), False),
+        (compare.Config((a, other)), False),
+    ):
+        compare.run(config, Quiet())
+        said = " ".join(capsys.readouterr().err.split())
+        assert ("1 and " in said and "trained with different settings" in said) == is_noted
 
 
 def test_other_versions_are_noted(tmp_path, capsys):

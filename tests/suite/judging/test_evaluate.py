@@ -14,6 +14,7 @@ import suite.judging.evaluate
 from eval.judging.results import read_trials
 from suite.commands import view
 from suite.common.console import Console, Quiet
+from suite.judging.content import PolicyContent, policy_digest
 from suite.judging.evaluate import evaluate as evaluate_here
 from suite.judging.flying import Manner, load_in_manner, manners, policy_for_workers
 from suite.judging.replay import read_evaluation
@@ -49,6 +50,9 @@ def test_eval_writes_the_tables_and_says_them(pilots, tmp_path, capfd):
     assert {key: said[key] for key in summary} == summary
     assert [cell["policy"] for cell in summary["cells"]] == ["pursuit", "diver"]
     assert summary["paired"][0]["trials"] == 2
+    caption = (out / "table.md").read_text().splitlines()[0]
+    said = "Vehicle reference, sensors perfect, simulator mujoco, seeds 5 to 6, time limit 3 s."
+    assert caption == said
     header = json.loads(pq.read_schema(out / "trials.parquet").metadata[b"suite"])
     assert set(header) >= {"schema", "suite_version", "git_commit", "seed"}
 
@@ -60,6 +64,24 @@ def test_trials_on_planned_tracks_are_counted_for_the_vehicle_of_the_plans(pilot
         assert evaluate(tmp_path / vehicle, f"{asked} --policy", pilots["pursuit"]) == 0
         summary = json.loads((tmp_path / vehicle / "summary.json").read_text())
         assert [laps["planned"] for laps in summary["over_plan"]] == planned
+
+
+def test_a_policy_that_its_training_replaces_during_the_flights_is_recorded_as_flown(
+    pilots, tmp_path, monkeypatch
+):
+    policy, fly, flown = pilots["diver"], eval.judging.judge.fly, []
+    digest, content = policy_digest(policy), Path(policy).read_bytes()
+
+    def replaced(make, trials, *rest):
+        Path(policy).write_text("after further iterations")
+        flown.append(make.args[0].files)
+        return fly(load_in_manner(policy, False), trials, *rest)
+
+    monkeypatch.setattr(eval.judging.judge, "fly", replaced)
+    assert evaluate(tmp_path / "out", "--track zigzag --trials 1 --workers 2 --policy", policy) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert [one["sha256"] for one in summary["policies"]] == [digest] != [policy_digest(policy)]
+    assert flown == [(("diver", content),)]
 
 
 def test_what_a_folder_holds_is_not_written_over_without_a_word(pilots, tmp_path, capsys):
@@ -144,12 +166,14 @@ def test_what_cannot_be_used_is_said_before_the_first_flight(pilots, tmp_path, m
         assert not (tmp_path / "out").exists()
 
 
-def test_with_a_monitor_each_policy_flies_twice_on_the_same_trials(pilots, tmp_path):
+def test_with_a_monitor_each_policy_flies_twice_on_the_same_trials(pilots, tmp_path, monkeypatch):
     assert evaluate(tmp_path, "--monitor --track zigzag --trials 1 --policy", pilots["diver"]) == 0
     table = (tmp_path / "table.md").read_text()
     assert "| diver | zigzag" in table and "| diver+monitor | zigzag" in table
     loaded = load_in_manner(pilots["diver"], False, Manner(monitored=True))
-    make = policy_for_workers(loaded, pilots["diver"], False, 2, Manner(monitored=True))
+    monkeypatch.setattr("suite.judging.content.load_policy", lambda *_: loaded.policy)
+    content = PolicyContent.of(pilots["diver"])
+    make = policy_for_workers(loaded, content, 2, Manner(monitored=True))
     assert callable(make) and make().name == "diver+monitor"
 
 

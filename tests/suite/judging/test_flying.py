@@ -206,12 +206,12 @@ def test_trials_and_slow_worlds_take_more_processes_and_seconds(monkeypatch):
     assert slow.seconds > 3 * quick.seconds
 
 
-def test_a_cluster_is_given_the_policy_and_this_machines_processes_its_name(policy):
+def test_other_processes_are_given_the_content_of_the_policy(policy):
+    content = PolicyContent.of("race-paper")
     alone, here, there = (
-        flying.policy_for_workers(policy, "race-paper", False, workers)
-        for workers in (1, 2, "tcp://a:1")
+        flying.policy_for_workers(policy, content, workers) for workers in (1, 2, "tcp://a:1")
     )
-    assert alone is policy and len(pack(here)) < 1000 < 100_000 < len(pack(there))
+    assert alone is policy and pack(here) == pack(there) and len(pack(here)) > 100_000
 
 
 def test_what_a_world_flies_otherwise_is_said_once_and_written(

@@ -260,7 +260,7 @@ def test_standings_are_paired_by_trial():
     assert {len(row) for row in grid.rows} == {len(grid.headers)}
     assert grid.rows[4][2].tone == "good" and grid.rows[1][2].text == ""
     cells = cell_grid(stand, LABELS)
-    assert len(cells.rows) == 2 and cells.rows[0][5].text.startswith("90 [")
+    assert len(cells.rows) == 2 and cells.rows[0][5].text.startswith("90 % [")
     with pytest.raises(ValueError, match="same trials"):
         policy_results({**results, "both": results["both"][::-1]}, ("before",))
 
