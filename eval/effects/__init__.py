@@ -23,7 +23,7 @@ from eval.effects import (
     wind,
 )
 from eval.effects.interface import SIGNALS, Effect, as_arrays, neutral
-from tracks.common.names import Registry, name_problem
+from tracks.common.names import Registry
 
 if TYPE_CHECKING:
     from eval.vehicles.vehicle import Vehicle
@@ -35,8 +35,6 @@ def _registration_error(name: str, effect: Any) -> str | None:
         return f"a {type(effect).__name__}; must be an eval.effects.interface.Effect"
     if effect.name != name:
         return f"its Effect is called {effect.name!r}; both names must be the same"
-    if problem := name_problem(name):
-        return problem
     if unknown := [signal for signal in effect.needs if signal not in SIGNALS]:
         return f"needs {unknown}; allowed is a tuple of {', '.join(SIGNALS)}"
     if (effect.start is None) != (effect.carry is None):

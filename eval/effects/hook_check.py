@@ -76,21 +76,25 @@ def hook_problem(effect: Effect) -> str | None:
     hooks = [name for name in CALLS if getattr(effect, name) is not None]
     if not hooks and effect.late is None:
         return f"without a hook it does nothing; give one of {', '.join(CALLS)}"
-    import jax  # imported here, because only effects of other programs need it
-
     for name in hooks:
-        try:
-            # The first use of an effect may be inside a function that JAX traces.
-            with np.errstate(all="ignore"), jax.ensure_compile_time_eval():
-                problem = _problem_of(effect, name)
-        except Exception as error:  # a hook may raise anything
-            problem = f"fails with {type(error).__name__}: {(str(error) or '?').splitlines()[0]}"
-        if problem:
+        if problem := problem_in_calls(lambda name=name: _problem_of(effect, name)):
             return (
                 f"its hook `{name}` {problem}. Hooks get values and states with any number of "
                 "leading axes, as NumPy and JAX arrays; see eval/effects/drag.py"
             )
     return None
+
+
+def problem_in_calls(problem_of: Callable[[], str | None]) -> str | None:
+    """Return the result of `problem_of`, which calls code of another program, or its error."""
+    import jax  # imported here, because only code of other programs needs it
+
+    try:
+        # The first use of an effect or a sensor may be inside a function that JAX traces.
+        with np.errstate(all="ignore"), jax.ensure_compile_time_eval():
+            return problem_of()
+    except Exception as error:  # such code may raise anything
+        return f"fails with {type(error).__name__}: {(str(error) or '?').splitlines()[0]}"
 
 
 def _problem_of(effect: Effect, name: str) -> str | None:

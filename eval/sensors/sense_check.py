@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from eval.effects.hook_check import ROWS, problem_in_calls
 from eval.effects.interface import as_arrays
 from eval.sensors.interface import STAGES, Moment, Parameter, Sensor, blank_draws, draw
 from policies.observation import View
 from tracks.geometry.camera import Camera
 from tracks.geometry.rotation import exp_rot
 
-ROWS = 5
-"""Number of views; it differs from the sizes of vectors (3) and of the image."""
 CAMERA = Camera(width=8, height=6)
 """Camera of the views."""
 DT_S = 0.1
@@ -39,17 +38,9 @@ def sensor_problem(sensor: Sensor) -> str | None:
                 f"parameter {parameter.name!r} is from {parameter.low:g} to {parameter.high:g} and "
                 f"neutral at {parameter.neutral:g}; needed is low <= neutral <= high, low < high"
             )
-    if not sensor.sense:
+    if not (sense := sensor.sense):
         return None
-    import jax  # imported here, because only models of other programs need it
-
-    try:
-        # The first use of a model may be inside a function that JAX traces.
-        with np.errstate(all="ignore"), jax.ensure_compile_time_eval():
-            problem = _problem_of(sensor, sensor.sense)
-    except Exception as error:  # a model may raise anything
-        problem = f"fails with {type(error).__name__}: {(str(error) or '?').splitlines()[0]}"
-    if problem:
+    if problem := problem_in_calls(lambda: _problem_of(sensor, sense)):
         return (
             f"`start` or `sense` {problem}. They get a row for each drone, as NumPy and JAX "
             "arrays; see eval/sensors/depth_cameras.py"

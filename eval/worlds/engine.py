@@ -21,7 +21,7 @@ from eval.worlds.trial import (
     judge_state,
     start_progress,
 )
-from tracks.families import SHIPPED, make_track
+from tracks.families import FAMILIES, make_track
 from tracks.formats.mujoco_scene import add_scene, solid_name
 from tracks.formats.plausibility import track_notes
 from tracks.geometry.camera import Camera, cast_rays_b, nearest
@@ -181,7 +181,7 @@ def family_notes(family: str, level: int, seed: int, vehicle: Vehicle) -> list[s
 
     One track of the family is examined, which `vehicle` flies.
     """
-    if family in SHIPPED:
+    if family in FAMILIES.own:
         return []
     return track_doubts(family, make_track(family, level, seed), vehicle)
 

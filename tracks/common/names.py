@@ -94,9 +94,11 @@ class Registry(Mapping[str, T]):
         The kind of entry is for messages. `group` is an entry point group, such as
         `diffracing_suite.effects`. The suite's `own` entries are values, or texts `module` or
         `module:attribute` from which they are imported. `check` (name, value) returns what is wrong
-        with an added entry; None if it is valid.
+        with an added entry; None if it is valid. The name of an added entry is checked before.
         """
         self._kind, self._group, self._check = kind, group, check
+        self.own = frozenset(own)
+        """Names of the suite's own entries, which are not checked."""
         self._entries: dict[str, Any] = {
             name: EntryPoint(name, value, group) if isinstance(value, str) else value
             for name, value in own.items()
@@ -178,7 +180,7 @@ class Registry(Mapping[str, T]):
 
     def _checked(self, name: str, value: Any, origin: str) -> Any:
         try:
-            problem = self._check(name, value)
+            problem = name_problem(name) or self._check(name, value)
         except Exception as error:  # an attribute of another package may be anything
             problem = f"cannot be checked ({type(error).__name__}: {error})"
         if problem:

@@ -24,7 +24,7 @@ from suite.experiments.bench.compare import Comparison, compare_times, in_turn
 from suite.judging.flying import default_policy
 from tracks.families import JUDGED
 
-BASELINE = "mujoco, its own rays"
+BASELINE = "mujoco-own-rays"
 """Name of the baseline's simulator."""
 
 

@@ -175,6 +175,17 @@ def test_ours_come_first_and_in_order_and_added_ones_after(monkeypatch):
     assert found["b"] == pytest.approx(3.1416, abs=1e-4)
 
 
+def test_an_added_name_must_be_one_that_files_can_hold(monkeypatch):
+    """A sensor model's name is a table of a sensors file, as an effect's is of a vehicle file."""
+    installed(monkeypatch, **{"a fin": ("one", "math:e")})
+    found = registry_of(z=1)
+    with pytest.raises(ValueError, match=r"thing 'a fin' \(.*letters without accents"):
+        found["a fin"]
+    with pytest.raises(ValueError, match=r"thing 'tür' \(register\): .*letters without accents"):
+        found.register("tür", 5)
+    assert found.own == {"z"}
+
+
 def test_one_of_ours_is_found_without_asking_packages_or_importing(monkeypatch):
     monkeypatch.setattr(registry, "_installed", lambda: pytest.fail("asked"))
     sys.modules.pop("wave", None)
