@@ -125,7 +125,7 @@ def evaluate(
         "actions": actions,
         "sentences": _sentences(results),
         "judged": evaluation,
-        "policies": [policy_record(*entry[:3]) for entry in entries],
+        "policies": [policy_record(entry.source, entry.policy, entry.content) for entry in entries],
         "sha256": file_digests(trial_set),
         "flown_otherwise": trial_set.differences,
     }
@@ -235,7 +235,7 @@ def _open_journals(
         settings = {
             **stamp(1, None),
             "engines": engines(),
-            "policy": policy_record(*entry[:3]),
+            "policy": policy_record(entry.source, entry.policy, entry.content),
             "speed": entry.manner.speed,
             "vehicle": trial_set.vehicle,
             "sensors": trial_set.sensors,
