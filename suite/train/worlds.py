@@ -25,7 +25,7 @@ from tracks.common.work import usable_cores
 from tracks.common.work.processes import worker_pool
 from tracks.families import MAX_COUNTS, random_track
 from tracks.families.random import Mix
-from tracks.geometry.cull import Bounds, bounds
+from tracks.geometry.bounds import Bounds, bounds
 from tracks.geometry.scene import Array, Scene, stack
 from tracks.track import Track, first_gates
 

@@ -7,40 +7,16 @@ returned unchanged.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from tracks.geometry.bounds import bounds
 from tracks.geometry.scene import Array, Counts, Scene
 
 _INVISIBLE = 1e6
 """Number that is added to the score of a solid out of view, which so comes last [m]."""
-
-
-class Bounds(NamedTuple):
-    """Bounding spheres of one kind of solid."""
-
-    center_w: Array
-    """(..., N, 3) centres [m]."""
-    radius: Array
-    """(..., N) radii [m]."""
-
-
-def bounds(scene: Scene) -> dict[str, Bounds]:
-    """Return the bounding spheres of every kind, under its field's name in `Scene`.
-
-    Takes numpy and JAX arrays, with any leading batch shape.
-    """
-    boxes, cylinders, capsules, spheres = scene[1:5]
-    half = boxes.half_size
-    xp = half.__array_namespace__()
-    return {
-        "boxes": Bounds(boxes.center_w, xp.sqrt((half * half).sum(-1))),
-        "cylinders": Bounds(cylinders.center_w, xp.hypot(cylinders.radius, cylinders.half_length)),
-        "capsules": Bounds(capsules.center_w, capsules.radius + capsules.half_length),
-        "spheres": Bounds(spheres.center_w, spheres.radius),
-    }
 
 
 def _gather(solids: Any, index: Array) -> Any:

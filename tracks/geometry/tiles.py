@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tracks.common.masks import take
+from tracks.geometry.bounds import Bounds, bounds
 from tracks.geometry.camera import Camera
-from tracks.geometry.cull import Bounds, bounds
 from tracks.geometry.rotation import to_local
 from tracks.geometry.scene import Boxes, Rods, Scene
 
