@@ -60,8 +60,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     else:
         comparisons = [compare_runs(runs[0], other) for other in (others or runs[1:])]
         notes = []
-    for note in [*notes, *version_notes([*runs, *others]), *policy_notes(runs, others)]:
+    notes += [*version_notes([*runs, *others]), *policy_notes(runs, others)]
+    for note in notes:
         console.note(note)
     for comparison in comparisons:
         console.say(comparison["sentence"])
-    return {"comparisons": comparisons}
+    return {"comparisons": comparisons, "notes": notes}

@@ -21,6 +21,10 @@ from tracks.input.reading import read_json
 
 CONDITIONS = ("simulator", "time_limit_s", "deadline_s")
 """Settings that change the result of a trial, besides the trial itself and the input files."""
+PACKAGES = ("numpy", "mujoco", "jax", "torch", "onnxruntime")
+"""Packages of the judge and of policies, whose versions may change a result."""
+OF_SIMULATOR = {"mjx": "mujoco-mjx", "rotorpy": "rotorpy"}
+"""Simulator -> the package that only it needs."""
 
 
 class Run(NamedTuple):
@@ -35,7 +39,7 @@ class Run(NamedTuple):
     inputs: dict[str, str]
     """Name of each input, such as the vehicle -> its SHA-256, which must be the same as well."""
     versions: dict[str, Any]
-    """Versions of the suite, of MuJoCo and of plugins, which may change results."""
+    """Versions of the suite, packages and plugins, and the processor, which may change results."""
     manner: str
     """End of the policy's label that says how it flew, such as "@0.5+monitor"; see `Manner`."""
     digest: str
@@ -61,8 +65,10 @@ def read_runs(folder: Path) -> list[Run]:
     conditions = {key: judged.get(key) for key in CONDITIONS}
     versions = {key: summary.get(key) for key in ("suite_version", "git_commit")}
     if (record := folder / "run.json").is_file():
-        run = read_json(record, packages=dict)
-        versions |= {"mujoco": run["packages"].get("mujoco"), "plugins": run.get("plugins")}
+        run = read_json(record, packages=dict, machine=dict)
+        used = (*PACKAGES, OF_SIMULATOR.get(str(conditions["simulator"]), "mujoco"))
+        versions |= {name: run["packages"].get(name) for name in used}
+        versions |= {"plugins": run.get("plugins"), "processor": run["machine"].get("processor")}
     names = list(dict.fromkeys(row.policy for row in results))
     flown = manners(judged.get("speed") or (), bool(judged.get("monitor")))
     endings = sorted((manner.label("") for manner in flown), key=len, reverse=True)
@@ -121,11 +127,11 @@ def refuse_other_conditions(first: Run, other: Run) -> None:
 
 
 def version_notes(runs: Sequence[Run]) -> list[str]:
-    """Return a note for each of the runs' versions that is not the same in all of them."""
+    """Return a note for each of the runs' `versions` that is not the same in all of them."""
     keys = dict.fromkeys(key for run in runs for key in run.versions)
     found = {key: dict.fromkeys(str(run.versions.get(key)) for run in runs) for key in keys}
     return [
-        f"the runs have different versions ({key}: {', '.join(values)}), which may change results"
+        f"the runs were not made alike ({key}: {', '.join(values)}), which may change results"
         for key, values in found.items()
         if len(values) > 1
     ]
@@ -243,6 +249,7 @@ def compare_seeds(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, 
     interval = interval._replace(low=max(lowest, interval.low), high=min(1.0, interval.high))
     rates = [[float(rate) for rate in group.mean(1)] for group in groups]
     return {
+        "runs": [[run.name for run in group] for group in (runs, others) if group],
         "trials": len(trials),
         "success_by_seed": rates,
         "spread": [float(np.std(group, ddof=1)) for group in rates],

@@ -217,13 +217,19 @@ def test_seeds_of_several_settings_are_noted(tmp_path, capsys):
 
 
 def test_other_versions_are_noted(tmp_path, capsys):
-    folders = [run_of(tmp_path / name, [True, False]) for name in "ab"]
+    judged = Evaluation(simulator="rotorpy")
+    folders = [run_of(tmp_path / name, [True, False], judged) for name in "ab"]
     for folder, version in zip(folders, ("3.3.0", "3.4.0"), strict=True):
-        run = {"packages": {"mujoco": version}, "plugins": version[2]}
+        versions = dict.fromkeys(("mujoco", "mujoco-mjx", "jax", "rotorpy"), version)
+        run = {"packages": versions, "plugins": version[2], "machine": {"processor": version[:3]}}
         (folder / "run.json").write_text(json.dumps(run))
-    compare.run(compare.Config(tuple(folders)), Quiet())
-    words = " ".join(capsys.readouterr().err.split())
-    assert "(mujoco: 3.3.0, 3.4.0)" in words and "(plugins: 3, 4)" in words
+    answer = compare.run(compare.Config(tuple(folders), seeds=True), Quiet())
+    assert answer["comparisons"][0]["runs"] == [[f"{folder}" for folder in folders]]
+    noted = [note.partition("(")[2].partition(")")[0] for note in answer["notes"]]
+    numbers = [f"{name}: 3.3.0, 3.4.0" for name in ("mujoco", "jax", "rotorpy")]
+    assert noted == [*numbers, "plugins: 3, 4", "processor: 3.3, 3.4"]
+    said = " ".join(capsys.readouterr().err.split())
+    assert all(note in said for note in answer["notes"])
 
 
 def test_runs_of_one_policy_or_of_other_speeds_are_noted(tmp_path, capsys):
