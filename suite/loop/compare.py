@@ -114,21 +114,16 @@ def overall_grid(
 ) -> Grid:
     """Return the table over all trials, a row per policy: success, differences, gates and speed.
 
-    Each of the `references` has two columns, in which the others are compared with it.
+    Each of the `references` has a column, in which the others are compared with it.
     """
-    headers = ["policy", "success"]
-    for reference in references:
-        headers += [f"minus {labels[reference]}", "p"]
+    headers = ["policy", "success", *(f"minus {labels[reference]}" for reference in references)]
     rows = []
     for result in results:
         row: list[str | Cell] = [labels[result.name], percent(result.success)]
         differences = {difference.against: difference for difference in result.differences}
         for reference in references:
             difference = differences.get(reference)
-            if difference:
-                row += [difference_cell(difference.success), f"{difference.p_value:.2g}"]
-            else:
-                row += ["", ""]
+            row.append(difference_cell(difference.success) if difference else "")
         rows.append([*row, *(with_interval(value) for value in (result.gates, result.v_mean))])
     headers += ["gates passed, mean", "mean speed, median [m/s]"]
     return table(headers, rows, f"Over {trials} trials of each policy")

@@ -240,7 +240,7 @@ def test_differences_are_of_the_same_trials_and_none_is_called_none():
     assert said in delta_action.verdict(policies, 40)
     equal = policy_results(dict.fromkeys(results, results["before"]), delta_action.REFERENCES)
     assert "not significantly different from" in delta_action.verdict(equal, 40)
-    cell = overall_grid(equal, delta_action.REFERENCES, delta_action.LABELS, 40).rows[2][4]
+    cell = overall_grid(equal, delta_action.REFERENCES, delta_action.LABELS, 40).rows[2][3]
     assert cell.tone == "" and cell.text.startswith("+0 [")
 
 
