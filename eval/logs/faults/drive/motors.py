@@ -36,6 +36,8 @@ TURNING = 0.05
 """A motor that never reaches this share of the fastest one counts as stopped."""
 FITS = 1.35
 """A lift within this factor of 1 may be a physical effect, which a diagnosis names."""
+AGILE = 3.0
+"""Mean lift of a flight, in multiples of the weight, that turns may need; more is a fault."""
 INERTIA = 2.5
 """Least factor of an inertia that is a fault; a diagnosis estimates smaller ones itself (effect
 `inertia_scale`)."""
@@ -306,6 +308,9 @@ def check_lift(rows: Rows, vehicle: Vehicle | None, doubtful: bool = False) -> l
     if not (lift := _lift(rows, vehicle)) > 0.0:
         return []
     figures = f"by {vehicle.name!r} they lift {lift:.3g} times the weight"
+    if SAME < lift < AGILE and "acc" not in rows and not {"quat", "pos"} <= rows.keys():
+        text = f"{figures}, which turns may need: no accelerometer and no pose show the force"
+        return unseen("rotor speeds", text, "motor_poles")
     if 1.0 / FITS < lift < FITS:
         if abs(np.log(lift)) < np.log(SAME):
             return [Finding("ok", "rotor speeds", figures)]

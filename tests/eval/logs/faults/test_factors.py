@@ -31,15 +31,23 @@ DEGREES = replace(PLAIN.controller, rate_max=(180.0, 180.0, 90.0))
 HOVER = np.sqrt(PLAIN.mass * 9.81 / (4 * PLAIN.rotors.thrust_coefficient))
 
 
-def lift(factor, vehicle=PLAIN):
+def lift(factor, vehicle=PLAIN, **force):
     rows = {"motor": np.full((50, 4), HOVER * factor), "time": np.arange(50.0)}
-    (finding,) = check_lift(rows, vehicle)
+    (finding,) = check_lift(rows | (force or {"acc": np.tile([0.0, 0.0, 9.81], (50, 1))}), vehicle)
     return finding
 
 
 def test_speeds_that_carry_the_weight_or_what_an_effect_can_do_are_no_fault():
     assert lift(0.98).status == lift(1.03).status == "ok"
     assert (lift(1.1).status, lift(1.1).fault) == ("note", "thrust_scale")
+
+
+def test_turns_may_need_more_lift_than_the_weight_where_no_signal_shows_the_force():
+    unknown = {"gyro": np.zeros((50, 3))}
+    for factor in (1.16, 14 / 12, 1.4):
+        assert lift(factor, **unknown).status == "not identifiable"
+    assert lift(1.0, **unknown).status == "ok" and lift(6.0, **unknown).status == "corrected"
+    assert lift(0.7, **unknown).is_open and lift(2.5, **unknown).is_open
 
 
 @pytest.mark.parametrize("seed", range(3))
