@@ -96,7 +96,7 @@ def evaluate_policy(
     from eval.judging.policy_checks.faults import notes_of, object_faults
     from eval.judging.policy_checks.in_flight import action_report
     from eval.logs.faults.vehicle import vehicle_doubts
-    from eval.quadrotor.vehicle_file import parse_vehicle, vehicle_table
+    from eval.quadrotor.vehicle_file import checked_vehicle
     from eval.vehicles.vehicle import Vehicle
     from eval.worlds.engine import warn_of
     from policies.policy import check_is_policy, load_policy
@@ -113,7 +113,7 @@ def evaluate_policy(
     check_type("sensors", sensors, PATH, "a name or a path")
     check_type("workers", workers, (int, type(None)), "a whole number or None")
     if isinstance(vehicle, Vehicle):
-        parse_vehicle(vehicle_table(vehicle))
+        checked_vehicle(vehicle)
     loaded = load_policy(policy) if isinstance(policy, PATH) else policy
     check_is_policy(loaded)
     given: dict[str, Any] = {"track": track, "vehicle": vehicle}

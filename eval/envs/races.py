@@ -26,7 +26,7 @@ from eval.envs.race import (
     unscaled,
 )
 from eval.judging.guard import ActionLimits, check_rate, first_action, guard_action, limits_of
-from eval.quadrotor.vehicle_file import load_vehicle
+from eval.quadrotor.vehicle_file import checked_vehicle, load_vehicle
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.engine import course_notes, family_notes, warn_of
 from eval.worlds.mujoco import MujocoWorld
@@ -161,11 +161,11 @@ def check_track_seed(seed: Any) -> None:
 
 
 def resolved_vehicle(config: RaceConfig, rng: np.random.Generator) -> Vehicle:
-    """Return the configured vehicle, drawn from `rng` if it is random."""
+    """Return the configured vehicle, drawn from `rng` if it is random, checked as a file is."""
     vehicle = config.vehicle
     if isinstance(vehicle, str | os.PathLike):
         return load_vehicle(os.fspath(vehicle))
-    return vehicle if isinstance(vehicle, Vehicle) else vehicle(rng)
+    return checked_vehicle(vehicle if isinstance(vehicle, Vehicle) else vehicle(rng))
 
 
 def resolved_spec(config: RaceConfig, vehicle: Vehicle) -> PolicySpec:

@@ -94,6 +94,17 @@ def parse_vehicle(table: Mapping[str, Any]) -> Vehicle:
     return replace(vehicle, effects=MappingProxyType(effects))
 
 
+def checked_vehicle(vehicle: Vehicle) -> Vehicle:
+    """Return `vehicle` after the checks that a file passes.
+
+    Raises:
+        ValueError: for another object, or with the key, the value and what is allowed.
+    """
+    check_type("vehicle", vehicle, (Vehicle,), "a Vehicle")
+    parse_vehicle(vehicle_table(vehicle))
+    return vehicle
+
+
 def save_vehicle(vehicle: Vehicle, path: str | os.PathLike[str], comment: str = "") -> None:
     """Write `vehicle` as a file, from which `load_vehicle` reads an equal vehicle.
 
@@ -103,10 +114,8 @@ def save_vehicle(vehicle: Vehicle, path: str | os.PathLike[str], comment: str = 
     Raises:
         ValueError: for a vehicle that the check refuses.
     """
-    check_type("vehicle", vehicle, (Vehicle,), "a Vehicle")
     check_type("comment", comment, (str,), "a text")
-    table = vehicle_table(vehicle)
-    parse_vehicle(table)
+    table = vehicle_table(checked_vehicle(vehicle))
     if "kind" in table["controller"] and vehicle.controller.rate_gain == UNUSED_GAIN:
         del table["controller"]["rate_gain"]  # a number that nobody gave, should `kind` become p
     write_text(as_path("path", path), toml_head(comment, SCHEMA) + to_toml(table))
