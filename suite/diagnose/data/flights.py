@@ -32,7 +32,12 @@ from suite.diagnose.data.sampling import (
     own_spacing_s,
     with_fewer_rows,
 )
-from suite.diagnose.data.steps import LONGEST_S, torque_between_rows, wrench_difference
+from suite.diagnose.data.steps import (
+    LONGEST_S,
+    rows_show_torque,
+    torque_between_rows,
+    wrench_difference,
+)
 from suite.diagnose.data.view import (
     FORCE,
     LEAST_ROWS,
@@ -48,6 +53,12 @@ from tracks.geometry.rotation import rot_to_quat
 
 SLOW_WIDTH_S = 1.0
 """Width of the bumps (smooth weights over time) where rates come from a path [s]."""
+HIDDEN_TORQUE = (
+    "torque: rotor speeds every {:.2g} ms do not show the torque between rows, as the lag of the "
+    "rotors in the vehicle file is {:.2g} ms (rotors.time_constant): a named torque effect may "
+    "not be real; correct the file or log faster"
+)
+"""Note if the rotors of the vehicle file are faster than the rows of a log."""
 SMOOTH_S = 0.1
 """Standard deviation of the Gaussian that smooths the velocity before it is differentiated [s]."""
 
@@ -133,6 +144,15 @@ def ready(
             )
             views.remove(view)
             del parts[view.name]
+    spacing_s = [rotors[k].spacing_s for k in kept]
+    hidden_s = [
+        step_s
+        for step_s in spacing_s
+        if not rows_show_torque(vehicle, step_s) and torque_between_rows(vehicle, step_s).any()
+    ]
+    if hidden_s and TORQUE.name in parts:
+        lag_ms = 1e3 * vehicle.rotors.time_constant
+        notes.append(HIDDEN_TORQUE.format(1e3 * max(hidden_s), lag_ms))
     return ViewFlights(
         tuple(views),
         tuple(given[k] for k in kept),

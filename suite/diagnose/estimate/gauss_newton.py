@@ -96,6 +96,17 @@ class Intervals(NamedTuple):
     inverse: np.ndarray
     """(K, K) inverse of the information: the covariance of the parameters by independent noise."""
 
+    def factor(self) -> np.ndarray:
+        """Return F (K, K): F F' is the parameters' joint uncertainty, with `half_width` as scale.
+
+        Its correlations are those of `by_stretch`; the rows of F are as long as the half-widths.
+        """
+        deviation = np.sqrt(np.maximum(np.diag(self.by_stretch), TINY))
+        values, vectors = np.linalg.eigh(self.by_stretch / np.outer(deviation, deviation))
+        factor = vectors * np.sqrt(np.maximum(values, 0.0))
+        length = np.maximum(np.linalg.norm(factor, axis=1), TINY)
+        return (self.half_width / length)[:, None] * factor
+
 
 def intervals95(
     equations: NormalEquations,

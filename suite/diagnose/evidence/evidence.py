@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from suite.diagnose.estimate.block import Block, Estimate
-from suite.diagnose.estimate.gauss_newton import gauss_newton_step, intervals95
+from suite.diagnose.estimate.gauss_newton import Intervals, gauss_newton_step, intervals95
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
 from suite.diagnose.estimate.permutation import CandidateScore, permutation_test
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
@@ -153,10 +153,14 @@ class Evaluation(NamedTuple):
     at: Estimate
     block: Block
 
+    def intervals(self, indices: Sequence[int]) -> Intervals:
+        """Return the uncertainty of the K parameters at `indices`."""
+        equations = self.block.equations.along_numbers(indices)
+        return intervals95(equations, float(self.evidence.misfit_is_noise))
+
     def half_widths(self, indices: Sequence[int]) -> np.ndarray:
         """Return the half-widths (K,) of the 95 % intervals of the parameters at `indices`."""
-        equations = self.block.equations.along_numbers(indices)
-        return intervals95(equations, float(self.evidence.misfit_is_noise)).half_width
+        return self.intervals(indices).half_width
 
 
 def validation_groups(flight: np.ndarray) -> np.ndarray:

@@ -189,7 +189,8 @@ def sizes_by_effect(
     see `upper_size`. The model's own numerical error may change the parameters by `model_error`
     (K,); this is subtracted before the upper end is computed.
     """
-    entries, width = found.last.evidence.space.entries, found.half_widths()
+    entries, intervals = found.last.evidence.space.entries, found.judged.intervals(found.indices)
+    width, factor = intervals.half_width, intervals.factor()
     change = (found.estimate.theta - found.start.theta)[found.indices]
     certain = less_error(change, model_error)
     error, sizes = np.broadcast_to(model_error, change.shape), {}
@@ -199,7 +200,7 @@ def sizes_by_effect(
         own_slope = slope[..., columns]
         upper = size_of(0.0 * own_slope[..., 0])
         if beyond_error(change[columns], error[columns], width[columns]):
-            upper = upper_size(own_slope, certain[columns], width[columns], size_of)
+            upper = upper_size(own_slope, certain[columns], factor[columns], size_of)
         sizes[name] = (size_of(own_slope @ change[columns]), upper)
     return sizes
 

@@ -117,8 +117,8 @@ class ViewSource(Source):
                 energy, left = (max(gap.energy.mean() - self._noise_power, 0.0) for gap in gaps)
                 structured, beyond = True, max(beyond, float(left / max(energy, left, TINY)))
                 where = (
-                    f"a force of {force:.2g} m/s^2 beyond the noise, which no logged signal "
-                    "predicts"
+                    f"a force of {force:.2g} m/s^2 beyond the noise, which a regression on the "
+                    "logged signals does not predict"
                 )
         closed, explainable = shares.total(shares.closed), shares.total(shares.explainable)
         return Remaining(

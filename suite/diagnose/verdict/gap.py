@@ -253,17 +253,18 @@ def rollout_size(shift: np.ndarray, windows: FlightWindows, z: float = 0.0) -> E
 def upper_size(
     slope: np.ndarray,
     change: np.ndarray,
-    half_width: np.ndarray,
+    factor: np.ndarray,
     size_of: Callable[..., EffectSize],
 ) -> EffectSize:
     """Return the upper end of the 95 % interval of the size of an effect with K parameters.
 
     `slope` (..., K) is the derivative of the simulated values, `change` (K,) the fitted parameters
-    minus those of the vehicle file, and `half_width` (K,) that of their 95 % intervals. `size_of`
-    takes a shift (...) of the simulated values, and `z` as in `rms_length`, to its size.
+    minus those of the vehicle file, and `factor` (K, L) their joint uncertainty, see
+    `Intervals.factor`: what two parameters cause may cancel. `size_of` takes a shift (...) of the
+    simulated values, and `z` as in `rms_length`, to its size.
     """
     size = size_of(slope @ change, z=Z95)
-    widths = [size_of(slope[..., k] * width) for k, width in enumerate(half_width)]
+    widths = [size_of(slope @ direction) for direction in factor.T]
     force, torque, drift = (
         float(np.sqrt(sum((one[i] or 0.0) ** 2 for one in widths))) for i in range(3)
     )

@@ -326,3 +326,7 @@ def test_a_rate_loop_faster_than_the_log_does_not_look_like_inertia():
     data = ViewEvidence(TORQUE, model, smoothed[TORQUE.name]).residuals(space.array("start"))
     share = (data.value * data.residual).sum(axis=0) / (data.value**2).sum(axis=0)
     assert share == pytest.approx([0.0] * 3, abs=0.0015)
+    # Rotors without a lag may turn at any speed between two rows.
+    quick = replace(vehicle, rotors=replace(vehicle.rotors, time_constant=0.0))
+    assert ready([log], vehicle).notes == ()
+    assert "every 10 ms do not show the torque" in ready([log], quick).notes[0]

@@ -10,6 +10,7 @@ import pytest
 
 from suite.diagnose.data.windows import SLICES, STATE
 from suite.diagnose.diagnose import Verdict, verdict_on
+from suite.diagnose.estimate.gauss_newton import Intervals
 from suite.diagnose.estimate.parameters import Candidate
 from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.search.evaluation import NamedEffect
@@ -231,12 +232,23 @@ def size_of(moved, z=0.0):
 
 def test_the_upper_end_of_a_size_holds_what_the_interval_allows():
     slope = pushed(1.0)[..., None]
-    upper = gaps.upper_size(slope, np.array([0.03]), np.array([0.01]), size_of)
+    upper = gaps.upper_size(slope, np.array([0.03]), np.array([[0.01]]), size_of)
     assert upper.force == pytest.approx(0.04) and not upper.relevant(THRESHOLDS)
-    unsure = gaps.upper_size(slope, np.array([0.03]), np.array([0.03]), size_of)
+    unsure = gaps.upper_size(slope, np.array([0.03]), np.array([[0.03]]), size_of)
     assert unsure.relevant(THRESHOLDS), "a small effect that may be large is no finding of none"
     slope[0] *= 2.0
-    assert gaps.upper_size(slope, np.array([0.03]), np.array([0.01]), size_of).force > 0.06
+    assert gaps.upper_size(slope, np.array([0.03]), np.array([[0.01]]), size_of).force > 0.06
+
+
+def test_parameters_that_cancel_have_the_size_of_their_sum():
+    """Two drags may have wide intervals, though the flights determine their sum."""
+    slope, change = np.repeat(pushed(1.0)[..., None], 2, axis=-1), np.array([0.5, -0.47])
+    for correlation, size in ((-1.0, 0.03), (0.0, 0.03 + 0.2 * 2**0.5), (1.0, 0.43)):
+        by_stretch = 7.0 * np.array([[1.0, correlation], [correlation, 1.0]])
+        intervals = Intervals(np.array([0.2, 0.2]), by_stretch, by_stretch)
+        factor = intervals.factor()
+        assert np.linalg.norm(factor, axis=1) == pytest.approx(intervals.half_width)
+        assert gaps.upper_size(slope, change, factor, size_of).force == pytest.approx(size)
 
 
 def test_an_effect_that_the_models_own_error_may_be_has_no_size_for_certain():
@@ -245,7 +257,8 @@ def test_an_effect_that_the_models_own_error_may_be_has_no_size_for_certain():
     space = SimpleNamespace(entries=[SimpleNamespace(effect="clock_offset")])
     named = [SimpleNamespace(candidate=SimpleNamespace(name="clock_offset"))]
     last = SimpleNamespace(evidence=SimpleNamespace(space=space))
-    found: Any = SimpleNamespace(named=named, last=last, indices=[0], half_widths=lambda: width)
+    judged = SimpleNamespace(intervals=lambda _: Intervals(width, np.eye(1), np.eye(1)))
+    found: Any = SimpleNamespace(named=named, last=last, indices=[0], judged=judged)
     found.estimate, found.start = (SimpleNamespace(theta=t) for t in (change, 0.0 * change))
 
     def upper(error):
