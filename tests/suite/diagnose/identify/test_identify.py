@@ -211,11 +211,11 @@ def test_commands_that_stop_early_do_not_identify_what_needs_them(drive, column,
 
 
 def test_a_flight_without_commands_or_voltage_takes_nothing_from_the_others():
-    logs = known.logs("pwm", 0)
-    alone = numbers_json(identify(logs[:3], known.start(), leave=TURNING).numbers)
+    logs, leave = known.logs("pwm", 0), (*TURNING, "drag")
+    alone = numbers_json(identify(logs[:3], known.start(), leave).numbers)
     assert set(alone) >= {"motors.thrust", "motors.voltage_exponent"}
-    short = identify([*logs[:3], *cut(logs[3:], "pwm")], known.start(), leave=TURNING)
-    no_voltage = identify([*logs[:3], *without_voltage(logs[3:])], known.start(), leave=TURNING)
+    short = identify([*logs[:3], *cut(logs[3:], "pwm")], known.start(), leave)
+    no_voltage = identify([*logs[:3], *without_voltage(logs[3:])], known.start(), leave)
     assert no_voltage.notes[0].startswith("no voltage in flight_3: ")
     for found in (short, no_voltage):
         entries = numbers_json(found.numbers)
