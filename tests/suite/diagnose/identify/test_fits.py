@@ -14,6 +14,7 @@ from tests.support import identified as known
 from tests.support import real_flights
 from tests.support.vehicles import PLAIN
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 SLOPE = Unknown("slope", 0.0, -10.0, 10.0, 1.0, 1e-3)
 BLIND = Unknown("blind", 4.0, -10.0, 10.0, 1.0, 1e-3)
 NONE = np.array([False])

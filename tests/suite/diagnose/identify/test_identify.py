@@ -14,6 +14,7 @@ from tests.support.diagnosis_flights import fly_all
 from tests.support.tools import program
 from tests.support.vehicles import PLAIN, with_effects
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 TRUE = {
     "motors.thrust": known.MOTORS.thrust,
     "motors.voltage_exponent": (known.MOTORS.voltage_exponent,),
@@ -211,11 +212,11 @@ def test_commands_that_stop_early_do_not_identify_what_needs_them(drive, column,
 
 
 def test_a_flight_without_commands_or_voltage_takes_nothing_from_the_others():
-    logs, leave = known.logs("pwm", 0), (*TURNING, "drag")
-    alone = numbers_json(identify(logs[:3], known.start(), leave).numbers)
+    logs = known.logs("pwm", 0)
+    alone = numbers_json(identify(logs[:3], known.start(), leave=TURNING).numbers)
     assert set(alone) >= {"motors.thrust", "motors.voltage_exponent"}
-    short = identify([*logs[:3], *cut(logs[3:], "pwm")], known.start(), leave)
-    no_voltage = identify([*logs[:3], *without_voltage(logs[3:])], known.start(), leave)
+    short = identify([*logs[:3], *cut(logs[3:], "pwm")], known.start(), leave=TURNING)
+    no_voltage = identify([*logs[:3], *without_voltage(logs[3:])], known.start(), leave=TURNING)
     assert no_voltage.notes[0].startswith("no voltage in flight_3: ")
     for found in (short, no_voltage):
         entries = numbers_json(found.numbers)
