@@ -144,7 +144,7 @@ def outcome(logs, drive="commands", limits=THRESHOLDS):
 def test_broken_flights_among_sound_ones(sound):
     rng = np.random.default_rng(0)
     broken = [breakage(log, rng) for breakage, log in zip(BREAKAGES[-3:], sound, strict=True)]
-    quick = Thresholds(most_names=1, fit_rounds=1, settle_rounds=1, last_rounds=1)
+    quick = Thresholds(most_names=1, short_list=1, settle_rounds=0, last_rounds=1, sign_draws=499)
     found = outcome([*broken, sound[1]], limits=quick)
     assert isinstance(found, dict), found
 

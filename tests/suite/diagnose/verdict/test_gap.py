@@ -145,7 +145,7 @@ def test_a_shape_that_grows_with_the_models_error_is_left_out_and_one_that_stays
 
 @pytest.fixture(scope="module")
 def log():
-    return fly(LAGGED, 0, duration_s=4.0, motors=True)
+    return fly(LAGGED, 0, duration_s=2.5, motors=True)
 
 
 def with_speeds(log, speed):
