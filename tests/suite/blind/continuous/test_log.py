@@ -40,7 +40,8 @@ def stepped(nominal, truth, ways, conditions, step_s):
     return fly_continuous(nominal, truth, ways, conditions, rng, step_s=step_s)
 
 
-@pytest.mark.parametrize("lag", [pytest.param(0.0, marks=pytest.mark.slow), 0.02])
+@pytest.mark.slow
+@pytest.mark.parametrize("lag", [0.0, 0.02])
 def test_a_finer_step_changes_a_flight_by_far_less_than_the_noise(lag):
     drag = {"linear_drag": ((0.3, 0.2, 0.1),), "quadratic_drag": ((0.03, 0.02, 0.04),)}
     air = {"inflow": (4e-4,), "ground_effect": (4.0, 0.0635), "blade_flapping": (1e-6,)}
