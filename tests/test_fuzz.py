@@ -183,7 +183,7 @@ def fuzz(kind, folder, count, part=0):
 
 @pytest.mark.parametrize("kind", (*KINDS, *FOREIGN))
 def test_odd_inputs_are_used_or_refused_in_a_line(kind, tmp_path, capfd):
-    fuzz(kind, tmp_path, 20)
+    fuzz(kind, tmp_path, 10)
     assert capfd.readouterr() == ("", ""), "libraries print nothing"
 
 

@@ -122,7 +122,13 @@ def compiled(function):
     return jax.jit(jax.vmap(both))
 
 
-@pytest.mark.parametrize("case", CASES)
+LONGEST = "action, from rest"
+"""Takes most of the time of all cases; the functions in it have cases of their own."""
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, marks=pytest.mark.slow) if c == LONGEST else c for c in CASES]
+)
 def test_a_gradient_is_the_limit_of_differences(case):
     function, at = CASES[case]
     with jax.enable_x64(True):

@@ -185,6 +185,7 @@ def _noise(
     measured = variograms.value
     # The variance is the variogram's limit at long lags. It counts as much as all short lags.
     weight = variograms.weight * np.append(np.ones(SHORT_LAGS), SHORT_LAGS)
+    root = np.sqrt(weight)
     size = float((variograms.weight[:, -1] * measured[:, -1]).sum()) + 1e-300
 
     def model(theta: np.ndarray) -> np.ndarray:
@@ -197,7 +198,7 @@ def _noise(
 
     def residual(theta: np.ndarray) -> np.ndarray:
         """Return the weighted residuals as one array."""
-        return (np.sqrt(weight) * (measured - model(theta)) / size).ravel()
+        return (root * (measured - model(theta)) / size).ravel()
 
     longest = max(LONGEST * duration_s, 2.0 * LONG_S)
     low = np.array([np.log(size) - 10.0, 0.0, LOG_RATIO[0], np.log(LEAST_S)])

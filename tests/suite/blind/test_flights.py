@@ -104,6 +104,7 @@ def test_an_effect_that_rotorpy_does_not_have_as_it_is_is_refused():
         rotorpy_flight.fly_rotorpy(LAGGED, truth, SHORT, 100.0)
 
 
+@pytest.mark.slow
 def test_flights_side_by_side_are_each_as_if_alone_and_move_as_their_accelerometers_say():
     pytest.importorskip("rotorpy")
     truth = with_effects(LAGGED, rotor_drag=(4e-4,))
@@ -121,8 +122,9 @@ def test_flights_side_by_side_are_each_as_if_alone_and_move_as_their_acceleromet
 
 def test_without_air_it_flies_as_mujoco_does_and_into_the_ground_it_fails():
     pytest.importorskip("rotorpy")
-    (here,) = fly(LAGGED, LAGGED, SHORT[:1])
-    (there,) = rotorpy_flight.fly_rotorpy(LAGGED, LAGGED, SHORT[:1], 100.0)
+    way = [replace(SHORT[0], duration_s=0.2)]
+    (here,) = fly(LAGGED, LAGGED, way)
+    (there,) = rotorpy_flight.fly_rotorpy(LAGGED, LAGGED, way, 100.0)
     off = Motion(*(np.abs(a - b).max() for a, b in zip(here.motion, there.motion, strict=True)))
     assert off.pos_w < 1e-3 and off.vel_w < 3e-3 and off.rate_b < 0.03
     with pytest.raises(FlightFailed, match=r"flight 1 failed at \d\.\d\d s"):

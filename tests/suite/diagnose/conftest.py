@@ -48,7 +48,7 @@ def diagnosed(tmp_path_factory):
     """Diagnose three flights with a hidden drag by the command; return its folder and result."""
     folder = tmp_path_factory.mktemp("diagnosis")
     truth = with_effects(LAGGED, linear_drag=((0.15, 0.15, 0.05),))
-    logs = fly_all([truth] * 3, range(3), duration_s=5.0, motors=True)
+    logs = fly_all([truth] * 3, range(3), duration_s=4.0, motors=True)
     paths = [str(write_flight(folder / f"{k}.parquet", log)) for k, log in enumerate(logs)]
     bad = folder / "bad.csv"
     bad.write_text("time,pos_x\n0,1\n", encoding="utf-8")
@@ -90,4 +90,4 @@ def flown(drag):
 def by_views():
     """Return a diagnosis of two effects by views."""
     hidden = {"linear_drag": ((0.4, 0.3, 0.2),), "angular_damping": ((6.0, 6.0, 4.0),)}
-    return diagnose(flights(4, 0, 5.0, hidden=hidden), VEHICLE, by="views")
+    return diagnose(flights(4, 0, 4.0, hidden=hidden), VEHICLE, by="views")

@@ -115,7 +115,7 @@ def test_an_input_that_would_be_written_over_and_too_few_flights_are_refused(tmp
     (tmp_path / "run.json").write_text(json.dumps(record))
     said = refused(capsys, "diagnose --vehicle reference", tmp_path, *out)
     assert "holds a run of another kind (made by suite loop)" in said
-    logs, new = fly_all([PLAIN] * 2, range(2), duration_s=3.0, motors=True), tmp_path / "new"
+    logs, new = fly_all([PLAIN] * 2, range(2), duration_s=2.0, motors=True), tmp_path / "new"
     short = write_flight(tmp_path / "short.parquet", rows(logs[0], logs[0].time_s < 1.2))
     assert "1.3 s" in refused(capsys, "diagnose --vehicle reference", short)
     one, other = (write_flight(tmp_path / f"{log.name}.parquet", log) for log in logs)
@@ -139,7 +139,7 @@ def test_a_change_is_written_as_every_diagnosis_is(tmp_path, capsys, monkeypatch
     save_vehicle(VEHICLE, tmp_path / "v.toml", "for a test")
     for folder, seed, effects in (("new", 8, {"mass_offset": (0.15,)}), ("old", 9, {})):
         (tmp_path / folder).mkdir()
-        for number, log in enumerate(flights(2, seed, 4.0, 2.0, hidden=effects)):
+        for number, log in enumerate(flights(2, seed, 3.0, 2.0, hidden=effects)):
             write_flight(tmp_path / folder / f"{number}.parquet", log)
     monkeypatch.chdir(tmp_path)
     Path("out").mkdir()
@@ -249,21 +249,24 @@ def test_plans_name_catalogue_effects_and_end_in_flights():
 FILES = sorted(example.FOLDER.glob("*.parquet"))
 
 
+@pytest.mark.slow
 def test_the_files_are_what_the_script_makes():
     made = example.make_flights()
     assert [path.stem for path in FILES] == [log.name for log in made]
     for path, log in zip(FILES, made, strict=True):
         kept = read_flight(path)
-        assert (kept.integrator, kept.step_s) == (log.integrator, log.step_s) == ("euler", 0.002)
+        assert (kept.integrator, kept.step_s) == (log.integrator, log.step_s)
         for name, bits in example.BITS.items():
             # Another machine's rounding may fall to the other side of a step.
             both = getattr(kept, name), getattr(log, name)
             np.testing.assert_allclose(*both, rtol=0, atol=1.01 * 2.0**-bits)
-    assert sum(path.stat().st_size for path in FILES) < 400_000
 
 
-def test_nothing_in_the_files_tells_what_is_hidden():
+def test_the_files_are_small_and_nothing_in_them_tells_what_is_hidden():
+    assert len(FILES) == 3 and sum(path.stat().st_size for path in FILES) < 400_000
     assert not set(example.HIDDEN) & set(load_vehicle(str(example.VEHICLE)).effects)
     for path in FILES:
-        text = json.dumps(read_flight(path).about)
+        log = read_flight(path)
+        assert (log.integrator, log.step_s) == ("euler", 0.002)
+        text = json.dumps(log.about)
         assert "com_offset" not in text and "battery" not in text

@@ -14,6 +14,7 @@ from tests.support import identified as known
 from tests.support import real_flights
 from tests.support.vehicles import PLAIN
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 SLOPE = Unknown("slope", 0.0, -10.0, 10.0, 1.0, 1e-3)
 BLIND = Unknown("blind", 4.0, -10.0, 10.0, 1.0, 1e-3)
 NONE = np.array([False])
@@ -46,7 +47,7 @@ def test_a_number_that_nothing_hangs_on_stays_and_flights_that_differ_are_the_un
 
 
 def test_intervals_hold_the_truth_nineteen_times_in_twenty():
-    found = [fit(flights([2.0] * 4, count=100, seed=k), [SLOPE]) for k in range(100)]
+    found = [fit(flights([2.0] * 4, count=100, seed=k), [SLOPE]) for k in range(60)]
     inside = [abs(one.value[0] - 2.0) < one.half_width[0] for one in found]
     assert 0.90 <= np.mean(inside) <= 0.99 and max(one.half_width[0] for one in found) < 0.03
 
@@ -90,7 +91,7 @@ def test_the_methods_own_errors_do_not_cancel_in_a_sum():
 
 def test_intervals_of_few_blocks_are_as_much_wider_as_students_t():
     few, many = (
-        [fit(flights([2.0], count=count, seed=k), [SLOPE]).half_width[0] for k in range(40)]
+        [fit(flights([2.0], count=count, seed=k), [SLOPE]).half_width[0] for k in range(20)]
         for count in (40, 2000)
     )
     # 4 blocks of 10 rows: t(3) = 3.18 in place of 1.96; the jackknife itself is a bit wider still.
@@ -179,7 +180,7 @@ def test_noise_of_the_rotor_speeds_widens_the_interval_and_makes_no_body_heavier
 
 def test_flapping_is_within_its_interval_and_none_without_what_it_needs():
     true, flights = 4e-7, real_flights.flights
-    blown = flights(3, 5, 5.0, blade_flapping=(true,))
+    blown = flights(3, 5, 4.0, blade_flapping=(true,))
     entry = flapping.flapping_of(blown, real_flights.VEHICLE)
     assert entry is not None and entry.key == "effects.blade_flapping.coefficient"
     ((low, high),), (value,) = entry.ci95, entry.value
@@ -188,7 +189,7 @@ def test_flapping_is_within_its_interval_and_none_without_what_it_needs():
     level = [replace(log, quat_wxyz=np.full_like(log.quat_wxyz, np.nan)) for log in blown]
     hover = np.full(len(blown[0].time_s), 9.81)
     bare = [replace(log, rotor_speed=None, thrust_cmd=hover) for log in blown]
-    without = flights(3, 6, 3.0)
+    without = flights(3, 6, 2.0)
     for logs in (level, bare, without):
         assert flapping.flapping_of(logs, real_flights.VEHICLE) is None
 

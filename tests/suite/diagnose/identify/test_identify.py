@@ -14,6 +14,7 @@ from tests.support.diagnosis_flights import fly_all
 from tests.support.tools import program
 from tests.support.vehicles import PLAIN, with_effects
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 TRUE = {
     "motors.thrust": known.MOTORS.thrust,
     "motors.voltage_exponent": (known.MOTORS.voltage_exponent,),
@@ -112,7 +113,7 @@ def test_an_inertia_that_is_ten_times_too_large_is_identified():
         assert moment == pytest.approx(true, rel=0.1)
 
 
-@pytest.mark.parametrize("drive", ["rotors", "pwm"])
+@pytest.mark.parametrize("drive", [pytest.param("rotors", marks=pytest.mark.slow), "pwm"])
 def test_time_on_the_ground_does_not_count(drive):
     (log, *_), leave = known.logs(drive, 0), (*TURNING, "drag")
     resting = on_the_ground(log, log.duration_s, 3.0)  # for most of the log

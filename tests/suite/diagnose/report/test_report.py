@@ -29,6 +29,12 @@ from tracks.common.files import plain
 from tracks.geometry.rotation import exp_rot, quat_to_rot
 
 
+@pytest.fixture(autouse=True)
+def undrawn(monkeypatch):
+    """Draw no pictures: tests/suite/diagnose/test_run.py has pages with theirs."""
+    monkeypatch.setattr(charts, "png", lambda figure: b"a picture")
+
+
 @pytest.fixture(scope="module")
 def found(drag, flown):
     mismatches = actuator_mismatches(flown.logs, flown.vehicle)

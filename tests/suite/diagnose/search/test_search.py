@@ -137,17 +137,17 @@ def test_p_values_of_coloured_noise_are_uniform():
 
 
 def test_the_true_effect_wins_over_one_that_looks_like_it_which_adds_nothing_to_it():
-    found = best_of(20, truth="rotor_drag", size=0.6, alike=1.0)
+    found = best_of(10, truth="rotor_drag", size=0.6, alike=1.0)
     # Gains on data left out are noisy; what looks alike is told apart by whole fits afterwards.
-    assert sum(one.candidate.name == "rotor_drag" for one in found) >= 18
+    assert sum(one.candidate.name == "rotor_drag" for one in found) >= 9
     assert max(one.p_value for one in found) <= 0.01
     least = 1.0 / (1 + THRESHOLDS.sign_draws)  # the record itself is one of the draws
     assert min(one.p_value for one in found) >= least * (1.0 - 1e-9)
     true = next(c for c in AMONG if c.name == "rotor_drag")
     others, named = [c for c in AMONG if c != true], list(true.indices)
-    found = best_of(20, named, others, truth="rotor_drag", size=0.6, alike=1.0)
+    found = best_of(10, named, others, truth="rotor_drag", size=0.6, alike=1.0)
     # The null shuffles the named effect's own part as well, which makes it the more careful.
-    assert sum(one.p_value <= 0.01 for one in found) < 3
+    assert sum(one.p_value <= 0.01 for one in found) < 2
 
 
 def test_other_seeds_draw_another_null_and_one_seed_the_same():

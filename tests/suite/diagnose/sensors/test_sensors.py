@@ -38,13 +38,17 @@ GROUPS = (("pos_w", "pos", "xyz"), ("vel_w", "vel", "xyz"), ("rot_w", "quat", "w
 
 
 def flown(
-    numbers: Sequence[int], delay_s: float = DELAY_S, drag: float = 0.0, **changed: float
+    numbers: Sequence[int],
+    delay_s: float = DELAY_S,
+    drag: float = 0.0,
+    long_s: float = LONG_S,
+    **changed: float,
 ) -> list[FlightLog]:
     """Return flights with an estimate by a model of `TRUE` that is late by `delay_s`.
 
     Its tilt errs by a neglected `drag`, with a correlation time of 0.8 s.
     """
-    lead, count = round(delay_s / STEP_S), round(LONG_S / STEP_S)
+    lead, count = round(delay_s / STEP_S), round(long_s / STEP_S)
     time_s = STEP_S * np.arange(-lead, count)
     drawn = np.array([np.random.default_rng(number).uniform(size=(2, 3)) for number in numbers])
     speed = 1.0 + 0.6 * drawn[:, 0]
@@ -88,6 +92,13 @@ def flown(
 
 
 flights, fitted = cache(lambda: flown(range(FLIGHTS))), cache(lambda: fit_sensors(flights()))
+short = cache(lambda: flown(range(2), long_s=15.0))
+"""Two flights, for tests that are not about the size of intervals."""
+
+
+def parts(log, group):
+    """Return the log with one group of its estimate, which fits faster than three."""
+    return replace(log, extra={k: v for k, v in log.extra.items() if k.startswith(f"est_{group}")})
 
 
 def test_the_true_parameters_are_within_the_intervals():
@@ -126,9 +137,8 @@ def test_a_drift_and_a_tilt_by_neglected_drag_are_found_where_they_are():
 
 
 def test_a_flight_without_a_part_of_the_estimate_does_not_count_for_it():
-    whole, long = flights()[0], flights()[1]
-    half = {name: v for name, v in long.extra.items() if not name.startswith("est_vel")}
-    one, two = (fit_sensors(logs) for logs in ([whole], [whole, replace(long, extra=half)]))
+    has, lacks = (parts(log, group) for log, group in zip(short(), ("vel", "quat"), strict=True))
+    one, two = (fit_sensors(logs) for logs in ([has], [has, lacks]))
     assert one.systematic.delay_s.value == pytest.approx(two.systematic.delay_s.value, abs=0.005)
     for axis in ("velocity_x", "velocity_y", "velocity_z"):
         assert two.axes[axis].noise.value == pytest.approx(one.axes[axis].noise.value, rel=0.1)
@@ -150,8 +160,8 @@ def test_a_wandering_clock_is_found_by_the_gyro_and_leaves_no_errors():
 
 def test_the_file_that_is_written_reads_back_with_what_was_found(tmp_path):
     file = tmp_path / "mine.toml"
-    for number, log in enumerate(flights()[:2]):
-        write_flight(tmp_path / f"{number}.parquet", log)
+    for number, log in enumerate(short()):
+        write_flight(tmp_path / f"{number}.parquet", parts(log, "vel"))
     found, read = identify_sensors([tmp_path], file, Console())["parameters"], load_sensors(file)
     noise, delay_s = (found[k]["value"] for k in ("measured_state.velocity_z", "delay.state"))
     assert read.models["measured_state"].velocity_z == pytest.approx(noise, rel=1e-3)
@@ -162,9 +172,9 @@ def test_the_file_that_is_written_reads_back_with_what_was_found(tmp_path):
 def test_an_estimate_ahead_of_its_reference_has_no_delay_in_the_file_and_a_warning(
     tmp_path, monkeypatch
 ):
-    for number, log in enumerate(flights()[:2]):
-        late = Clock(log.time_s, np.full(len(log.time_s), DELAY_S + 0.05))
-        write_flight(tmp_path / f"{number}.parquet", on_gyro_clock(log, late))
+    log = parts(short()[0], "vel")
+    late = Clock(log.time_s, np.full(len(log.time_s), DELAY_S + 0.05))
+    write_flight(tmp_path / "log.parquet", on_gyro_clock(log, late))
     # The gyro shows the shift, which would be removed.
     monkeypatch.setattr(identify, "clock_of", lambda log: Clock(np.zeros(1), np.zeros(1)))
     found = identify_sensors([tmp_path], tmp_path / "mine.toml", Console())
@@ -175,7 +185,7 @@ def test_an_estimate_ahead_of_its_reference_has_no_delay_in_the_file_and_a_warni
 
 
 def test_a_log_without_an_estimate_or_a_reference_is_refused(tmp_path):
-    log = flights()[0]
+    log = short()[0]
     bare = replace(log, extra={})
     lost = replace(log, pos_w=np.full_like(log.pos_w, np.nan), about={"partial": ["pos"]})
     for one, words in (
