@@ -163,7 +163,7 @@ def test_what_a_policy_is_given_on_flights_is_kept_but_for_rows_in_which_nothing
 
 
 @needs_cc
-@pytest.mark.parametrize("kind", ["acceleration", "ctbr"])
+@pytest.mark.parametrize("kind", ["acceleration", pytest.param("ctbr", marks=pytest.mark.slow)])
 def test_the_engines_that_are_timed_are_one_policy(kind, tmp_path):
     spec = replace(SPEC, action=ActionSpec(kind))
     folder = save_policy(tmp_path / "tiny", lively(spec, 2), spec, seed=1)
