@@ -114,13 +114,13 @@ def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(tmp_path, monke
 
 def test_a_network_learns_a_push_that_is_in_no_model():
     """As many windows are held out as are fitted: the errors of both are one program."""
-    nominal, config = nominal_model(PHYSICS), replace(CONFIG, iterations=60)
+    nominal, config = nominal_model(PHYSICS), replace(CONFIG, iterations=30)
     logs = fly(nominal, 8, extra_b=push)
     parts = (cut_windows(logs[k::2], config.horizon_s, config.stride_s) for k in (0, 1))
     found = fit_network(config, partial(replay_point_mass, nominal), *parts)
     without, with_delta = found.errors.values()
     assert without.position_m > 0.1 and with_delta.position_m < 0.5 * without.position_m
-    assert [row["iteration"] for row in found.curve] == list(range(60))
+    assert [row["iteration"] for row in found.curve] == list(range(30))
     assert found.curve[-1]["held_out_m"] == pytest.approx(with_delta.position_m, rel=1e-5)
 
 
