@@ -28,6 +28,7 @@ PACKAGES = (
 """Names of the packages that can change a result."""
 
 
+@functools.cache
 def package_versions() -> dict[str, str | None]:
     """Return the installed version of each of `PACKAGES`; None if it is missing."""
     versions: dict[str, str | None] = {}

@@ -44,12 +44,10 @@ EXAMPLES = {
     "quadrotor_gradient": (["3"], r"0\.06000 kg; the truth is 0\.06 kg", []),
 }
 """Name: arguments, what it must say (an expression), files that it must write."""
-IN_SHORT = {
-    "fly_and_plot": r"\d gates, timeout",
-    "own_track": r"\d gates, \w+",
-    "own_effect": r"0\.0 N/m: \d gates, timeout\n(.*\n)*0\.4 N/m: \d gates",
-}
-"""What these say where trials end after 0.6 s."""
+IN_FULL = (
+    *("bring_your_own_policy", "fly_and_plot", "own_effect", "own_track", "quadrotor_gradient"),
+)
+"""These take seconds also in short; the types of all are checked with each run of all tests."""
 
 
 def source(name):
@@ -78,8 +76,13 @@ def as_a_program(tmp_path, monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore:.*after a very short training this is no fault")
-@pytest.mark.parametrize("name", EXAMPLES)
-@pytest.mark.parametrize("short", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("name", "short"),
+    [
+        *((name, True) for name in EXAMPLES if name not in IN_FULL),
+        *(pytest.param(name, False, marks=pytest.mark.slow) for name in EXAMPLES),
+    ],
+)
 def test_the_example_runs(name, short, tmp_path, monkeypatch, capsys):
     """In this process, where jax and what is compiled are there already; warnings are errors."""
     args, said, written = EXAMPLES[name]
@@ -89,7 +92,7 @@ def test_the_example_runs(name, short, tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(suite, "make_env", made)
         # In full it is compiled for seconds, as in tests/suite/train/test_run.py.
         monkeypatch.setattr(train_run, "make_update", partial(made_update, trained := []))
-        said = IN_SHORT.get(name, said).replace("[1-8] gates", r"\d gates")
+        said = said.replace("[1-8] gates", r"\d gates")
     program = str(ROOT / "examples" / f"{name}.py")
     monkeypatch.setattr(sys, "argv", [program, *args])
     if name == "bring_your_own_policy":

@@ -227,6 +227,7 @@ def test_a_cache_that_is_full_or_cut_costs_time_and_no_words(suite):
     assert suite("", before=before) == (0, "")
 
 
+@pytest.mark.slow
 def test_warnings_of_numbers_are_not_for_people(suite, root, tmp_path):
     text = (root / "eval/vehicles/racer5.toml").read_text()
     (tmp_path / "it.toml").write_text(text.replace("mass = 0.75", "mass = 1e300"))

@@ -29,6 +29,7 @@ def refused(capture, line, *words, lines=1):
 
 
 def evaluate(out, line, *words):
-    """Run `suite eval` into `out`, by default at level 0; return the exit code."""
+    """Run `suite eval` into `out`, by default at level 0 for 0.1 s; return the exit code."""
     level = "" if "--difficulty" in line else "--difficulty 0"
-    return run(f"eval {level} {line}", *words, "--out", out)
+    limit = "" if "--time-limit-s" in line else "--time-limit-s 0.1"
+    return run(f"eval {level} {limit} {line}", *words, "--out", out)

@@ -2,10 +2,21 @@
 
 import json
 import re
+from pathlib import Path
 
 from policies import shipped
 from policies.formats.checkpoint import CONFIG, WEIGHTS
 from suite import cli
+
+
+def unpainted(monkeypatch):
+    """Let matplotlib save figures as empty files: painting takes longer than short flights."""
+
+    def save(figure, file, **_):
+        empty = b"\x89PNG"
+        file.write(empty) if hasattr(file, "write") else Path(file).write_bytes(empty)
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", save)
 
 
 def reproduce(tmp_path, name, *args):

@@ -12,6 +12,7 @@ from eval.worlds.trial import Rules
 from suite.loop import config as loop_config
 from suite.loop.config import RECORDED_FROM
 from suite.loop.options import Config
+from tests.support.documents import unpainted
 
 
 def resolve(**options):
@@ -41,8 +42,10 @@ class Small:
     recorded_s = 1.4
     """Length of a flight that is recorded, a little more than a window of a fit [s]."""
 
-    def __init__(self, monkeypatch):
+    def __init__(self, monkeypatch, painted=False):
         self.flown, self.trained = [], []
+        if not painted:
+            unpainted(monkeypatch)
         self.stop_after: int | None = None
         self._fly = eval.judging.judge.fly
         monkeypatch.setattr(eval.judging.judge, "fly", self.fly)

@@ -192,6 +192,14 @@ def gradient_of(config):
 
 
 @cache
+def flown_of(config):
+    """Return the compiled flight(params, worlds, key) -> (loss, records), without a gradient."""
+    rollout, shape = make_rollout(config), (config.episode.steps, config.episode.batch)
+    shift = np.zeros((*shape, config.spec.hidden_size), np.float32)
+    return jax.jit(lambda params, *given: rollout(params, shift, *given, network.encode))
+
+
+@cache
 def shards_of(config):
     """Return the compiled shards of a configuration, for two cores."""
     with mock.patch.object(shards, "usable_cores", lambda: 2):

@@ -217,7 +217,7 @@ def test_the_command_copies_all_a_diagnosis_needs(tmp_path, capsys):
     assert "flight_3.parquet --vehicle" in said.out and "mine" not in said.out
 
 
-def test_the_real_flights_come_as_published_and_tell_a_vehicle_at_the_first_try(tmp_path, capsys):
+def test_the_real_flights_come_as_published(tmp_path, capsys):
     names = answer(capsys, "example --real --out", tmp_path)["files"]
     assert f"import {tmp_path}/B3_figure8_fast_rep1.csv" in (tmp_path / "README.md").read_text()
     logs = [name for name in names if name.endswith(".csv")]
@@ -230,6 +230,11 @@ def test_the_real_flights_come_as_published_and_tell_a_vehicle_at_the_first_try(
     assert "arXiv 2603.09908" in (tmp_path / "README.md").read_text()
     packed = sum(path.stat().st_size for path in (FOLDER / "real").iterdir() if path.is_file())
     assert packed < 320_000
+
+
+@pytest.mark.slow
+def test_the_real_flights_tell_a_vehicle_at_the_first_try(tmp_path, capsys):
+    assert run("example --real --out", tmp_path) == 0
     raw, log = tmp_path / "B3_figure8_fast_rep1.csv", tmp_path / "eight.parquet"
     mapping, out = tmp_path / "nanobench.toml", tmp_path / "mine.toml"
     assert run("import --vehicle crazyflie21 --end 8 --map", mapping, "--out", log, raw) == 0

@@ -3,6 +3,7 @@
 import json
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,10 +26,17 @@ from suite.delta.fit import (
     ReplayErrors,
     _descend,
     _loss,
+    fit_network,
     identify,
     window_errors,
 )
-from suite.delta.replay import PointMassModel, check_corrects, describe_dynamics, nominal_model
+from suite.delta.replay import (
+    PointMassModel,
+    check_corrects,
+    describe_dynamics,
+    nominal_model,
+    replay_point_mass,
+)
 from suite.delta.run import errors_grid, fit_delta, long_enough, split
 from suite.delta.windows import cut_windows, log_decisions
 from suite.train.config import PointMassConfig, QuadrotorConfig
@@ -69,6 +77,7 @@ def push(vel_b, action_b):
     return -0.1 * action_b + np.array([0.0, 0.8, -0.5], np.float32)
 
 
+@pytest.mark.slow
 def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(tmp_path, monkeypatch):
     """As many flights are held out as are fitted: the errors of both are one program."""
     for number, log in enumerate(fly(nominal_model(PHYSICS), 8, extra_b=push)):
@@ -101,6 +110,18 @@ def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(tmp_path, monke
     assert "| point mass with Delta Action Model |" in said
     with pytest.raises(ValueError, match=r"\(seed is 0 there, 7 here\); give another --out"):
         fit_delta(replace(CONFIG, seed=7), PHYSICS, flights, tmp_path / "out", console)
+
+
+def test_a_network_learns_a_push_that_is_in_no_model():
+    """As many windows are held out as are fitted: the errors of both are one program."""
+    nominal, config = nominal_model(PHYSICS), replace(CONFIG, iterations=30)
+    logs = fly(nominal, 8, extra_b=push)
+    parts = (cut_windows(logs[k::2], config.horizon_s, config.stride_s) for k in (0, 1))
+    found = fit_network(config, partial(replay_point_mass, nominal), *parts)
+    without, with_delta = found.errors.values()
+    assert without.position_m > 0.1 and with_delta.position_m < 0.5 * without.position_m
+    assert [row["iteration"] for row in found.curve] == list(range(30))
+    assert found.curve[-1]["held_out_m"] == pytest.approx(with_delta.position_m, rel=1e-5)
 
 
 class Record(NamedTuple):

@@ -25,7 +25,7 @@ from suite.train import run as training_run
 from suite.train.config import TrainConfig
 from suite.train.ppo.config import PpoConfig
 from tests.support import judged_cells
-from tests.support.documents import another_racer, page, reproduce
+from tests.support.documents import another_racer, page, reproduce, unpainted
 from tests.support.engines import STAND_IN
 from tests.support.training import boxes_worlds
 from tracks.common.grid import Grid
@@ -35,6 +35,7 @@ class Sky:
     """Counts the trials that are flown, and stops at a given one."""
 
     def __init__(self, monkeypatch):
+        unpainted(monkeypatch)
         self.flown = []
         self.stop_after = None
         self._fly = judging.fly_share

@@ -38,7 +38,7 @@ def printed(capture):
 
 def test_eval_writes_the_tables_and_says_them(pilots, tmp_path, capfd):
     out = tmp_path / "out"
-    line = "eval --difficulty 0 --track zigzag --trials 2 --seed 5 --time-limit-s 3 --policy"
+    line = "eval --difficulty 0 --track zigzag --trials 2 --seed 5 --time-limit-s 1.5 --policy"
     said = answer(capfd, line, pilots["pursuit"], pilots["diver"], "--out", out)
     names = {path.name for path in out.iterdir()}
     assert names == {"trials.parquet", "table.md", "summary.json", "run.json"}
@@ -51,7 +51,7 @@ def test_eval_writes_the_tables_and_says_them(pilots, tmp_path, capfd):
     assert [cell["policy"] for cell in summary["cells"]] == ["pursuit", "diver"]
     assert summary["paired"][0]["trials"] == 2
     caption = (out / "table.md").read_text().splitlines()[0]
-    said = "Vehicle reference, sensors perfect, simulator mujoco, seeds 5 to 6, time limit 3 s."
+    said = "Vehicle reference, sensors perfect, simulator mujoco, seeds 5 to 6, time limit 1.5 s."
     assert caption == said
     header = json.loads(pq.read_schema(out / "trials.parquet").metadata[b"suite"])
     assert set(header) >= {"schema", "suite_version", "git_commit", "seed"}
@@ -85,7 +85,7 @@ def test_a_policy_that_its_training_replaces_during_the_flights_is_recorded_as_f
 
 
 def test_what_a_folder_holds_is_not_written_over_without_a_word(pilots, tmp_path, capsys):
-    asked = ("--track zigzag --policy", pilots["diver"], "--trials")
+    asked = ("--time-limit-s 0.1 --track zigzag --policy", pilots["diver"], "--trials")
     assert evaluate(tmp_path, *asked, 1) == 0
     assert "overwritten" not in printed(capsys)
     assert evaluate(tmp_path, *asked, 1) == 0
@@ -103,7 +103,7 @@ def test_what_a_folder_holds_is_not_written_over_without_a_word(pilots, tmp_path
 
 
 def test_an_interrupted_eval_goes_on_to_the_same_result(pilots, tmp_path, monkeypatch, capfd):
-    asked = ("--track circular,zigzag --trials 1 --time-limit-s 0.4 --policy", pilots["pursuit"])
+    asked = ("--track circular,zigzag --trials 1 --time-limit-s 0.1 --policy", pilots["pursuit"])
     whole, again = tmp_path / "whole", tmp_path / "again"
     assert evaluate(whole, *asked) == 0
     flown = cut_short(monkeypatch, stop_after=1)
@@ -118,6 +118,7 @@ def test_an_interrupted_eval_goes_on_to_the_same_result(pilots, tmp_path, monkey
     assert read_trials(again / "trials.parquet") == read_trials(whole / "trials.parquet")
 
 
+@pytest.mark.slow
 def test_trials_flown_before_under_another_label_are_the_same_policys(
     pilots, tmp_path, monkeypatch
 ):
@@ -137,7 +138,7 @@ def test_a_later_policys_journal_is_looked_at_before_the_first_flight(
     pilots, tmp_path, monkeypatch, capsys
 ):
     """The first policy's trials may take hours."""
-    out, asked = tmp_path / "out", "--track zigzag --trials 1 --policy"
+    out, asked = tmp_path / "out", "--time-limit-s 0.1 --track zigzag --trials 1 --policy"
     with monkeypatch.context() as patch:
         cut_short(patch, stop_after=2)
         assert evaluate(out, asked, pilots["diver"], pilots["other"]) == 130
@@ -218,7 +219,8 @@ ONE = "--track zigzag --trials 1 --policy"
 
 def test_view_flies_the_chosen_trials_again(pilots, tmp_path, monkeypatch, capfd, request):
     out, seen = tmp_path / "out", tmp_path / "seen"
-    assert evaluate(out, "--track ellipse --trials 2 --seed 2 --policy", pilots["diver"]) == 0
+    asked = "--track ellipse --trials 2 --seed 2 --time-limit-s 2 --policy"
+    assert evaluate(out, asked, pilots["diver"]) == 0
     again = ("view --out", seen, out)
     said = answer(capfd, *again, *"--pick failed --count 1 --gif".split())
     names = sorted(path.name for path in seen.iterdir())
@@ -241,7 +243,7 @@ def test_view_finds_the_trials_of_every_policy_of_a_run(pilots, tmp_path, capfd)
     """The first one is often `race`, and the one that fails the user's own."""
     out, again = tmp_path / "out", ("view --out", tmp_path / "seen", tmp_path / "out")
     policies = ("--policy", pilots["pursuit"], pilots["diver"], pilots["diver2"])
-    assert evaluate(out, "--trials 1 --track zigzag", *policies) == 0
+    assert evaluate(out, "--trials 1 --track zigzag --time-limit-s 20", *policies) == 0
     assert run(*again, "--pick", "failed") == 0
     said = capfd.readouterr().err
     assert f"flying 1 trial of {pilots['diver']} again" in said
@@ -253,6 +255,7 @@ def test_view_finds_the_trials_of_every_policy_of_a_run(pilots, tmp_path, capfd)
     assert "unknown --policy 'rac'" in refused(capfd, *again, "--policy", "rac")
 
 
+@pytest.mark.slow
 def test_view_flies_at_the_speed_of_the_shown_trials(pilots, tmp_path, monkeypatch, unpainted):
     out = tmp_path / "out"
     assert evaluate(out, "--trials 1 --track zigzag --speed 0.4 0.7 --policy", pilots["other"]) == 0
@@ -274,7 +277,7 @@ def test_a_run_whose_files_have_changed_is_not_flown_again(
     files["sensors"] = Path(shutil.copy(root / "eval/sensors/presets/vio.toml", tmp_path))
     flown = [text for name, file in files.items() for text in (f"--{name}", file)]
     out, again = tmp_path / "out", ("view --out", tmp_path / "seen", tmp_path / "out")
-    assert evaluate(out, "--trials 1 --time-limit-s 0.5", *flown) == 0
+    assert evaluate(out, "--trials 1", *flown) == 0
     for what in ("vehicle", "track"):
         files[what].write_text(f"# a comment\n{files[what].read_text()}")
     assert run(*again) == 0
@@ -331,15 +334,15 @@ def test_a_trial_ends_at_the_time_that_is_given_and_is_seen_so_again(
     pilots, tmp_path, capfd, unpainted
 ):
     out, logs = tmp_path / "out", tmp_path / "logs"
-    asked = ("--time-limit-s 0.6", *ONE.split(), pilots["pursuit"])
+    asked = ("--time-limit-s 0.2", *ONE.split(), pilots["pursuit"])
     assert evaluate(out, *asked) == 0
     (row,) = read_trials(out / "trials.parquet")
-    assert (row.ended_by, row.time_s) == ("timeout", 0.6)
+    assert (row.ended_by, row.time_s) == ("timeout", 0.2)
     assert run("view --out", tmp_path / "seen", out) == 0
-    assert "timeout after 0.6 s" in capfd.readouterr().out
+    assert "timeout after 0.2 s" in capfd.readouterr().out
     assert run("collect --difficulty 0 --out", logs, *asked[0].split(), *asked[1:]) == 0
     listed = json.loads((logs / "flights.json").read_text())
-    assert [flight["time_s"] for flight in listed["flights"]] == [0.6]
+    assert [flight["time_s"] for flight in listed["flights"]] == [0.2]
     words = refused(capfd, "eval --time-limit-s 0 --out", out, *asked[1:])
     assert "--time-limit-s is 0.0, allowed is" in words
 

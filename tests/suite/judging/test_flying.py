@@ -122,7 +122,7 @@ def test_an_object_whose_rows_depend_on_each_other_is_refused_and_memory_warns(m
 def test_a_track_file_is_flown_once_a_seed_and_once_where_nothing_acts_by_chance(pilots, tmp_path):
     trials = trial_list([YARD, "zigzag"], [0, 9], trials=2, seed=3)
     assert [t[1:] for t in trials] == [(0, 3), (0, 4), (0, 3), (0, 4), (9, 3), (9, 4)]
-    line = f"--track {YARD} --difficulty 4 --trials 1 --policy"
+    line = f"--track {YARD} --difficulty 4 --trials 1 --time-limit-s 2 --policy"
     assert evaluate(tmp_path, line, pilots["diver"]) == 0
     (row,) = read_trials(tmp_path / "trials.parquet")
     assert (row.track, row.difficulty, row.ended_by) == (YARD, 0, "collision")
@@ -156,7 +156,8 @@ def test_a_track_file_is_flown_once_a_seed_and_once_where_nothing_acts_by_chance
 )
 def test_sensors_without_random_numbers_give_equal_flights(tmp_path, stage, text, flights, noted):
     (tmp_path / "mine.toml").write_text(f'name = "mine"\n[[{stage}]]\n{text}\n')
-    options = Evaluation(track=YARD, trials=3, sensors=str(tmp_path / "mine.toml"))
+    (track := tmp_path / "course.toml").write_text(IN_CONTACT.replace("0.02", "1.3"))
+    options = Evaluation(track=str(track), trials=3, sensors=str(tmp_path / "mine.toml"))
     trial_set = read_trial_set(options)
     assert len(trial_set.trials) == flights
     assert noted in trial_set.notes[-1] if noted else not trial_set.notes

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from policies.networks import network
 from suite.train import losses, rollout
 from suite.train.config import LossConfig, PointMassConfig
 from suite.train.dynamics import point_mass
 from suite.train.dynamics.interface import make_dynamics
-from suite.train.gradient import encoder_gradient, sampled_encoder_gradient
+from suite.train.gradient import sampled_encoder_gradient
 from suite.train.losses import UNIT_FIELD, speed_to_goal
 from suite.train.rollout import view_in
 from suite.train.step import BEYOND_M, PATH_SAMPLES, approach_shift, make_step, target_gate
@@ -26,8 +27,8 @@ from tests.support.training import (
     blind,
     boxes_worlds,
     doubled,
+    flown_of,
     fresh_params,
-    gradient_of,
     largest_difference,
     loss_of,
     small_config,
@@ -45,10 +46,13 @@ def test_training_casts_one_ray_a_pixel_whatever_the_camera_casts_in_flight(monk
         return jnp.ones((len(pos_w), len(rays)))
 
     monkeypatch.setattr(rollout, "depth_image", spy)
-    state = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
     observer = rollout.Observer(config)
-    start = observer.start(worlds, state, (SPEC.hidden_size,))
-    jax.eval_shape(partial(observer.observe, worlds), start, jax.random.split(KEY, 4))
+
+    def look(keys):
+        state = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
+        return observer.observe(worlds, observer.start(worlds, state, (SPEC.hidden_size,)), keys)
+
+    jax.eval_shape(look, jax.random.split(KEY, 4))
     assert cast == [(camera.height * camera.width, 3)]
 
 
@@ -146,7 +150,7 @@ def test_a_world_that_crashed_deep_leaves_the_loss():
         pos_w=np.array(inside), vel_w=0 * worlds.vel_w,
         scene=worlds.scene._replace(boxes=boxes._replace(center_w=center, half_size=wall)),
     )  # fmt: skip
-    records = gradient_of(NOISY)(params, moved, KEY, None)[2]
+    records = flown_of(NOISY)(params, moved, KEY)[1]
     total = np.abs(sum(np.array(term) for term in records.terms.values()))
     assert np.all(total[0] > 0)
     assert not np.any(total[1:, :2]) and np.all(total[1:, 2:] > 0)
@@ -189,19 +193,19 @@ def test_what_is_delayed_is_shown_so_many_steps_later_and_before_them_the_start(
 
 def test_a_stopped_world_leaves_the_loss_and_a_remembered_state_is_flown():
     worlds, params = boxes_worlds(NOISY), fresh_params()
-    run = gradient_of(NOISY)
-    _, _, records = run(params, worlds._replace(stop=np.array([6, 2, 1, 6])), KEY, None)
+    run = flown_of(NOISY)
+    _, records = run(params, worlds._replace(stop=np.array([6, 2, 1, 6])), KEY)
     assert np.array_equal(
         records.alive.T, [[1] * 6, [1, 1, 0, 0, 0, 0], [1, 0, 0, 0, 0, 0], [1] * 6]
     )
     for term in records.terms.values():
         assert (np.asarray(term)[np.asarray(records.alive) == 0] == 0).all()
     remembered = worlds._replace(hidden=np.full_like(worlds.hidden, 0.5))
-    first = run(params, remembered, KEY, None)[2].hidden[0]
+    first = run(params, remembered, KEY)[1].hidden[0]
     assert np.abs(np.asarray(first - records.hidden[0])).max() > 0.1
 
 
-@pytest.mark.parametrize("finish", [False, True])
+@pytest.mark.parametrize("finish", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_world_that_has_passed_its_last_gate_leaves_the_loss_where_that_is_the_finish(finish):
     config = replace(NOISY, episode=replace(NOISY.episode, finish=finish))
     worlds = boxes_worlds(config)
@@ -234,16 +238,18 @@ def test_the_encoders_gradient_is_that_of_its_chunks_and_on_average_of_every_oth
     params, rng = fresh_params(), np.random.default_rng(1)
     images = jnp.asarray(rng.normal(size=(6, 2, 20, 20)), jnp.float32)
     cotangents = jnp.asarray(rng.normal(size=(6, 2, 8)), jnp.float32)
-    inputs = params, images.reshape(12, 20, 20), cotangents.reshape(12, 8)
-    whole = jax.jit(encoder_gradient)(*inputs)
+
+    @jax.jit
+    def whole(params):
+        encode = lambda params: network.encode(params, images.reshape(12, 20, 20))  # noqa: E731
+        return jax.vjp(encode, params)[1](cotangents.reshape(12, 8))[0]
+
+    monkeypatch.setattr("suite.train.gradient.CHUNK", 4)  # two chunks of three images
     keys = {int(jax.random.randint(key, (), 0, 2)): key for key in jax.random.split(KEY, 8)}
     sampled = jax.jit(sampled_encoder_gradient, static_argnums=3)
     halves = [sampled(params, images, cotangents, 2, keys[k]) for k in (0, 1)]
     mean = jax.tree.map(lambda one, other: (one + other) / 2, *halves)
-    assert largest_difference(mean, whole) < 1e-5
-    monkeypatch.setattr("suite.train.gradient.CHUNK", 5)
-    in_chunks = jax.jit(lambda *inputs: encoder_gradient(*inputs))
-    assert largest_difference(in_chunks(*inputs), whole) < 1e-5
+    assert largest_difference(mean, whole(params)) < 1e-5
 
 
 stepped = jax.jit(make_step, static_argnums=0)
@@ -266,7 +272,9 @@ def test_the_point_before_the_gate_that_progress_is_measured_to(place_g, shift):
     assert approach_shift(LossConfig(), jnp.array([place_g])) == 0.0
 
 
-@pytest.mark.parametrize(("pass_first", "speed"), [(False, -3.0), (True, 3.0)])
+@pytest.mark.parametrize(
+    ("pass_first", "speed"), [(False, -3.0), pytest.param(True, 3.0, marks=pytest.mark.slow)]
+)
 def test_a_step_through_a_gate_and_its_numbers(pass_first, speed):
     """From 0.1 m before the first gate to 0.1 m behind it at 3 m/s; the second is straight on."""
     worlds = boxes_worlds(small_config(2))

@@ -105,6 +105,7 @@ def flights(family):
     return scene, jnp.asarray(pos, jnp.float32), jnp.asarray(rot, jnp.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
 def test_culled_images_and_distances_are_exact_where_they_matter(family):
     """All but a few far pixels, and distances within 1 m, where the loss of an obstacle starts."""
@@ -179,32 +180,22 @@ def seen(config, steps=3):
     return of, worlds, start
 
 
-@pytest.fixture(scope="module")
-def shown():
-    """Return a function (worlds, start) of what is seen, and slopes of the sums of both parts.
-
-    These are along a change of all positions, then one of all attitudes: forwards, which compiles
-    faster. The stereo camera does not round disparities: rounding would have no slope anyway.
-    """
-    unrounded = ALL.seen.models["stereo"]._replace(step=0.0)
-    of = seen(sensed(seen=replace(ALL.seen, models={**ALL.seen.models, "stereo": unrounded})))[0]
-    rng = np.random.default_rng(2)
-    way, turn = rng.normal(size=(BATCH, 3)), rng.normal(size=(BATCH, 3, 3))
-
-    def sums(along, worlds, state):
-        moved = {"pos_w": state.pos_w + along[0] * way, "rot_w": state.rot_w + along[1] * turn}
-        found = of(worlds, state._replace(**moved))
-        return (found.state.sum(), found.image.sum()), found
-
-    both = jax.jit(jax.jacfwd(sums, has_aux=True))
-    return lambda worlds, state: both(jnp.zeros(2), worlds, state)[::-1]
+def unrounded(*names):
+    """Return sensors of these models, with a stereo camera that does not round disparities."""
+    models = {**ALL.seen.models, "stereo": ALL.seen.models["stereo"]._replace(step=0.0)}
+    return replace(ALL.seen, models={name: models[name] for name in names or models})
 
 
-def test_at_magnitude_nothing_the_truth_is_seen(shown):
-    _, perfect, state = seen(sensed(perfect_share=1.0, magnitude=(1.0, 1.0)))
-    noisy = seen(sensed(perfect_share=0.0, magnitude=(1.0, 1.0)))[1]
-    without, worlds, _ = seen(SMALL)
-    one, last = (shown(each, state)[0] for each in (perfect, noisy))
+@pytest.mark.parametrize(
+    "names",
+    [("delay", "state_noise", "stereo"), pytest.param((), marks=pytest.mark.slow, id="all")],
+)
+def test_at_magnitude_nothing_the_truth_is_seen(names):
+    few = unrounded(*names)
+    shown, perfect, state = seen(sensed(seen=few, perfect_share=1.0, magnitude=(1.0, 1.0)))
+    noisy = seen(sensed(seen=few, perfect_share=0.0, magnitude=(1.0, 1.0)))[1]
+    (without, worlds, _), shown = seen(SMALL), jax.jit(shown)
+    one, last = (shown(each, state) for each in (perfect, noisy))
     none = jax.jit(without)(worlds, state)
     np.testing.assert_allclose(one.state, none.state, atol=2e-5)
     np.testing.assert_allclose(one.image, none.image, atol=2e-5)
@@ -212,16 +203,26 @@ def test_at_magnitude_nothing_the_truth_is_seen(shown):
     assert np.ptp(last.image[-1] - none.image[-1]) > 1e-2
 
 
-def test_the_state_carries_a_finite_gradient_and_the_image_none(shown):
+@pytest.mark.slow
+def test_the_state_carries_a_finite_gradient_and_the_image_none():
+    """Along a change of all positions, then one of all attitudes: forwards compiles faster."""
     _, worlds, state = seen(sensed(perfect_share=0.0, magnitude=(2.0, 2.0)))
-    of_state, of_image = map(np.asarray, shown(worlds, state)[1])
+    of, rng = seen(sensed(seen=unrounded()))[0], np.random.default_rng(2)
+    way, turn = rng.normal(size=(BATCH, 3)), rng.normal(size=(BATCH, 3, 3))
+
+    def sums(along):
+        moved = {"pos_w": state.pos_w + along[0] * way, "rot_w": state.rot_w + along[1] * turn}
+        found = of(worlds, state._replace(**moved))
+        return found.state.sum(), found.image.sum()
+
+    of_state, of_image = map(np.asarray, jax.jit(jax.jacfwd(sums))(jnp.zeros(2)))
     assert np.isfinite(of_state).all() and np.abs(of_state).min() > 0.1
     assert not of_image.any()
 
 
 def test_magnitudes_are_drawn_per_world_and_model_from_the_range():
     sensors = replace(ALL, perfect_share=0.25, magnitude=(0.5, 2.0))
-    config = replace(small_config(batch=200), sensors=sensors)
+    config = replace(small_config(batch=80), sensors=sensors)
     drawn = sample_worlds(config, 0).sensed
     assert set(drawn.magnitude) == set(ALL.seen.models)
     table = np.stack(list(drawn.magnitude.values()))
@@ -229,7 +230,7 @@ def test_magnitudes_are_drawn_per_world_and_model_from_the_range():
     assert none.mean() == pytest.approx(0.25, abs=0.1)
     assert table[:, ~none].min() >= 0.5 and table[:, ~none].max() <= 2.0
     assert len(np.unique(table[:, ~none])) == table[:, ~none].size
-    assert drawn.trial["gate_map"].normal.shape == (200, SENSORS["gate_map"].trial.normal)
+    assert drawn.trial["gate_map"].normal.shape == (80, SENSORS["gate_map"].trial.normal)
     plain, again = (sample_worlds(c, 0) for c in (replace(config, sensors=None), config))
     for field in ("pos_w", "target", "stop", "fov_scale"):
         assert np.array_equal(getattr(plain, field), getattr(again, field)), field

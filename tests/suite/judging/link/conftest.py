@@ -7,6 +7,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialSpec, track_of
 from suite.judging.link.companion import Companion
 from suite.judging.link.messages import State, Wire, image_packets
+from tests.support.courses import IN_CONTACT
 from tests.support.pilots import Pursuit
 
 TRIAL = TrialSpec("zigzag", 0, 0)
@@ -49,6 +50,19 @@ class Bench:
             self.now += 0.01
         assert self.companion.flying
         return self
+
+
+@pytest.fixture
+def track(tmp_path):
+    """Return a track file that is read faster than one with a mesh."""
+    (file := tmp_path / "yard.toml").write_text(IN_CONTACT.replace("0.02", "1.3"))
+    return file
+
+
+@pytest.fixture
+def real(track):
+    """Return a command that flies a real vehicle, but for its folder."""
+    return f"fly --link udpin:127.0.0.1:0 --track {track} --vehicle crazyflie21 --out"
 
 
 @pytest.fixture

@@ -243,14 +243,13 @@ def test_a_link_on_which_nobody_is_ends_and_a_vehicle_that_waits_is_called(
 
 
 LINK = "fly --link udpin:127.0.0.1:0 --out"
-REAL = LINK.replace("--out", "--track tracks/examples/yard.toml --vehicle crazyflie21 --out")
 
 
-def test_a_real_vehicle_needs_the_operators_word(capsys, tmp_path, monkeypatch):
-    assert "docs/fly.md" in refused(capsys, REAL, tmp_path)
-    assert "silence-s" in refused(capsys, REAL, tmp_path, "--silence-s", "-1")
-    confirmed = (REAL, tmp_path, "--confirm")
-    for one in ("--vehicle racer5", "--track tracks/examples/yard.toml"):
+def test_a_real_vehicle_needs_the_operators_word(capsys, tmp_path, monkeypatch, real, track):
+    assert "docs/fly.md" in refused(capsys, real, tmp_path)
+    assert "silence-s" in refused(capsys, real, tmp_path, "--silence-s", "-1")
+    confirmed = (real, tmp_path, "--confirm")
+    for one in ("--vehicle racer5", f"--track {track}"):
         said = refused(capsys, f"{LINK} {tmp_path} --confirm {one}")
         assert "the vehicle file (--vehicle) and the course (--track)" in said
     high = refused(capsys, "fly --floor-m 3 --out", tmp_path / "high")
@@ -276,7 +275,7 @@ def test_a_real_vehicle_needs_the_operators_word(capsys, tmp_path, monkeypatch):
 
 
 def test_an_operator_who_ends_a_flight_is_told_to_the_vehicle_and_its_log_stays(
-    capsys, tmp_path, monkeypatch
+    capsys, tmp_path, monkeypatch, real
 ):
     sent = []
 
@@ -285,10 +284,10 @@ def test_an_operator_who_ends_a_flight_is_told_to_the_vehicle_and_its_log_stays(
 
     monkeypatch.setattr(fly, "fly_link", ended)
     monkeypatch.setattr(UdpLink, "send", lambda self, datagrams: sent.extend(datagrams))
-    assert run(REAL, tmp_path, "--confirm") == 1
+    assert run(real, tmp_path, "--confirm") == 1
     assert "the operator" in printed(capsys) and len(sent) == 1 and b"the operator" in sent[0]
     (tmp_path / "zigzag-0-0.parquet").write_text("the log of a flight that ended by an error")
-    for command in (f"{REAL} {tmp_path} --confirm", f"fly --out {tmp_path}"):
+    for command in (f"{real} {tmp_path} --confirm", f"fly --out {tmp_path}"):
         assert "holds earlier flights" in refused(capsys, command)
 
 
@@ -381,12 +380,12 @@ def test_a_flight_in_real_time_over_the_loopback(tmp_path, capsys):
     assert (log.integrator, log.step_s) == ("euler", 0.002), "the steps that a diagnosis repeats"
 
 
-def test_a_speed_and_the_judges_monitor_fly_in_real_time_too(capsys, tmp_path, monkeypatch):
+def test_a_speed_and_the_judges_monitor_fly_in_real_time_too(capsys, tmp_path, monkeypatch, real):
     flown = []
     said = refused(capsys, "fly --policy race-paper --speed 0.3 --out", tmp_path)
     assert "--speed 0.3: race-paper takes no speed" in said
     monkeypatch.setattr(fly, "_fly_real_vehicle", lambda policy, *_: flown.append(policy) or {})
-    asked = (REAL.replace("fly", "fly --policy race --confirm"),)
+    asked = (real.replace("fly", "fly --policy race --confirm", 1),)
     assert run(*asked, tmp_path / "a", "--speed", "0.3") == run(*asked, tmp_path / "b") == 0
     assert [policy.spec.speed for policy in flown] == [0.3, load_policy("race").spec.speed]
     capsys.readouterr()

@@ -112,6 +112,7 @@ def test_on_the_judges_steps_the_trainers_quadrotor_flies_the_judges_flight(floa
         np.testing.assert_allclose(one, two, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_the_default_recipe_draws_vehicles_that_fly():
     """A second of mild actions tips none over, around the lightest of the shipped vehicles."""
     config = with_quadrotor(named_recipe("race"), load_vehicle("crazyflie21")).quadrotor
@@ -120,8 +121,12 @@ def test_the_default_recipe_draws_vehicles_that_fly():
     assert np.isfinite(pos_w).all() and rot_w[..., 2, 2].min() > 0.5
 
 
+@pytest.mark.slow
 def test_the_rollouts_gradient_is_that_of_finite_differences(float64, monkeypatch):
-    """Where nothing is cut, heading held, with a Delta Action network, which sees the attitude."""
+    """Where nothing is cut, heading held, with a Delta Action network, which sees the attitude.
+
+    tests/test_gradients.py has that of three decisions by the action.
+    """
     monkeypatch.setattr(quadrotor, "blend_heading", lambda heading_w, *_: heading_w)
     monkeypatch.setattr(losses, "BARRIER_SLOPE", -4.0)  # smooth enough for differences
     free = {"gradient_decay": 0.0, "field_gain": 0.0, "collide": 0.0}
@@ -216,6 +221,7 @@ def test_draws_stay_within_what_a_vehicle_can_have_and_move_no_other_draw():
     np.testing.assert_allclose(torque.std(0), [0.0192, 0.0192, 0.00384], rtol=0.08)
 
 
+@pytest.mark.slow
 def test_effects_of_every_kind_fly_in_training_together():
     drawn = drawn_effects(np.random.default_rng(0)).effects
     effects = {name: values for name, values in drawn.items() if EFFECTS[name].in_flight}

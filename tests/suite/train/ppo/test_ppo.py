@@ -279,6 +279,7 @@ def worlds():
     return drawn._replace(scene=boxes_only(drawn.scene))
 
 
+@pytest.mark.slow
 def test_mapped_it_flies_what_the_batch_of_the_trainers_ppo_flies(worlds):
     seen, state = reset(KEYS, worlds)
     assert seen.state.shape == (3, 12) and seen.image.shape == (3, 20, 20)
