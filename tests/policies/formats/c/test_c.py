@@ -21,6 +21,7 @@ from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.formats.spec_json import KEY, labels
 from policies.policy import load_policy
 from policies.spec import NoAnswer, PolicyError
+from tests.support.marks import slow
 from tests.support.policy_files import SPEC, action_of, lively
 from tracks.geometry.camera import Camera
 
@@ -90,7 +91,7 @@ def checked(folder, *flags, name="check"):
 
 @pytest.mark.parametrize(
     ("name", "kind"),
-    [("odd", "-DPOLICY_PLAIN"), ("odd", "-march=native"), ("odd8", "-march=native")],
+    [slow("odd", "-DPOLICY_PLAIN"), ("odd", "-march=native"), slow("odd8", "-march=native")],
 )
 def test_it_compiles_strictly_and_runs_under_the_sanitizers(exports, name, kind):
     flags = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", kind)
@@ -101,8 +102,8 @@ def test_it_compiles_strictly_and_runs_under_the_sanitizers(exports, name, kind)
 
 def test_it_does_not_compile_without_its_checks_for_nan_or_with_another_header(exports, tmp_path):
     def said(folder, *flags):
-        command = [*(find_compiler() or ()), "-std=c99", *flags, "-c", str(folder / "policy.c")]
-        made = subprocess.run([*command, "-o", str(tmp_path / "o")], capture_output=True, text=True)
+        command = [*(find_compiler() or ()), "-std=c99", *flags, str(folder / "policy.c")]
+        made = subprocess.run([*command, "-fsyntax-only"], capture_output=True, text=True)
         return made.stderr
 
     folder = shutil.copytree(exports["odd"].folder, tmp_path / "copy")
@@ -141,7 +142,7 @@ def test_the_vectors_find_one_wrong_weight(exports, tmp_path):
     assert checked(folder).returncode == 1
 
 
-@pytest.mark.parametrize(("name", "steps"), [("float32", 300), ("odd", 100)])
+@pytest.mark.parametrize(("name", "steps"), [slow("float32", 300), ("odd", 100)])
 def test_parity_with_jax_over_many_steps_with_memory(exports, name, steps):
     export = exports[name]
     observed = random_observations(export.checkpoint.spec, steps, seed=9)
