@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eval.judging import monitor
@@ -37,6 +37,7 @@ def test_each_fault():
     assert not found.late.any()
 
 
+@settings(max_examples=20)
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True, width=64), min_size=3, max_size=3))
 def test_whatever_comes_out_is_finite_and_within_the_limit(values):
     found = guard_action(LIMITS, np.array([values]), np.zeros((1, 3)), 0.0, "p")

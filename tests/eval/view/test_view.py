@@ -6,7 +6,7 @@ from dataclasses import replace
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from PIL import Image, ImageSequence
@@ -163,6 +163,7 @@ def test_solids_are_the_gates_bars_first_and_their_normals_point_out():
     assert len(faces) == 48 and faces.max() == len(vertices) - 1
 
 
+@settings(max_examples=20)
 @given(npst.arrays(np.float64, (30, 2), elements=st.floats(-10, 10, width=16)))
 def test_outlines_are_the_convex_hulls(points):
     corners = outline(points)
