@@ -268,6 +268,7 @@ def test_offset_and_drift_come_back(offset, drift, rate):
     assert found.correlation > 0.999
 
 
+@pytest.mark.slow
 def test_noise_widens_the_reported_error():
     calm = align(_poses((1, 19), 120.0, 2.0, 0.0), _gyro((0, 20)), "pose")
     poses = _poses((1, 19), 120.0, 2.0, 0.0, noise=0.002)
@@ -343,6 +344,7 @@ def test_slow_poses_are_no_fast_ones_in_a_smaller_unit_and_the_long_file_is_name
         with_pose(Recording("log", {"rate": fast}), ImportOptions(pose=path))
 
 
+@pytest.mark.slow
 def test_a_turned_marker_body_is_corrected(tmp_path):
     turn = Rotation.from_euler("z", 90, degrees=True)
     made.write_mocap(tmp_path / "pose.csv", span=(1, 11), turn=turn)

@@ -198,6 +198,7 @@ def test_a_scaled_policy_flies_as_the_plain_one():
     assert scaled.pos_x == pytest.approx(plain.pos_x, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_a_vehicle_too_heavy_to_climb_is_no_gravity_in_the_action():
     heavy = replace(VEHICLE, mass=2.7 * VEHICLE.mass)
     result = flown(Pursuit(), rules=Rules(time_limit_s=2.0), vehicle=heavy)

@@ -88,6 +88,7 @@ def test_a_name_with_dollar_signs_is_a_name(tmp_path):
     assert opened(tmp_path / "grid.png").size[0] > 300
 
 
+@pytest.mark.slow
 def test_a_grid_has_a_panel_a_trial(tmp_path):
     trials = [rollout(), rollout("collision", 1.5, False), (small_track(4, seed=2), None, None)]
     write_grid(tmp_path / "one.png", trials[:1])

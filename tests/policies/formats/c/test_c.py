@@ -332,7 +332,8 @@ def test_it_includes_only_math_and_its_header_says_sizes_and_weights(exports):
     for said in ("POLICY_STATE_SIZE 12", "POLICY_IMAGE_HEIGHT 24", "POLICY_RATE_HZ 33.0f"):
         assert f"#define {said}" in header
     assert export.checkpoint.config["weights"]["sha256"] in header
-    for name, export in exports.items():
+    for name in ("odd", "odd8"):
+        export = exports[name]
         assert set(export.project.files) == set(FILES)
         policy = load_c(export.folder, trust=True)
         assert policy.state_bytes == source.memory_bytes(policy.spec, name.endswith("8"))
