@@ -268,7 +268,6 @@ def test_offset_and_drift_come_back(offset, drift, rate):
     assert found.correlation > 0.999
 
 
-@pytest.mark.slow
 def test_noise_widens_the_reported_error():
     calm = align(_poses((1, 19), 120.0, 2.0, 0.0), _gyro((0, 20)), "pose")
     poses = _poses((1, 19), 120.0, 2.0, 0.0, noise=0.002)
