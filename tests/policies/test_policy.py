@@ -95,6 +95,7 @@ def test_what_is_shipped_is_whole_small_and_has_its_card(name):
     assert sum(file.stat().st_size for file in folder.iterdir()) < 5_000_000
 
 
+@pytest.mark.slow
 def test_a_policy_is_shipped_with_another_usual_speed(tmp_path, monkeypatch, root):
     spec = replace(SPEC, speed_input=True)
     save_policy(tmp_path / "run/policy", network.init(jax.random.key(0), spec), spec, seed=1)

@@ -67,7 +67,7 @@ def climbing(kind):
 
 
 @pytest.mark.parametrize(
-    ("kind", "second"), [("ctbr", "action_roll_rate"), ("motors", "action_rotor_2")]
+    ("kind", "second"), [("ctbr", "action_roll_rate"), slow("motors", "action_rotor_2")]
 )
 def test_flights_of_other_kinds_of_action_become_logs(kind, second, tmp_path):
     how = {"vehicle": VEHICLE, "slots": 1, "workers": 1, "record": Record()}
@@ -189,6 +189,7 @@ def test_mistakes_of_unit_are_reported_from_the_flights(change, action, fault):
     assert found["decisions"] >= 5 and (found["limited"] > 0.5) == (fault == "action_limited")
 
 
+@pytest.mark.slow
 def test_a_scaled_policy_flies_as_the_plain_one():
     track = straight((0.5, 4.0))
     plain = flown(Changed(lambda a: a), track=track)

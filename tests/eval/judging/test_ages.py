@@ -125,6 +125,7 @@ def test_in_the_judge_an_age_of_a_period_shows_the_decision_before():
     assert np.array_equal(dim[1][1], image) and np.array_equal(dim[1][0], second)
 
 
+@pytest.mark.slow
 def test_an_old_state_has_the_misplaced_gate_that_was_next_then():
     trial = 0.8, straight((0.6, 1.2, 9.0))
     (result,), watcher = watched(Pursuit(4.0, spec=SPEC), PERFECT, *trial)

@@ -163,7 +163,7 @@ def test_one_action_for_all_is_learned_without_saturating_the_memory(seed):
     ("seen", "spec", "columns"),
     [
         slow(SMALL, SECOND, slice(0, 12)),
-        (AXIS, BOTH, np.r_[0:12, 15:18]),
+        slow(AXIS, BOTH, np.r_[0:12, 15:18]),
         slow(AXIS, PACED, slice(0, 15)),
         slow(PACED, replace(PACED, second_axis=True), np.r_[0:15, 18]),
         (PACED, replace(PACED, second_gate=True, speed=1.0), np.r_[0:12, 15:19]),

@@ -234,6 +234,7 @@ def test_what_is_not_trusted_or_compiled_is_said_in_plain_words(exports, tmp_pat
             load_c(exports["odd"].folder, trust=True)
 
 
+@pytest.mark.slow
 def test_a_folder_of_links_flies_with_its_own_header(exports, tmp_path):
     """As caches keep files: by what they hold, in another folder and under other names."""
     (tmp_path / "linked").mkdir()
@@ -245,6 +246,7 @@ def test_a_folder_of_links_flies_with_its_own_header(exports, tmp_path):
     assert load_c(tmp_path / "linked", trust=True).name == "odd.c"
 
 
+@pytest.mark.slow
 def test_a_name_with_signs_that_c_reads_otherwise_comes_back(exports, tmp_path):
     """Of two ? and a third sign C99 makes another sign, a backslash even."""
     name = r'run ??) "one" ??/ \ü'
