@@ -9,12 +9,18 @@ position the velocity's is about 29 s [m/s], against 71 s for a central differen
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 HALF_WINDOW_S = 0.05
 """Positions within this time of a row are used [s]; slower logs use the five nearest rows."""
 GAP_STEPS = 6.0
 """Rows further away than this many median steps (and the half window) are not used."""
+
+
+KEPT, KEPT_ROWS = 8, 20_000
+"""The last results are kept, of logs with at most so many rows: checks repeat the same fit."""
 
 
 def velocity_from_position(time_s: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
@@ -28,6 +34,19 @@ def velocity_from_position(time_s: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
         (T, 3) velocity. Where fewer than four positions are near, the fit has a lower degree;
         where fewer than two are near, the velocity is NaN.
     """
+    if len(time_s) > KEPT_ROWS or not time_s.dtype == pos_w.dtype == np.float64:
+        return _fit(time_s, pos_w)
+    return _kept_fit(time_s.tobytes(), pos_w.tobytes(), pos_w.shape).copy()
+
+
+@lru_cache(maxsize=KEPT)
+def _kept_fit(time_s: bytes, pos_w: bytes, shape: tuple[int, ...]) -> np.ndarray:
+    """Return `_fit` of arrays that are given by their bytes."""
+    return _fit(np.frombuffer(time_s), np.frombuffer(pos_w).reshape(shape))
+
+
+def _fit(time_s: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
+    """Return the velocity at each row; see `velocity_from_position`."""
     good = np.flatnonzero(np.isfinite(pos_w).all(axis=1))
     velocity = np.full(pos_w.shape, np.nan)
     if len(good) < 2:

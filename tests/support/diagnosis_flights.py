@@ -1,5 +1,8 @@
 """Flights for the diagnosis: flown in MuJoCo by a plain trajectory tracker, logged with noise."""
 
+from dataclasses import fields, replace
+from functools import cache
+
 import mujoco
 import numpy as np
 
@@ -8,6 +11,7 @@ from eval.logs.flight_log import FlightLog
 from eval.quadrotor.model import compile_quadrotor
 from eval.quadrotor.plant import Command, Motion, make_plant, uses_noise
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
+from tests.support.vehicles import PLAIN
 from tracks.geometry.rotation import quat_to_rot, to_local, to_world
 
 NOISE = {"pos": 0.002, "att": 0.004, "vel": 0.02, "rate": 0.02, "motor": 4.0, "acc": 0.15}
@@ -52,6 +56,20 @@ def track(point, yaw, motion):
 def fly(vehicle, seed, *args, **options):
     """Return the log of one flight of the true `vehicle`; see `fly_all`."""
     return fly_all([vehicle], [seed], *args, **options)[0]
+
+
+@cache
+def without_fault():
+    """Return a flight of the plain vehicle, made once: no test writes into its arrays."""
+    return fly(PLAIN, 0, duration_s=8.0, motors=True)
+
+
+def part_of(log, begin_s, end_s):
+    """Return the rows of a log from one time to another, from 0 s on."""
+    rows = (log.time_s > begin_s - 1e-6) & (log.time_s < end_s + 1e-6)
+    arrays = {field.name: getattr(log, field.name) for field in fields(log)}
+    cut = {name: x[rows] for name, x in arrays.items() if isinstance(x, np.ndarray)}
+    return replace(log, **cut | {"time_s": cut["time_s"] - cut["time_s"][0]})
 
 
 def fly_all(

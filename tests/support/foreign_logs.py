@@ -280,16 +280,18 @@ def write_mcap(
             files = [ROS_MESSAGES / f"{part}.msg" for part in (name.rpartition("/")[2], "parts")]
             schema = writer.register_msgdef(name, "".join(file.read_text() for file in files))
             truth = source(np.arange(span[0], span[1], 1 / rate))
+            quats = truth.quat
             for k, t in enumerate(truth.time):
                 when = origin + round(t * 1e9)
                 stamp = {"sec": when // 10**9, "nanosec": when % 10**9}
-                message = {"header": {"stamp": stamp, "frame_id": "odom"}, **message_of(truth, k)}
+                header = {"stamp": stamp, "frame_id": "odom"}
+                message = {"header": header, **message_of(truth, k, quats[k])}
                 for topic in topics[: None if k % 10 == 0 else 1]:
                     writer.write_message(topic, schema, message, when)
 
-        def moving(truth, k):
+        def moving(truth, k, quat):
             body = truth.rot[k].T @ truth.vel[k]
-            pose = {"position": xyz(truth.pos[k]), "orientation": quaternion(truth.quat[k])}
+            pose = {"position": xyz(truth.pos[k]), "orientation": quaternion(quat)}
             twist = {"linear": xyz(body), "angular": xyz(truth.rate[k])}
             return {
                 "child_frame_id": "base_link",
@@ -297,10 +299,10 @@ def write_mcap(
                 "twist": {"twist": twist, "covariance": [0.0] * 36},
             }
 
-        def placed(truth, k):
-            return {"pose": moving(truth, k)["pose"]["pose"]}
+        def placed(truth, k, quat):
+            return {"pose": moving(truth, k, quat)["pose"]["pose"]}
 
-        def measured(truth, k):
+        def measured(truth, k, quat):
             names = ("orientation", "angular_velocity", "linear_acceleration")
             return {
                 "orientation": quaternion([1, 0, 0, 0]),
@@ -309,15 +311,15 @@ def write_mcap(
                 **{f"{name}_covariance": [0.0] * 9 for name in names},
             }
 
-        def wanted(truth, k):
+        def wanted(truth, k, quat):
             return {
                 "type_mask": mask,
-                "orientation": quaternion(truth.quat[k]),
+                "orientation": quaternion(quat),
                 "body_rate": xyz(truth.cmd_rate[k]),
                 "thrust": float(truth.thrust[k] / full_thrust),
             }
 
-        def turning(truth, k):
+        def turning(truth, k, quat):
             return {"velocity": [float(speed) for speed in truth.motor[k]]}
 
         topics = ["/odom", "/odom_slow"]

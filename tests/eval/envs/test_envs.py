@@ -29,6 +29,7 @@ from eval.worlds.trial import Rules, TrialSpec
 from policies.contract import read_contract
 from policies.spec import PolicySpec
 from tests.support.courses import end_of
+from tests.support.marks import slow
 from tests.support.pilots import Pursuit
 from tests.support.pixels import share
 from tracks.geometry.camera import Camera
@@ -69,7 +70,7 @@ class TestDmControl(test_utils.EnvironmentTestMixin, absltest.TestCase):
     def make_action_sequence(self):
         spec = self.environment.action_spec()
         rng = np.random.default_rng(0)
-        for _ in range(40):
+        for _ in range(20):
             yield rng.uniform(spec.minimum, spec.maximum)
 
 
@@ -82,9 +83,9 @@ def pursue(policy, observation):
 @pytest.mark.parametrize(
     ("trial", "spec"),
     [
-        (TrialSpec("ellipse", 0, 0), EVEN),
+        slow(TrialSpec("ellipse", 0, 0), EVEN),
         (TrialSpec("circular", 9, 1), EVEN),
-        (TrialSpec("circular", 9, 1), PolicySpec()),
+        slow(TrialSpec("circular", 9, 1), PolicySpec()),
     ],
 )
 def test_environments_fly_what_the_judge_flies(trial, spec):

@@ -19,6 +19,7 @@ from eval.vehicles.vehicle import MotorMap
 from tests.support import foreign_logs as made
 from tests.support import known_flight
 from tests.support.imported import TRUE, levels, near, same_flight, text
+from tests.support.marks import slow
 from tests.support.raw_logs import write_bin, write_raw
 from tests.support.vehicles import PLAIN
 
@@ -54,7 +55,13 @@ def test_px4_at_the_loggers_default_rates(tmp_path):
 
 @pytest.mark.parametrize(
     ("new", "frame", "known"),
-    [*((True, k, k in (1, 3)) for k in range(4)), *((False, k, k != 2) for k in (0, 2, 3))],
+    [
+        (True, 0, False),
+        (True, 3, True),
+        (False, 3, True),
+        *(slow(True, k, k == 1) for k in (1, 2)),
+        *(slow(False, k, k == 0) for k in (0, 2)),
+    ],
 )
 def test_px4_odometry_has_a_velocity_in_frames_that_are_known(tmp_path, new, frame, known):
     path = made.write_ulog(tmp_path / "log.ulg", (0, 4), odometry=(new, frame))
@@ -82,20 +89,20 @@ def test_betaflight_with_motion_capture_equals_the_flight(tmp_path):
     assert any(f"+{ppm} ppm" in text(findings, "pose clock") for ppm in range(57, 64))
 
 
-def test_betaflights_tenfold_values_are_found(tmp_path):
+@pytest.mark.parametrize(("status", "tenfold"), [("corrected", 1), slow("doubt", 10)])
+def test_betaflights_tenfold_values_are_found(tmp_path, status, tenfold):
     """blackbox_high_resolution multiplies rates by ten, blackbox_decode the voltage."""
     path = made.write_blackbox(tmp_path / "log.csv", (0, 10), gain=10, tenfold=10)
     pose = made.write_mocap(tmp_path / "pose.csv", span=(0, 10), offset=0.4)
-    for status, tenfold in (("corrected", 1), ("doubt", 10)):
-        options = ImportOptions(pose=pose, full_thrust=30.0, fix=tenfold == 1)
-        log, findings = import_log(path, None, options)
-        level = {f.signal for f in findings if f.status == status}
-        assert level >= {"gyro", "voltage"} and "high_resolution" in text(findings, "gyro")
-        truth = known_flight.fly(log.time_s)
-        near(log.rate_b, tenfold * truth.rate, 0.02 * tenfold)
-        near(log.rate_cmd_b, tenfold * truth.cmd_rate, 0.04 * tenfold)
-        near(log.voltage, tenfold * truth.voltage, 0.1 * tenfold)
-        assert tenfold == 10 or level == {"gyro", "rate command", "voltage"}
+    options = ImportOptions(pose=pose, full_thrust=30.0, fix=tenfold == 1)
+    log, findings = import_log(path, None, options)
+    level = {f.signal for f in findings if f.status == status}
+    assert level >= {"gyro", "voltage"} and "high_resolution" in text(findings, "gyro")
+    truth = known_flight.fly(log.time_s)
+    near(log.rate_b, tenfold * truth.rate, 0.02 * tenfold)
+    near(log.rate_cmd_b, tenfold * truth.cmd_rate, 0.04 * tenfold)
+    near(log.voltage, tenfold * truth.voltage, 0.1 * tenfold)
+    assert tenfold == 10 or level == {"gyro", "rate command", "voltage"}
 
 
 def test_motors_are_where_each_firmware_has_them():
@@ -128,7 +135,9 @@ def test_a_map_of_columns_and_an_odd_number_of_poles_are_not_for_betaflight(tmp_
         import_log(path, None, ImportOptions(map=tmp_path / "mine.toml", partial=True))
 
 
-@pytest.mark.parametrize("how", [{"version": 1}, {"version": 2}, {"compressed": True, "crc": 0}])
+@pytest.mark.parametrize(
+    "how", [slow({"version": 1}), {"version": 2}, {"compressed": True, "crc": 0}]
+)
 def test_crazyflie_equals_the_flight(tmp_path, how):
     log, findings = import_log(made.write_usd(tmp_path / "log00", **how), None, FULL)
     truth = known_flight.fly(log.time_s)
@@ -200,12 +209,12 @@ def test_mcap_equals_the_flight(tmp_path):
 
 
 def test_what_an_attitude_target_says_to_ignore_is_no_command(tmp_path):
-    path = made.write_mcap(tmp_path / "log.mcap", span=(0, 2.5), mask=7)
+    path = made.write_mcap(tmp_path / "log.mcap", span=(0, 1.5), mask=7)
     log, _ = import_log(path, None, FULL)
     assert log.rate_cmd_b is None and log.rotor_speed is not None
     log, _ = import_log(path, None, ImportOptions(full_thrust=30.0, vehicle=PLAIN))
     assert log.rate_cmd_b is not None and log.thrust_cmd is not None
-    whole = made.write_mcap(tmp_path / "none.mcap", span=(0, 2.5), mask=7 + 64 + 128)
+    whole = made.write_mcap(tmp_path / "none.mcap", span=(0, 1.5), mask=7 + 64 + 128)
     log, _ = import_log(whole, None, FULL)
     assert log.rate_cmd_b is None and log.thrust_cmd is None
 
@@ -219,7 +228,7 @@ def test_mcap_topics_are_chosen_by_a_map(tmp_path):
     # Rows at twice the rate of the slow poses: every other one has a pose, and that is exact.
     assert np.isnan(log.pos_w[1::2]).all() and np.isfinite(log.rate_b).all()
     near(log.pos_w[::2], known_flight.fly(log.time_s[::2]).pos, 1e-6)
-    path = made.write_mcap(tmp_path / "both.mcap", span=(0, 4), pose=120.0)
+    path = made.write_mcap(tmp_path / "both.mcap", span=(0, 2), pose=120.0)
     chosen.write_text('[topics]\npose = "/pose"\n')
     log, findings = import_log(path, None, ImportOptions(map=chosen, full_thrust=30.0))
     assert "120 Hz" in text(findings, "rows") and log.velocity_derived
@@ -290,7 +299,7 @@ def test_the_longest_log_of_a_raw_file_is_read(tmp_path, monkeypatch):
         import_log(both, None, PARTIAL)
 
 
-@pytest.mark.parametrize("pose", [False, True])
+@pytest.mark.parametrize("pose", [slow(False), True])
 def test_an_ardupilot_log_equals_the_flight(tmp_path, pose):
     truth = known_flight.fly(np.arange(0.0, 8.0, 0.01))
     path = write_bin(tmp_path / "00000001.BIN", truth, pose, lowest=int(pose))

@@ -22,6 +22,7 @@ from suite.judging import checking
 from suite.judging.checking import policy_findings
 from tests.support.courses import end_of, fly_on, straight
 from tests.support.judged_cells import cut_short
+from tests.support.marks import slow
 from tests.support.pilots import Pursuit, Scripted, Steady
 
 VEHICLE = load_vehicle("reference")
@@ -44,8 +45,13 @@ def test_the_first_action_of_every_kind_carries_the_weight_and_turns_nothing():
         np.testing.assert_allclose(first_action(action, VEHICLE), wanted)
 
 
-@pytest.mark.parametrize("world", ["mujoco", "reference"])
-@pytest.mark.parametrize("kind", ["ctbr", "motors"])
+@pytest.mark.parametrize(
+    ("kind", "world"),
+    [
+        *(("ctbr", "mujoco"), ("motors", "reference")),
+        *(slow("ctbr", "reference"), slow("motors", "mujoco")),
+    ],
+)
 def test_hovering_by_any_kind_of_action_stays_where_it_is(kind, world):
     action = ActionSpec(kind, motors="speed")
     hover = Steady(tuple(first_action(action, VEHICLE)), PolicySpec(action=action))
@@ -61,7 +67,7 @@ def climbing(kind):
 
 
 @pytest.mark.parametrize(
-    ("kind", "second"), [("ctbr", "action_roll_rate"), ("motors", "action_rotor_2")]
+    ("kind", "second"), [("ctbr", "action_roll_rate"), slow("motors", "action_rotor_2")]
 )
 def test_flights_of_other_kinds_of_action_become_logs(kind, second, tmp_path):
     how = {"vehicle": VEHICLE, "slots": 1, "workers": 1, "record": Record()}
@@ -76,7 +82,7 @@ def test_flights_of_other_kinds_of_action_become_logs(kind, second, tmp_path):
     )
 
 
-@pytest.mark.parametrize("world", ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("world", ["mujoco", slow("mjx")])
 def test_a_log_has_a_row_at_every_new_command_of_body_rates(world):
     swinging = np.array([[GRAVITY, (-1) ** k * 0.2, 0.0, 0.0] for k in range(12)])
     policy = Scripted(swinging, PolicySpec(action=ActionSpec("ctbr")))
@@ -89,17 +95,22 @@ def test_a_log_has_a_row_at_every_new_command_of_body_rates(world):
     assert np.isin(np.arange(0, 200, 5), np.rint(500 * flight.time_s)).all()
 
 
-@pytest.mark.parametrize("kind", ["ctbr", "motors"])
-def test_worlds_fly_commands_and_motors_alike(kind):
+@pytest.mark.parametrize(
+    ("kind", "world", "off_m", "off_m_s"),
+    [
+        ("ctbr", "reference", 0.0, 0.0),
+        slow("motors", "reference", 0.0, 0.0),
+        *(slow(kind, "rotorpy", 0.002, 0.015) for kind in ("ctbr", "motors")),
+    ],
+)
+def test_worlds_fly_commands_and_motors_alike(kind, world, off_m, off_m_s):
     policy = climbing(kind)
     track, rules = straight(height=30.0), Rules(time_limit_s=0.4)
     ours = flown(policy, "mujoco", track, rules)
     assert ours.v_max > 0.2
-    for world, off_m, off_m_s in (("reference", 0.0, 0.0), ("rotorpy", 0.002, 0.015)):
-        theirs = flown(policy, world, track, rules)
-        ends = end_of(theirs), end_of(ours)
-        np.testing.assert_allclose(*ends, rtol=0, atol=off_m, err_msg=world)
-        assert theirs.v_max == pytest.approx(ours.v_max, abs=off_m_s)
+    theirs = flown(policy, world, track, rules)
+    np.testing.assert_allclose(end_of(theirs), end_of(ours), rtol=0, atol=off_m)
+    assert theirs.v_max == pytest.approx(ours.v_max, abs=off_m_s)
 
 
 @pytest.mark.slow
@@ -133,7 +144,7 @@ def test_a_world_without_other_kinds_refuses_them(monkeypatch):
         flown(Steady((9.81, 0, 0, 0), PolicySpec(action=ActionSpec("ctbr"))))
 
 
-@pytest.mark.parametrize(("axis", "way"), [(0, (0, -1)), (1, (1, 0)), (2, (0, 0))])
+@pytest.mark.parametrize(("axis", "way"), [(0, (0, -1)), (1, (1, 0)), slow(2, (0, 0))])
 def test_rates_turn_the_body_about_its_own_axes(axis, way):
     """Roll tilts to the right (-y), pitch ahead (x): g rate t^3 / 6 after loop and rotors lag."""
     action = np.zeros(4)
@@ -178,6 +189,7 @@ def test_mistakes_of_unit_are_reported_from_the_flights(change, action, fault):
     assert found["decisions"] >= 5 and (found["limited"] > 0.5) == (fault == "action_limited")
 
 
+@pytest.mark.slow
 def test_a_scaled_policy_flies_as_the_plain_one():
     track = straight((0.5, 4.0))
     plain = flown(Changed(lambda a: a), track=track)
@@ -187,6 +199,7 @@ def test_a_scaled_policy_flies_as_the_plain_one():
     assert scaled.pos_x == pytest.approx(plain.pos_x, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_a_vehicle_too_heavy_to_climb_is_no_gravity_in_the_action():
     heavy = replace(VEHICLE, mass=2.7 * VEHICLE.mass)
     result = flown(Pursuit(), rules=Rules(time_limit_s=2.0), vehicle=heavy)
@@ -199,22 +212,30 @@ def test_gravity_in_the_action_shows_in_flight():
     assert "action_gravity" in [doubt.fault for doubt in found["warnings"]]
 
 
-def test_short_flights_show_negated_axes_saturation_and_a_constant_memory(capsys, monkeypatch):
-    monkeypatch.setattr(checking, "TIME_LIMIT_S", 3.0)
-    changes = {
-        "": lambda a: a,
-        "no_gate": lambda a: a * np.array([-1, 1, 1], np.float32),
-        "few_gates": lambda a: a * np.array([1, -0.2, 1], np.float32),
-        "action_saturated": lambda a: 15 * np.sign(a),
-    }
-    for fault, change in changes.items():
-        findings = policy_findings(Changed(change), 3, Console())
-        found = [(finding.fault, finding.status) for finding in findings]
-        notes = [("memory_constant", "note"), ("input_unused", "note")]
-        assert found == [(fault, "doubt")] * bool(fault) + notes, fault
-        assert "3 flights of 3 s at level 0 it passed" in capsys.readouterr().out
-        assert ("race passes" in findings[0].evidence) == fault.endswith(("_gate", "_gates"))
-    assert not Watched(Steady()).hints()  # it has made no decision
+@pytest.mark.parametrize(
+    ("fault", "change"),
+    [
+        slow("", lambda a: a),
+        ("no_gate", lambda a: a * np.array([-1, 1, 1], np.float32)),
+        slow("few_gates", lambda a: a * np.array([1, -0.2, 1], np.float32)),
+        ("action_saturated", lambda a: 15 * np.sign(a)),
+    ],
+)
+def test_short_flights_show_negated_axes_saturation_and_a_constant_memory(
+    capsys, monkeypatch, fault, change
+):
+    seconds = 3.0 if fault.endswith("_gates") else 2.0
+    monkeypatch.setattr(checking, "TIME_LIMIT_S", seconds)
+    findings = policy_findings(Changed(change), 3, Console())
+    found = [(finding.fault, finding.status) for finding in findings]
+    notes = [("memory_constant", "note"), ("input_unused", "note")]
+    assert found == [(fault, "doubt")] * bool(fault) + notes
+    assert f"3 flights of {seconds:g} s at level 0 it passed" in capsys.readouterr().out
+    assert ("race passes" in findings[0].evidence) == fault.endswith(("_gate", "_gates"))
+
+
+def test_without_a_decision_there_is_no_hint():
+    assert not Watched(Steady()).hints()
 
 
 def test_from_python_the_doubts_of_suite_eval_are_warnings(monkeypatch):
@@ -235,7 +256,6 @@ def test_from_python_the_doubts_of_suite_eval_are_warnings(monkeypatch):
     for policy, vehicle, expected in (
         (Own(), "reference", []),
         (Own(factor=57.0), "reference", ["more than the limit"]),
-        (Own(factor=0.02), "reference", ["as if unscaled"]),
         (Own(last_step=20.0), "reference", ["were not finite"]),
         (Own(), heavy, ["inertia about x or y is"]),
     ):
@@ -248,4 +268,4 @@ def test_from_python_the_doubts_of_suite_eval_are_warnings(monkeypatch):
         assert len(said) == len(expected), said
         assert all(text in line for text, line in zip(expected, said, strict=True)), said
         assert all(warning.filename == __file__ for warning in caught)
-    assert len(flown) == 5
+    assert len(flown) == 4

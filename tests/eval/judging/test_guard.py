@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eval.judging import monitor
@@ -16,6 +16,7 @@ from eval.worlds.trial import Rules
 from policies.observation import encode_depth
 from policies.spec import NoAnswer, PolicySpec
 from tests.support.courses import fly_on, straight
+from tests.support.marks import slow
 from tests.support.pilots import Pursuit, Steady
 from tracks.geometry.camera import pixel_rays_b
 
@@ -36,6 +37,7 @@ def test_each_fault():
     assert not found.late.any()
 
 
+@settings(max_examples=20)
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True, width=64), min_size=3, max_size=3))
 def test_whatever_comes_out_is_finite_and_within_the_limit(values):
     found = guard_action(LIMITS, np.array([values]), np.zeros((1, 3)), 0.0, "p")
@@ -76,7 +78,7 @@ class Faulty(Pursuit):
         return action, count[:, None]
 
 
-@pytest.mark.parametrize("world", ["mujoco", "reference"])
+@pytest.mark.parametrize("world", ["mujoco", slow("reference")])
 def test_the_trial_says_so(world):
     how = {"seeds": range(4), "slots": 3, "rules": Rules(time_limit_s=0.295)}
     pilot = Faulty(1.0, spec=PolicySpec(rate_hz=100.0))
@@ -101,7 +103,7 @@ class Slow(Pursuit):
         return super().act(hidden, state, image, fresh)
 
 
-@pytest.mark.parametrize(("world", "concerned"), [("mujoco", 2), ("reference", 1)])
+@pytest.mark.parametrize(("world", "concerned"), [("mujoco", 2), slow("reference", 1)])
 @pytest.mark.parametrize(
     ("slow", "deadline_s"),
     [(Slow(3.0, 0.3), 0.2), (Slow(3.0, 0.0, NoAnswer("it.onnx: does not come to an end")), None)],

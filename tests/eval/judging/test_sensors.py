@@ -18,6 +18,7 @@ from eval.sensors.sensors_file import PERFECT, load_sensors, scale_sensors, sens
 from eval.worlds.trial import Rules, TrialSpec
 from policies.observation import View
 from policies.spec import PolicySpec
+from tests.support.marks import slow
 from tests.support.pilots import Pursuit, random_network
 from tests.support.reference import fly
 from tracks.geometry.camera import Camera
@@ -159,7 +160,8 @@ def filtered_flights(wanted, trials, monkeypatch, slots=40, seconds=1.6):
 
 
 @pytest.mark.parametrize(
-    ("believed", "trials", "least", "most"), [(1.0, 20, 0.9, 1.0), (0.25, 5, 0.0, 0.5)]
+    ("believed", "trials", "least", "most"),
+    [slow(1.0, 20, 0.9, 1.0), slow(0.25, 5, 0.0, 0.5)],
 )
 def test_nees_is_within_its_bounds_if_the_corners_variance_is_right(
     monkeypatch, believed, trials, least, most

@@ -25,7 +25,7 @@ from eval.logs.flight_log import (
 from tests.support.log_tables import KINDS, STATE, assert_same, columns, write_table
 
 
-@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data(), kind=st.sampled_from(KINDS))
 def test_any_values_round_trip_to_the_last_bit(tmp_path, data, kind):
     rows = data.draw(st.integers(2, 12))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from PIL import Image, ImageSequence
@@ -21,6 +21,7 @@ from eval.view.solids import flat_normals, join_solids, outline, track_solids
 from eval.view.video import DEPTH_RANGE_M, VideoOptions, frame_times, video_frames, write_video
 from eval.view.video_file import write_video_file
 from tests.support.flights import rollout, small_track
+from tests.support.marks import slow
 from tests.support.pixels import opened, share
 from tests.support.recordings import columns
 from tracks.geometry.camera import Camera
@@ -36,8 +37,7 @@ def test_a_diverged_flight_can_still_be_seen(tmp_path):
     result = result._replace(ended_by="diverged")
     write_recording(tmp_path / "a.rrd", [(track, lost, result)], Drone(camera=Camera(pitch_deg=0)))
     write_picture(tmp_path / "a.png", track, lost, result)
-    for images in (lost.depth_m, None):
-        write_video(tmp_path / "a.gif", track, lost._replace(depth_m=images), result, SMALL)
+    write_video(tmp_path / "a.gif", track, lost._replace(depth_m=None), result, SMALL)
     strips = columns(tmp_path / "a.rrd")["/trial_0/world/path", "LineStrips3D:strips"][1][0]
     assert len(strips) == len(pos) - 4
 
@@ -84,13 +84,13 @@ def test_pictures_show_track_path_gates_and_end(tmp_path):
 def test_a_name_with_dollar_signs_is_a_name(tmp_path):
     track, flight, result = rollout()
     odd = (replace(track, family="a$x^{$"), flight, result._replace(policy="b$\\foo$"))
-    write_picture(tmp_path / "one.png", *odd)
     write_grid(tmp_path / "grid.png", [odd])
-    assert opened(tmp_path / "one.png").size[0] > 600
+    assert opened(tmp_path / "grid.png").size[0] > 300
 
 
+@pytest.mark.slow
 def test_a_grid_has_a_panel_a_trial(tmp_path):
-    trials = [rollout(), rollout("collision", 1.5, False), (small_track(6, seed=2), None, None)]
+    trials = [rollout(), rollout("collision", 1.5, False), (small_track(4, seed=2), None, None)]
     write_grid(tmp_path / "one.png", trials[:1])
     write_grid(tmp_path / "three.png", trials, columns=2)
     one, three = opened(tmp_path / "one.png"), opened(tmp_path / "three.png")
@@ -164,6 +164,7 @@ def test_solids_are_the_gates_bars_first_and_their_normals_point_out():
     assert len(faces) == 48 and faces.max() == len(vertices) - 1
 
 
+@settings(max_examples=20)
 @given(npst.arrays(np.float64, (30, 2), elements=st.floats(-10, 10, width=16)))
 def test_outlines_are_the_convex_hulls(points):
     corners = outline(points)
@@ -218,7 +219,7 @@ def test_bad_video_requests_are_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("kind", ["mp4", "gif"])
+@pytest.mark.parametrize("kind", ["mp4", slow("gif")])
 def test_a_video_plays_the_whole_flight(tmp_path, kind):
     done = []
     path = tmp_path / f"a.{kind}"

@@ -20,7 +20,7 @@ from tracks.formats.custom import load_track
 from tracks.formats.mujoco_scene import MESH_GROUP
 from tracks.geometry.camera import Camera, pixel_rays_b
 from tracks.geometry.rotation import exp_rot
-from tracks.geometry.scene import Boxes, Rods, Spheres, counts, stack
+from tracks.geometry.scene import Boxes, Counts, Rods, Spheres, stack
 
 distances = jax.jit(box_distances)
 nearest = jax.jit(near_solids)
@@ -84,6 +84,10 @@ def alone(geom, size):
     return scene._replace(**{kind: rods})
 
 
+ONE_OF_EACH = Counts(1, 1, 1, 1, 4)
+"""The counts of all scenes with one solid, so that they share one compiled program."""
+
+
 def wedge(size):
     """Return the triangles of a tetrahedron that fills half a box."""
     corners = np.array([[-1, -1, -1], [1, -1, -1], [-1, 1, -1], [1, 1, 1]]) * np.array(size)
@@ -125,7 +129,7 @@ def test_no_contact_is_missed_and_none_made_up(name):
         gap[k] = min((contact.dist for contact in data.contact[: data.ncon]), default=0.01)
         rot[k] = data.xmat[1].reshape(3, 3)
     scene = alone(geom, size)
-    batch = jax.tree.map(lambda a: np.repeat(a, n, 0), stack([scene], counts(scene)))
+    batch = jax.tree.map(lambda a: np.repeat(a, n, 0), stack([scene], ONE_OF_EACH))
     found = np.asarray(
         distances(*jax.tree.map(np.float32, (batch, pos, rot, half_size, np.zeros(3))))
     )

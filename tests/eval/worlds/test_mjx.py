@@ -14,6 +14,7 @@ from eval.worlds.collision import NEAR
 from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
 from tests.support.courses import fly_on, straight
+from tests.support.marks import slow
 from tests.support.pilots import Pursuit, Steady
 from tracks.geometry.scene import Boxes
 
@@ -23,7 +24,7 @@ POSITION_TOLERANCE_M = 2e-4
 step, 1e-7, and this policy does not use its image."""
 
 
-def both(trials, rules=None, record=None, vehicle=VEHICLE):
+def both(trials, rules=None, record=None, vehicle=VEHICLE, tracks=None):
     slots = min(6, len(trials))
     options, found = JudgeOptions(slots=slots, workers=1, rules=rules or Rules()), []
     for world in ("mujoco", "mjx"):
@@ -32,14 +33,20 @@ def both(trials, rules=None, record=None, vehicle=VEHICLE):
         def keep(result, flight, flights=flights):
             flights[result.trial] = flight
 
-        found.append((fly(Pursuit(), trials, vehicle, world, options, keep, record), flights))
+        results = fly(Pursuit(), trials, vehicle, world, options, keep, record, tracks)
+        found.append((results, flights))
     return found
 
 
-@pytest.fixture(scope="module")
-def few():
-    trials = [TrialSpec(t, 9, s) for t, s in (("zigzag", 0), ("circular", 0), ("ellipse", 1))]
-    return both(trials, Rules(time_limit_s=1.6), Record(depth=True))
+@pytest.fixture(scope="module", params=["small", slow("families")])
+def few(request):
+    """Flights on small tracks, whose program compiles soon, or on those of the families."""
+    how = Rules(time_limit_s=1.6), Record(depth=True)
+    if request.param == "families":
+        kinds = (("zigzag", 0), ("circular", 0), ("ellipse", 1))
+        return both([TrialSpec(track, 9, seed) for track, seed in kinds], *how)
+    tracks = {"clear": straight(name="clear"), "walled": straight(wall_at=1.0, name="walled")}
+    return both([TrialSpec(name, 0, 0) for name in tracks], *how, tracks=tracks)
 
 
 def test_states_and_images_agree(few):

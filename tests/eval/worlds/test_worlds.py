@@ -17,6 +17,7 @@ from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
 from tests.support import reference as reference_world
 from tests.support.courses import fly_on, straight
+from tests.support.marks import slow
 from tests.support.pilots import Pursuit, Scripted, Steady, Watcher
 from tests.support.reference import fly
 from tests.support.vehicles import PLAIN, with_effects, with_lag
@@ -49,7 +50,7 @@ def test_a_flight_through_all_gates_is_finished(world):
     assert result.v_mean == pytest.approx(4.0 / result.time_s, rel=0.02)
 
 
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("world", ["mujoco", slow("reference")])
 def test_contact_with_the_wall_or_the_ground_is_a_collision(world):
     result = one(Pursuit(3.0), straight((1.0, 4.0), wall_at=2.0), world)
     assert (result.ended_by, result.collided_with) == ("collision", "the wall")
@@ -84,7 +85,7 @@ def test_a_load_on_a_line_is_the_trials_own():
     assert ours[0][2] < without[0][2] - 0.1, "nothing makes up for its weight"
 
 
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("world", ["mujoco", slow("reference")])
 def test_a_gate_crossed_outside_its_opening_does_not_count(world):
     track = straight((1.0,))
     track.scene.gates.opening_g[:] *= 0.01  # 1 cm: the pursuit is not that exact
@@ -104,7 +105,7 @@ def with_forces(world, change, monkeypatch):
     monkeypatch.setattr(module, "autopilot_step", step_of)
 
 
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("world", ["mujoco", slow("reference")])
 def test_diverged_ends_that_trial_only(world, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # MuJoCo would leave its log here
 
@@ -148,7 +149,7 @@ def shown(world, trial, seconds, **more):
 
 
 in_every_world = pytest.mark.parametrize(
-    "world", ["mujoco", "reference", pytest.param("mjx", marks=pytest.mark.slow)]
+    "world", ["mujoco", *(slow(w) for w in ("reference", "mjx"))]
 )
 
 
@@ -219,7 +220,7 @@ def moved(world, motion, frequency=1 / STEP_S, vehicle=PARITY, seconds=1.0):
 
 
 each_motion = pytest.mark.parametrize(
-    "motion", ["manoeuvre", *(pytest.param(m, marks=pytest.mark.slow) for m in list(MOTIONS)[:3])]
+    "motion", ["manoeuvre", *(slow(m) for m in list(MOTIONS)[:3])]
 )
 """The manoeuvre has everything; the others at full size."""
 
@@ -245,10 +246,10 @@ def test_mjx_steps_as_mujoco_does(motion):
 
 @each_motion
 def test_rotorpy_steps_as_mujoco_does_but_for_the_length_of_mujocos_steps(motion):
-    (_, ours), (_, theirs) = by_mujoco(motion), moved("rotorpy", motion, seconds=0.5)
+    (_, ours), (_, theirs) = by_mujoco(motion), moved("rotorpy", motion, seconds=0.3)
     rows = len(theirs.time_s)
     np.testing.assert_allclose(theirs.time_s, ours.time_s[:rows], atol=1e-9)
-    assert rows == 51 and np.abs(ours.pos_w[:rows] - theirs.pos_w).max() < EULER_M
+    assert rows == 31 and np.abs(ours.pos_w[:rows] - theirs.pos_w).max() < EULER_M
     assert np.abs(ours.vel_w[:rows] - theirs.vel_w).max() < EULER_SPEED
     assert np.abs(ours.quat_wxyz[:rows] - theirs.quat_wxyz).max() < EULER_QUAT
 
@@ -272,6 +273,7 @@ def test_what_differs_from_rotorpy_halves_with_the_step(motion):
     assert 1.8 < attitude < 2.3 or motion == "fall"
 
 
+@pytest.mark.slow
 def test_rotorpy_falls_as_continuous_equations_say():
     """Rotors that run down from a hover with lag tau push with g exp(-2 t / tau)."""
     tau, end = 0.03, 0.3

@@ -39,7 +39,7 @@ def copied(tmp_path_factory):
     return lambda: Path(shutil.copytree(saved, tmp_path_factory.mktemp("copy") / "c"))
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(
     st.dictionaries(
         st.text("abc.'[]µ", min_size=1, max_size=8),
@@ -103,7 +103,7 @@ def test_a_changed_byte_of_the_weights_is_refused(copied, at, flip):
         load_arrays(folder, kind="policy")
 
 
-@settings(max_examples=25)
+@settings(max_examples=5)
 @given(
     key=st.sampled_from(["schema", "kind", "weights", "weights.sha256", "weights.bytes"]),
     value=st.one_of(st.none(), st.booleans(), st.floats(allow_nan=False), st.text(), st.just([])),

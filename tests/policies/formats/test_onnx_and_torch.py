@@ -352,7 +352,7 @@ class Counting(torch.nn.Module):
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
-def test_the_memory_of_a_script_is_that_of_its_contract(tmp_path):
+def test_the_memory_of_a_script_is_that_of_its_contract(tmp_path, in_process):
     path = tmp_path / "it.pt"
     for module, memory in ((Counting(), (2, 4)), (Failing(), (5,))):
         text = contract_of(PolicySpec(), memory).text
@@ -368,6 +368,7 @@ def test_the_memory_of_a_script_is_that_of_its_contract(tmp_path):
         load_policy(path, trust=True)
 
 
+@pytest.mark.slow
 def test_answers_are_those_of_torch_here_to_the_bit(exported):
     """In a process of its own a program gives what it gives in this one, with one thread."""
     policy = load_policy(exported / "tiny.pt2", trust=True)

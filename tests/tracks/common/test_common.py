@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
@@ -59,6 +59,7 @@ def test_a_wrong_name_is_answered_with_the_nearest_and_the_list():
     assert "Did you mean" not in none and "Known: linear_drag" in none
 
 
+@settings(max_examples=20)
 @given(TABLES)
 def test_toml_text_reads_back_equal(table):
     assert tomllib.loads(to_toml(table)) == table

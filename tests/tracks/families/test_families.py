@@ -283,7 +283,7 @@ def shape_numbers(track):
 
 def test_no_stretch_runs_through_another_gates_frame(tracks):
     share = np.linspace(0, 1, 30)[:, None]
-    for track in tracks[::4]:
+    for track in tracks[::12]:
         gates = track.scene.gates
         point = np.concatenate([track.start_pos_w[None], gates.center_w])[:, :2]
         for k, (begin, end) in enumerate(zip(point, point[1:], strict=False)):
@@ -374,6 +374,7 @@ def steepest(track):
     return np.rad2deg(np.arccos(shape_numbers(track)[2])).max()
 
 
+@pytest.mark.slow
 def test_hairpins_are_met_as_steeply_as_the_hardest_ellipses_apexes():
     """Half of the hardest ellipses have a gate that is met from beyond its side."""
     ellipses = [steepest(make_track("ellipse", 9, seed)) for seed in range(150)]

@@ -123,18 +123,22 @@ def loop_gain(
     # Try every loop on a grid, and keep each axis' best gain. The first 0.5 s do not count: the
     # filter starts there.
     settled = slice(min(round(0.5 / step), len(grid) // 4), None)
-    for hz, ratio, late_s in product(LOOP_HZ, DAMPING, LOOP_LATE_S):
-        omega, count = 2.0 * np.pi * hz, round(late_s / step)
+    for hz, ratio in product(LOOP_HZ, DAMPING):
+        omega = 2.0 * np.pi * hz
         top, bottom = bilinear([omega**2], [1.0, 2.0 * ratio * omega, omega**2], 1.0 / step)
-        late = np.concatenate([np.repeat(command[:1], count, axis=0), command])[: len(grid)]
-        wanted = np.asarray(lfilter(top, bottom, late - command[0], axis=0))[settled]
-        wanted = wanted - wanted.mean(axis=0)
-        # The filtered command may be constant in these rows.
-        squares = np.maximum(np.sum(wanted**2, axis=0), 1e-12)
-        gain = np.sum(wanted * rate[settled], axis=0) / squares
-        residual = np.sum((rate[settled] - gain * wanted) ** 2, axis=0)
-        gains = np.where(residual < least_residual, gain, gains)
-        least_residual = np.minimum(residual, least_residual)
+        # The filter is at rest before the first command, so that a later command is filtered alike.
+        filtered = np.asarray(lfilter(top, bottom, command - command[0], axis=0))
+        for late_s in LOOP_LATE_S:
+            count = min(round(late_s / step), len(grid))
+            rest = np.zeros((count, len(axes)))
+            wanted = np.concatenate([rest, filtered])[: len(grid)][settled]
+            wanted = wanted - wanted.mean(axis=0)
+            # The filtered command may be constant in these rows.
+            squares = np.maximum(np.sum(wanted**2, axis=0), 1e-12)
+            gain = np.sum(wanted * rate[settled], axis=0) / squares
+            residual = np.sum((rate[settled] - gain * wanted) ** 2, axis=0)
+            gains = np.where(residual < least_residual, gain, gains)
+            least_residual = np.minimum(residual, least_residual)
     reliable = least_residual < (1.0 - EXPLAINED) * np.sum(rate[settled] ** 2, axis=0)
     if not reliable.any() or (gains[reliable] <= 0.0).any():
         return None

@@ -26,17 +26,19 @@ from eval.logs.faults.sensors import check_barometer
 from eval.logs.flight_log import FlightLog, columns_from_log, log_from_columns, write_flight
 from suite.commands.check import Config, run
 from suite.common.console import Console
-from tests.support.diagnosis_flights import fly, fly_all
+from tests.support.diagnosis_flights import part_of, without_fault
 from tests.support.imported import flight
+from tests.support.marks import slow
 from tests.support.vehicles import PLAIN
 
 ROOT = Path(__file__).resolve().parents[4]
 
 
 @cache
-def flown(duration_s=3.0):
-    """A flight without a fault, made once: no test writes into its arrays."""
-    return fly(PLAIN, 0, duration_s=duration_s)
+def flown(duration_s=3.0, begin_s=0.0):
+    """Part of a flight without a fault; no test writes into its arrays."""
+    log = part_of(without_fault(), begin_s, begin_s + duration_s)
+    return replace(log, rotor_speed=None)
 
 
 def flight_at_rest(time_s):
@@ -78,7 +80,7 @@ def test_a_time_takes_a_unit_or_a_positive_factor(text):
     )
 
 
-@pytest.mark.parametrize("factor", [0.95, 1.08])
+@pytest.mark.parametrize("factor", [slow(0.95), 1.08])
 def test_a_small_error_of_a_clocks_rate_needs_gyro_and_velocity(factor):
     log = flown(8.0)
     scaled = {
@@ -95,7 +97,7 @@ def test_a_small_error_of_a_clocks_rate_needs_gyro_and_velocity(factor):
         assert noted <= {name} and (noted or name in ("clock", "position"))
 
 
-@pytest.mark.parametrize("factor", [0.5, 1.25])
+@pytest.mark.parametrize("factor", [slow(0.5), 1.25])
 def test_a_clock_of_another_rate_is_one_fault(factor):
     parts = flight(100.0, 10.0, 0.3)
     parts["time"] = factor * parts["time"]
@@ -177,7 +179,7 @@ def test_a_copy_of_a_flight_is_refused(tmp_path):
     log = flown()
     rounded = replace(log, name="copy", rate_b=np.round(log.rate_b, 6))
     with pytest.raises(ValueError, match=f"{log.name} and copy are the same flight"):
-        check_flights([log, fly(PLAIN, 1, duration_s=1.5), rounded], CheckContext())
+        check_flights([log, flown(1.5, 4.0), rounded], CheckContext())
     unknown = replace(log, rate_b=np.full_like(log.rate_b, np.nan))
     moved = replace(unknown, pos_w=log.pos_w + [0.0, 0.0, 1.0])
     check_flights([log, unknown, moved], CheckContext(), list(FAULTS))
@@ -194,7 +196,7 @@ def test_rows_in_bursts_are_one_fault():
 
 
 def test_logs_of_two_vehicles_are_refused_and_a_log_without_a_name_is_not():
-    flights = fly_all([PLAIN] * 3, range(3), duration_s=1.5)
+    flights = [flown(1.5, begin_s) for begin_s in (0.0, 2.0, 4.0)]
     logs = [
         replace(log, name=f"{k}.csv", about={"vehicle": "other" if k == 2 else "mine"})
         for k, log in enumerate(flights)
@@ -222,7 +224,7 @@ def test_logs_of_two_vehicles_are_refused_and_a_log_without_a_name_is_not():
 )
 @pytest.mark.parametrize("missing", [slice(0), slice(140, 150)])
 def test_a_jump_of_the_position_is_named(rows, moved_m, status, missing):
-    log = flown()
+    log = flown(begin_s=0.5)
     assert not check_jumps(log.time_s, log.pos_w)
     pos = log.pos_w.copy()
     pos[rows] += [moved_m, 0.0, 0.0]
@@ -255,7 +257,7 @@ def test_a_velocity_in_body_axes_is_turned_right_where_a_missing_attitude_change
 
 
 def test_another_vehicles_name_is_a_note_and_an_implausible_file_is_in_doubt():
-    log = replace(fly(PLAIN, 0, duration_s=3.0, motors=True), about={"vehicle": "other"})
+    log = replace(part_of(without_fault(), 0.0, 3.0), about={"vehicle": "other"})
     fast = replace(PLAIN, rotors=replace(PLAIN.rotors, speed_max=10.0 * PLAIN.rotors.speed_max))
     texts = [f.evidence for f in check_log(log, CheckContext(fast))[0] if f.status == "note"]
     assert "not checked against the weight: the vehicle file is in doubt" in texts

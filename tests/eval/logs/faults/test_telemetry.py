@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from eval.logs.faults.check import CheckContext, check_log
-from tests.support.diagnosis_flights import fly
+from tests.support.diagnosis_flights import without_fault
 from tests.support.vehicles import PLAIN
 
 
 @pytest.fixture(scope="module")
 def log():
-    return fly(PLAIN, 0, duration_s=6.0, motors=True)
+    return without_fault()
 
 
 def opened(log):
