@@ -195,6 +195,7 @@ def test_a_case_is_the_same_to_the_bit_and_its_seed_matters(made_set, monkeypatc
     np.testing.assert_allclose(across, -coefficient[:2] * vel_b[:-1, :2], rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_outside_cases_say_how_much_the_catalogue_cannot_explain(short_flights):
     built = build(Case("outside", ("ripple",), 6.0, "bare", "capture", (5, 3)))
     outside = built.answer["outside"]

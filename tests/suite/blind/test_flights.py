@@ -38,6 +38,7 @@ def fifth():
     return run(5)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(fifth):
     (_, first), (_, again), (_, other) = fifth, run(5), run(6)
     for one, two in zip(first, again, strict=True):

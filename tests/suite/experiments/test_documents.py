@@ -75,6 +75,7 @@ def test_robustness(sky, tmp_path):
     assert (tmp_path / "docs" / "robustness-2.png").is_file()
 
 
+@pytest.mark.slow
 def test_perception(sky, tmp_path):
     args = "--only vio stereo --difficulty 0,3 --trials 1 --growing-trials 1 --policy race-paper"
     trained = tmp_path / "trained"

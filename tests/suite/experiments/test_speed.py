@@ -128,6 +128,7 @@ def test_without_a_compiler_or_packages_it_says_what_to_install(monkeypatch):
         diagnose.run()
 
 
+@pytest.mark.slow
 def test_both_sides_fly_the_same_trials_to_the_same_end(tmp_path, monkeypatch, capsys):
     folder, run = str(small_checkpoint(tmp_path)), judge.run
     monkeypatch.setattr(judge, "run", lambda: run(folder, trials=3, time_limit_s=0.2))

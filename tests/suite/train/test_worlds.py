@@ -186,6 +186,7 @@ def unrounded(*names):
     return replace(ALL.seen, models={name: models[name] for name in names or models})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
     [("delay", "state_noise", "stereo"), pytest.param((), marks=pytest.mark.slow, id="all")],

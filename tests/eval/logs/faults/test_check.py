@@ -80,6 +80,7 @@ def test_a_time_takes_a_unit_or_a_positive_factor(text):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [slow(0.95), 1.08])
 def test_a_small_error_of_a_clocks_rate_needs_gyro_and_velocity(factor):
     log = flown(8.0)

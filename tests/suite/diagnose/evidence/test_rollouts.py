@@ -33,6 +33,7 @@ DRAG = (0.3, 0.35, 0.1)
 flown = cache(lambda layout: jax.jit(rollouts.compiled(layout, False, False, "continuous")[0]))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("compiled_quickly")
 @pytest.mark.parametrize(
     ("frequency", "rate_hz", "lag", "delay"),

@@ -85,6 +85,7 @@ def test_an_inertia_is_named_though_the_trim_of_each_flight_is_larger():
     assert after.energy.sum() < before.energy.sum()
 
 
+@pytest.mark.slow
 def test_flights_of_two_vehicles_give_no_name_whose_interval_has_the_files_value():
     other = flights(2, 3, 5.0, hidden={"thrust_scale": (0.9,)})
     names, found = found_in([*flights(2, 1, 5.0), *other])

@@ -236,6 +236,7 @@ def means_of(actor, records, hidden):
     return means(actor.params, embeddings.reshape(6, 4, -1), sequences)
 
 
+@pytest.mark.slow
 def test_exploration_is_not_the_image_noise_of_a_world():
     """A policy that sees the noise of its own action could learn to correct it."""
     worlds = boxes_worlds(CONFIG.shared)

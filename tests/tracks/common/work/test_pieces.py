@@ -239,6 +239,7 @@ os._exit(late)
 """Asks at a port of nobody, at one of who is silent, of a web server and of who hangs up."""
 
 
+@pytest.mark.slow
 def test_a_port_of_something_else_is_refused_in_the_time_that_is_promised():
     """In a process of its own, as Dask's client tries on beside when we gave it up."""
     pytest.importorskip("distributed")
