@@ -127,7 +127,7 @@ LONGEST = "action, from rest"
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(c, marks=pytest.mark.slow) if c == LONGEST else c for c in CASES]
+    "case", [pytest.param(c, marks=pytest.mark.extended) if c == LONGEST else c for c in CASES]
 )
 def test_a_gradient_is_the_limit_of_differences(case):
     function, at = CASES[case]

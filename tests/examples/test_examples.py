@@ -80,7 +80,7 @@ def as_a_program(tmp_path, monkeypatch):
     ("name", "short"),
     [
         *((name, True) for name in EXAMPLES if name not in IN_FULL),
-        *(pytest.param(name, False, marks=pytest.mark.slow) for name in EXAMPLES),
+        *(pytest.param(name, False, marks=pytest.mark.extended) for name in EXAMPLES),
     ],
 )
 def test_the_example_runs(name, short, tmp_path, monkeypatch, capsys):

@@ -15,7 +15,7 @@ from tests.support.tools import program
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_ppo_in_one_file_trains_and_its_export_answers_as_its_agent(tmp_path, monkeypatch, capsys):
     example = program(EXAMPLES / "cleanrl_ppo.py")
     agents, kind = [], example.Agent

@@ -26,7 +26,7 @@ from policies.networks import network
 from policies.policy import load_policy
 from policies.spec import ActionSpec, DepthEncoding, PolicyError, PolicySpec
 from suite.cli import main
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.policy_files import SPEC, action_of, lively
 from tests.support.tools import program, python
 
@@ -95,7 +95,7 @@ def test_what_is_shipped_is_whole_small_and_has_its_card(name):
     assert sum(file.stat().st_size for file in folder.iterdir()) < 5_000_000
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_a_policy_is_shipped_with_another_usual_speed(tmp_path, monkeypatch, root):
     spec = replace(SPEC, speed_input=True)
     save_policy(tmp_path / "run/policy", network.init(jax.random.key(0), spec), spec, seed=1)
@@ -108,7 +108,7 @@ def test_a_policy_is_shipped_with_another_usual_speed(tmp_path, monkeypatch, roo
     assert load_policy_checkpoint(tmp_path / "race").spec == replace(spec, speed=0.85)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_thread_counts_do_not_change_our_network(checkpoint):
     """XLA's pool may split the work any way; the bits have to stay."""
     script = (
@@ -293,7 +293,7 @@ def rollout(policy, n, steps):
 WIDER = replace(SPEC, second_gate=True, gate_axis=True, second_axis=True, channels=(6, 64, 32))
 
 
-@pytest.mark.parametrize("spec", [slow(SPEC), WIDER])
+@pytest.mark.parametrize("spec", [more(SPEC), WIDER])
 def test_the_three_are_equal_over_a_rollout(spec, tmp_path, in_process):
     folder = save_policy(tmp_path / "it", lively(spec, 3), spec, seed=1)
     ours = load_policy(folder)

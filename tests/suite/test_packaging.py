@@ -134,7 +134,7 @@ def suite(commands, env, cwd):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_all_four_are_used_by_commands(installed, tmp_path, root):
     text = (root / "eval" / "vehicles" / "reference.toml").read_text(encoding="utf-8")
     fins = "\n[effects.fin_drag]\ncoefficient = 0.3\n"

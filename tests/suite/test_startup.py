@@ -194,6 +194,7 @@ def test_a_compiled_program_that_a_kill_cut_is_compiled_again(tmp_path):
     startup.keep_compiled({"JAX_COMPILATION_CACHE_DIR": ""})
 
 
+@pytest.mark.extended
 def test_jax_says_of_a_missing_platform_what_we_expect(suite, tmp_path):
     """The words are JAX's own: a new version may choose others."""
     env = {"JAX_PLATFORMS": "rocm", "XDG_CACHE_HOME": str(tmp_path)}
@@ -227,7 +228,7 @@ def test_a_cache_that_is_full_or_cut_costs_time_and_no_words(suite):
     assert suite("", before=before) == (0, "")
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_warnings_of_numbers_are_not_for_people(suite, root, tmp_path):
     text = (root / "eval/vehicles/racer5.toml").read_text()
     (tmp_path / "it.toml").write_text(text.replace("mass = 0.75", "mass = 1e300"))

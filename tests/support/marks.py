@@ -3,6 +3,6 @@
 import pytest
 
 
-def slow(*values, **options):
-    """Return a case of a parametrised test that only `-m slow` runs."""
-    return pytest.param(*values, marks=pytest.mark.slow, **options)
+def more(*values, **options):
+    """Return a further case of a parametrised test, which `make test` leaves out."""
+    return pytest.param(*values, marks=pytest.mark.extended, **options)

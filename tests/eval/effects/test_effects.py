@@ -17,7 +17,7 @@ from eval.effects.slung_load import LoadState, SlungLoad
 from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step, rollout, step
 from tests.support.faults import ImuFault, with_imu_fault
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.vehicles import PLAIN, at_rest, drawn_effects, with_effects, with_lag
 from tracks.geometry.rotation import exp_rot
 
@@ -190,7 +190,7 @@ def test_a_step_of_the_line_is_backward_euler_of_a_damped_spring():
     assert parting == pytest.approx(spring + damper) and parting > 1.0
 
 
-@pytest.mark.parametrize("dt", [0.002, slow(0.004), 0.02])
+@pytest.mark.parametrize("dt", [0.002, more(0.004), 0.02])
 def test_a_hanging_load_pulls_by_its_weight_and_both_hover(dt):
     plant = make_plant(LOADED, dt)
     for swing, motion, wrench, _ in flown(plant, hanging(plant), at_rest(), HOLDING, 0.6):
@@ -211,7 +211,7 @@ def test_the_start_is_where_a_swing_comes_to_rest():
     assert line_w[0] / line_w[2] == pytest.approx(np.tan(0.1))
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_small_swings_have_the_period_of_both_masses():
     """Level under (M + m) g the vehicle is free to give way: 2 pi sqrt(L / (g (1 + m / M)))."""
     plant = make_plant(LOADED, 0.002)
@@ -298,7 +298,7 @@ def held(time_s):
     return lively(0.02 * np.floor(time_s / 0.02 + 1e-6))
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_steps_converge_and_none_is_too_long():
     def end(dt):
         plant = make_plant(with_lag(LOADED, 0.03), dt)

@@ -12,7 +12,7 @@ from eval.effects.log_faults import apply_log_faults
 from eval.quadrotor.plant import Command, Motion, accelerations, make_plant, uses_noise
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from tests.support.flights import small_log
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.vehicles import PLAIN, at_rest, with_effects
 from tracks.geometry.rotation import quat_to_rot
 
@@ -275,7 +275,7 @@ def test_attitude_offset_logs_other_body_axes():
         assert faulty[name] is log[name]
 
 
-@pytest.mark.parametrize("xp", [np, slow(jnp)])
+@pytest.mark.parametrize("xp", [np, more(jnp)])
 def test_clock_offset_logs_an_older_pose(xp):
     log = {name: xp.asarray(values) for name, values in small_log().items()}
     faulty = apply_log_faults(with_effects(clock_offset=(0.015,)).effects, log)

@@ -11,7 +11,7 @@ import pytest
 from eval.effects import EFFECTS
 from eval.effects.hook_check import hook_problem, parameter_problem
 from eval.effects.interface import Effect, Parameter, per_axis
-from tests.support.marks import slow
+from tests.support.marks import more
 
 CALLS = count(1)
 
@@ -51,7 +51,7 @@ def write(values, flow):
 
 # The steppers' gradients are tested by every effect in flight, too.
 @pytest.mark.parametrize(
-    "name", [slow(name) if effect.in_flight else name for name, effect in EFFECTS.items()]
+    "name", [more(name) if effect.in_flight else name for name, effect in EFFECTS.items()]
 )
 def test_the_suites_effects_pass(name):
     assert parameter_problem(EFFECTS[name]) is hook_problem(EFFECTS[name]) is None

@@ -29,7 +29,7 @@ from eval.worlds.trial import Rules, TrialSpec
 from policies.contract import read_contract
 from policies.spec import PolicySpec
 from tests.support.courses import end_of
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.pilots import Pursuit
 from tests.support.pixels import share
 from tracks.geometry.camera import Camera
@@ -83,9 +83,9 @@ def pursue(policy, observation):
 @pytest.mark.parametrize(
     ("trial", "spec"),
     [
-        slow(TrialSpec("ellipse", 0, 0), EVEN),
+        more(TrialSpec("ellipse", 0, 0), EVEN),
         (TrialSpec("circular", 9, 1), EVEN),
-        slow(TrialSpec("circular", 9, 1), PolicySpec()),
+        more(TrialSpec("circular", 9, 1), PolicySpec()),
     ],
 )
 def test_environments_fly_what_the_judge_flies(trial, spec):

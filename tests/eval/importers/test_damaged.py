@@ -19,7 +19,7 @@ from eval.logs.columns import FlightLogError
 from tests.support import foreign_logs as made
 from tests.support import known_flight, raw_logs
 from tests.support.imported import flight, near, text, write
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.vehicles import PLAIN
 
 
@@ -97,7 +97,7 @@ def test_what_a_reader_quotes_of_a_damaged_file_is_one_line(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    "rate", ["missing", "no speeds", *(slow(r) for r in ("three numbers", "a header"))]
+    "rate", ["missing", "no speeds", *(more(r) for r in ("three numbers", "a header"))]
 )
 def test_messages_of_another_definition_are_refused(tmp_path, monkeypatch, rate):
     """What was written under the true definition is read under the other one."""
@@ -174,7 +174,7 @@ def test_a_topic_without_a_timestamp_is_left_out(px4_log):
     assert log.rotor_speed is None and "esc_status has no timestamp" in text(findings, "file")
 
 
-@pytest.mark.parametrize("value", ["0.1", *(slow(v) for v in (b"\xff", None, float("nan")))])
+@pytest.mark.parametrize("value", ["0.1", *(more(v) for v in (b"\xff", None, float("nan")))])
 def test_a_parameter_that_is_no_number_is_as_one_that_is_missing(px4_log, value):
     odd = {"THR_MDL_FAC": value, "CA_ROTOR0_PX": value, "CA_ROTOR0_PY": value}
     _, findings = px4_log(lambda _, log: log.initial_parameters.update(odd))

@@ -19,7 +19,7 @@ from eval.vehicles.vehicle import MotorMap
 from tests.support import foreign_logs as made
 from tests.support import known_flight
 from tests.support.imported import TRUE, levels, near, same_flight, text
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.raw_logs import write_bin, write_raw
 from tests.support.vehicles import PLAIN
 
@@ -59,8 +59,8 @@ def test_px4_at_the_loggers_default_rates(tmp_path):
         (True, 0, False),
         (True, 3, True),
         (False, 3, True),
-        *(slow(True, k, k == 1) for k in (1, 2)),
-        *(slow(False, k, k == 0) for k in (0, 2)),
+        *(more(True, k, k == 1) for k in (1, 2)),
+        *(more(False, k, k == 0) for k in (0, 2)),
     ],
 )
 def test_px4_odometry_has_a_velocity_in_frames_that_are_known(tmp_path, new, frame, known):
@@ -89,7 +89,7 @@ def test_betaflight_with_motion_capture_equals_the_flight(tmp_path):
     assert any(f"+{ppm} ppm" in text(findings, "pose clock") for ppm in range(57, 64))
 
 
-@pytest.mark.parametrize(("status", "tenfold"), [("corrected", 1), slow("doubt", 10)])
+@pytest.mark.parametrize(("status", "tenfold"), [("corrected", 1), more("doubt", 10)])
 def test_betaflights_tenfold_values_are_found(tmp_path, status, tenfold):
     """blackbox_high_resolution multiplies rates by ten, blackbox_decode the voltage."""
     path = made.write_blackbox(tmp_path / "log.csv", (0, 10), gain=10, tenfold=10)
@@ -136,7 +136,7 @@ def test_a_map_of_columns_and_an_odd_number_of_poles_are_not_for_betaflight(tmp_
 
 
 @pytest.mark.parametrize(
-    "how", [slow({"version": 1}), {"version": 2}, {"compressed": True, "crc": 0}]
+    "how", [more({"version": 1}), {"version": 2}, {"compressed": True, "crc": 0}]
 )
 def test_crazyflie_equals_the_flight(tmp_path, how):
     log, findings = import_log(made.write_usd(tmp_path / "log00", **how), None, FULL)
@@ -299,7 +299,7 @@ def test_the_longest_log_of_a_raw_file_is_read(tmp_path, monkeypatch):
         import_log(both, None, PARTIAL)
 
 
-@pytest.mark.parametrize("pose", [slow(False), True])
+@pytest.mark.parametrize("pose", [more(False), True])
 def test_an_ardupilot_log_equals_the_flight(tmp_path, pose):
     truth = known_flight.fly(np.arange(0.0, 8.0, 0.01))
     path = write_bin(tmp_path / "00000001.BIN", truth, pose, lowest=int(pose))

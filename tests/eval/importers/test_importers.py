@@ -20,7 +20,7 @@ from tests.support import foreign_logs as made
 from tests.support import known_flight
 from tests.support.imported import NAMES, flight, near, text, write
 from tests.support.log_tables import write_table
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.vehicles import PLAIN
 
 FULL = ImportOptions(full_thrust=30.0)
@@ -88,7 +88,7 @@ def test_published_logs_are_read_by_their_shipped_mappings(path, lacks, length_s
 @pytest.mark.parametrize(
     ("signal", "late", "words"),
     [
-        slow("rate", False, "gyro: ends at 4.0 s; 4.0 s of other signals left out"),
+        more("rate", False, "gyro: ends at 4.0 s; 4.0 s of other signals left out"),
         ("pos", True, "position: begins at 4.0 s; 4.0 s of other signals left out"),
     ],
 )
@@ -127,7 +127,7 @@ def test_positions_that_stand_still_in_flight_are_left_out(tmp_path):
     ("columns", "unit", "words"),
     [
         (["yaw", "pitch", "roll"], "rad", "the columns are yaw, pitch, roll"),
-        slow(["pitch", "roll", "yaw"], "rad", "the columns are pitch, roll, yaw"),
+        more(["pitch", "roll", "yaw"], "rad", "the columns are pitch, roll, yaw"),
         (["roll", "pitch", "yaw"], "deg", "the angles are in rad, read as deg"),
         (["roll", "pitch", "yaw"], "rad", ""),
     ],

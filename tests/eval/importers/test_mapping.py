@@ -17,7 +17,7 @@ from eval.logs.columns import FlightLogError
 from eval.logs.faults.reading import parse_readings
 from tests.support import known_flight
 from tests.support.imported import TRUE, flight, near, same_flight, text, write
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.vehicles import PLAIN
 from tracks.common.toml_table import shipped_names
 
@@ -294,8 +294,8 @@ def test_a_mapped_table_equals_the_flight(tmp_path, kind):
     ("unit", "span", "words"),
     [
         ("%", 65535.0, "0 to 65535"),
-        slow("%", 1000.0, "0 to 1000"),
-        slow("65535", 100.0, "percent"),
+        more("%", 1000.0, "0 to 1000"),
+        more("65535", 100.0, "percent"),
     ],
 )
 def test_a_throttle_in_another_unit_than_the_mapping_says_is_corrected(tmp_path, unit, span, words):

@@ -17,7 +17,7 @@ from eval.logs.faults.position import jumps_of
 from eval.logs.flight_log import read_flight
 from tests.support import known_flight
 from tests.support.imported import flight, text, write
-from tests.support.marks import slow
+from tests.support.marks import more
 
 
 def imported(folder, change, fix=True):
@@ -29,7 +29,7 @@ def imported(folder, change, fix=True):
     return log, findings, [f for f in findings if f.status == "doubt"]
 
 
-@pytest.mark.parametrize("number", [0.0, slow(-9999.0)])
+@pytest.mark.parametrize("number", [0.0, more(-9999.0)])
 @pytest.mark.parametrize("kept", ["most", "every fourth"])
 def test_a_number_that_stands_for_no_position_is_an_empty_cell(tmp_path, number, kept):
     is_missing = np.random.default_rng(0).random(800) < 0.02
@@ -121,7 +121,7 @@ def test_a_counter_that_starts_again_is_one_clock(bits, per_s, unit):
     assert not unwrapped(two_flights)[1] and not unwrapped(count[::-1] * unit)[1]
 
 
-@pytest.mark.parametrize("hz", [100.0, slow(400.0)])
+@pytest.mark.parametrize("hz", [100.0, more(400.0)])
 def test_a_gyro_that_is_the_rate_command_is_named_and_moves_no_clock(tmp_path, hz):
     parts = flight(hz, 6.0, 1.0)
     log, findings = import_log(write(tmp_path / "good.csv", parts))

@@ -15,7 +15,7 @@ from eval.logs.faults.reading import read_as
 from tests.support import foreign_logs as made
 from tests.support import known_flight
 from tests.support.imported import flight, of, text, write
-from tests.support.marks import slow
+from tests.support.marks import more
 
 
 def test_differing_rates_jitter_and_holes(tmp_path):
@@ -45,7 +45,7 @@ def test_differing_rates_jitter_and_holes(tmp_path):
     np.testing.assert_allclose(log.vel_w[clear], found.vel[clear], atol=0.1)
 
 
-@pytest.mark.parametrize(("pos", "quat", "vel"), [(4, 1, 8), slow(10, 5, 10), slow(2, 3, 2)])
+@pytest.mark.parametrize(("pos", "quat", "vel"), [(4, 1, 8), more(10, 5, 10), more(2, 3, 2)])
 def test_a_measurement_is_in_one_row_only(tmp_path, pos, quat, vel):
     """Values copied to rows between them would look like less noise than there is."""
     good = flight(noise=1.0)
@@ -258,7 +258,7 @@ def _poses(span, rate, offset, drift, noise=0.0, turn=None):
 
 @pytest.mark.parametrize(
     ("offset", "drift", "rate"),
-    [slow(0.0, 0.0, 240.0), slow(-7.77, -400e-6, 120.0), (1.7e6, 30e-6, 60.0)],
+    [more(0.0, 0.0, 240.0), more(-7.77, -400e-6, 120.0), (1.7e6, 30e-6, 60.0)],
 )
 def test_offset_and_drift_come_back(offset, drift, rate):
     found = align(_poses((5, 45), rate, offset, drift), _gyro((0, 60), bias=0.02), "pose")
@@ -343,7 +343,7 @@ def test_slow_poses_are_no_fast_ones_in_a_smaller_unit_and_the_long_file_is_name
         with_pose(Recording("log", {"rate": fast}), ImportOptions(pose=path))
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_a_turned_marker_body_is_corrected(tmp_path):
     turn = Rotation.from_euler("z", 90, degrees=True)
     made.write_mocap(tmp_path / "pose.csv", span=(1, 11), turn=turn)
@@ -367,7 +367,7 @@ def gyro_mirrored(time):
 @pytest.mark.parametrize(
     ("poses", "log", "fault"),
     [
-        slow(pitch_reversed, known_flight.fly, "attitude_sign"),
+        more(pitch_reversed, known_flight.fly, "attitude_sign"),
         (known_flight.fly, gyro_mirrored, "gyro_axes"),
     ],
 )

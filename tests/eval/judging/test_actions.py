@@ -22,7 +22,7 @@ from suite.judging import checking
 from suite.judging.checking import policy_findings
 from tests.support.courses import end_of, fly_on, straight
 from tests.support.judged_cells import cut_short
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.pilots import Pursuit, Scripted, Steady
 
 VEHICLE = load_vehicle("reference")
@@ -49,7 +49,7 @@ def test_the_first_action_of_every_kind_carries_the_weight_and_turns_nothing():
     ("kind", "world"),
     [
         *(("ctbr", "mujoco"), ("motors", "reference")),
-        *(slow("ctbr", "reference"), slow("motors", "mujoco")),
+        *(more("ctbr", "reference"), more("motors", "mujoco")),
     ],
 )
 def test_hovering_by_any_kind_of_action_stays_where_it_is(kind, world):
@@ -67,7 +67,7 @@ def climbing(kind):
 
 
 @pytest.mark.parametrize(
-    ("kind", "second"), [("ctbr", "action_roll_rate"), slow("motors", "action_rotor_2")]
+    ("kind", "second"), [("ctbr", "action_roll_rate"), more("motors", "action_rotor_2")]
 )
 def test_flights_of_other_kinds_of_action_become_logs(kind, second, tmp_path):
     how = {"vehicle": VEHICLE, "slots": 1, "workers": 1, "record": Record()}
@@ -82,7 +82,7 @@ def test_flights_of_other_kinds_of_action_become_logs(kind, second, tmp_path):
     )
 
 
-@pytest.mark.parametrize("world", ["mujoco", slow("mjx")])
+@pytest.mark.parametrize("world", ["mujoco", more("mjx")])
 def test_a_log_has_a_row_at_every_new_command_of_body_rates(world):
     swinging = np.array([[GRAVITY, (-1) ** k * 0.2, 0.0, 0.0] for k in range(12)])
     policy = Scripted(swinging, PolicySpec(action=ActionSpec("ctbr")))
@@ -99,8 +99,8 @@ def test_a_log_has_a_row_at_every_new_command_of_body_rates(world):
     ("kind", "world", "off_m", "off_m_s"),
     [
         ("ctbr", "reference", 0.0, 0.0),
-        slow("motors", "reference", 0.0, 0.0),
-        *(slow(kind, "rotorpy", 0.002, 0.015) for kind in ("ctbr", "motors")),
+        more("motors", "reference", 0.0, 0.0),
+        *(more(kind, "rotorpy", 0.002, 0.015) for kind in ("ctbr", "motors")),
     ],
 )
 def test_worlds_fly_commands_and_motors_alike(kind, world, off_m, off_m_s):
@@ -144,7 +144,7 @@ def test_a_world_without_other_kinds_refuses_them(monkeypatch):
         flown(Steady((9.81, 0, 0, 0), PolicySpec(action=ActionSpec("ctbr"))))
 
 
-@pytest.mark.parametrize(("axis", "way"), [(0, (0, -1)), (1, (1, 0)), slow(2, (0, 0))])
+@pytest.mark.parametrize(("axis", "way"), [(0, (0, -1)), (1, (1, 0)), more(2, (0, 0))])
 def test_rates_turn_the_body_about_its_own_axes(axis, way):
     """Roll tilts to the right (-y), pitch ahead (x): g rate t^3 / 6 after loop and rotors lag."""
     action = np.zeros(4)
@@ -189,7 +189,7 @@ def test_mistakes_of_unit_are_reported_from_the_flights(change, action, fault):
     assert found["decisions"] >= 5 and (found["limited"] > 0.5) == (fault == "action_limited")
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_a_scaled_policy_flies_as_the_plain_one():
     track = straight((0.5, 4.0))
     plain = flown(Changed(lambda a: a), track=track)
@@ -199,7 +199,7 @@ def test_a_scaled_policy_flies_as_the_plain_one():
     assert scaled.pos_x == pytest.approx(plain.pos_x, abs=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_a_vehicle_too_heavy_to_climb_is_no_gravity_in_the_action():
     heavy = replace(VEHICLE, mass=2.7 * VEHICLE.mass)
     result = flown(Pursuit(), rules=Rules(time_limit_s=2.0), vehicle=heavy)
@@ -215,9 +215,9 @@ def test_gravity_in_the_action_shows_in_flight():
 @pytest.mark.parametrize(
     ("fault", "change"),
     [
-        slow("", lambda a: a),
+        more("", lambda a: a),
         ("no_gate", lambda a: a * np.array([-1, 1, 1], np.float32)),
-        slow("few_gates", lambda a: a * np.array([1, -0.2, 1], np.float32)),
+        more("few_gates", lambda a: a * np.array([1, -0.2, 1], np.float32)),
         ("action_saturated", lambda a: 15 * np.sign(a)),
     ],
 )
@@ -238,6 +238,7 @@ def test_without_a_decision_there_is_no_hint():
     assert not Watched(Steady()).hints()
 
 
+@pytest.mark.extended
 def test_from_python_the_doubts_of_suite_eval_are_warnings(monkeypatch):
     flown = cut_short(monkeypatch, 0.8)
 

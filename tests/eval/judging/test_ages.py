@@ -11,7 +11,7 @@ from eval.worlds.trial import Rules, TrialSpec
 from policies.observation import View
 from policies.spec import PolicySpec
 from tests.support.courses import fly_on, straight
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.pilots import Pursuit, Scripted, Watcher
 
 VEHICLE = load_vehicle("reference")
@@ -90,7 +90,7 @@ def test_a_fresh_trial_sees_its_own_start_while_the_others_go_on():
     assert (again.pos_w[1] == 99.0).all() and (again.pos_w[0] < 4.0).all()
 
 
-@pytest.mark.parametrize(("age_s", "jitter"), [(0.05, 1.0), slow(0.1, 0.4), slow(0.02, 1.0)])
+@pytest.mark.parametrize(("age_s", "jitter"), [(0.05, 1.0), more(0.1, 0.4), more(0.02, 1.0)])
 def test_ages_that_jitter_have_the_mean_and_the_spread_that_are_asked_for(age_s, jitter):
     ages = Ages(age_s, age_s, jitter)
     found = ages_seen(ages, TRIALS, 300)[6:]
@@ -125,7 +125,7 @@ def test_in_the_judge_an_age_of_a_period_shows_the_decision_before():
     assert np.array_equal(dim[1][1], image) and np.array_equal(dim[1][0], second)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_an_old_state_has_the_misplaced_gate_that_was_next_then():
     trial = 0.8, straight((0.6, 1.2, 9.0))
     (result,), watcher = watched(Pursuit(4.0, spec=SPEC), PERFECT, *trial)

@@ -16,7 +16,7 @@ from eval.worlds.trial import Rules
 from policies.observation import encode_depth
 from policies.spec import NoAnswer, PolicySpec
 from tests.support.courses import fly_on, straight
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.pilots import Pursuit, Steady
 from tracks.geometry.camera import pixel_rays_b
 
@@ -78,7 +78,7 @@ class Faulty(Pursuit):
         return action, count[:, None]
 
 
-@pytest.mark.parametrize("world", ["mujoco", slow("reference")])
+@pytest.mark.parametrize("world", ["mujoco", more("reference")])
 def test_the_trial_says_so(world):
     how = {"seeds": range(4), "slots": 3, "rules": Rules(time_limit_s=0.295)}
     pilot = Faulty(1.0, spec=PolicySpec(rate_hz=100.0))
@@ -103,7 +103,7 @@ class Slow(Pursuit):
         return super().act(hidden, state, image, fresh)
 
 
-@pytest.mark.parametrize(("world", "concerned"), [("mujoco", 2), slow("reference", 1)])
+@pytest.mark.parametrize(("world", "concerned"), [("mujoco", 2), more("reference", 1)])
 @pytest.mark.parametrize(
     ("slow", "deadline_s"),
     [(Slow(3.0, 0.3), 0.2), (Slow(3.0, 0.0, NoAnswer("it.onnx: does not come to an end")), None)],

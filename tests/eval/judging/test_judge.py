@@ -15,7 +15,7 @@ from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
 from tests.support.courses import fly_on, straight
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.pilots import Pursuit, Steady, random_network
 from tests.support.reference import fly
 from tracks.formats.custom import load_track
@@ -56,7 +56,7 @@ def test_tracks_with_meshes_are_flown_beside_others(root):
     assert results[0] == results[2]
 
 
-@pytest.mark.parametrize("rate_hz", [7.0, slow(30.0), slow(100.0), 500.0])
+@pytest.mark.parametrize("rate_hz", [7.0, more(30.0), more(100.0), 500.0])
 def test_decisions_come_at_the_policys_rate(rate_hz):
     policy, end_s = Steady(spec=PolicySpec(rate_hz=rate_hz)), 1.0 if rate_hz < 100 else 0.3
     how = {"record": Record(), "rules": Rules(time_limit_s=end_s)}
@@ -80,7 +80,7 @@ class Interrupt:
             raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("workers", [slow(1), 2])
+@pytest.mark.parametrize("workers", [more(1), 2])
 def test_interrupt_keeps_what_was_finished_and_the_rest_is_flown_later(tmp_path, workers):
     trials = [TrialSpec("zigzag", 3, seed) for seed in range(6)]
     options = JudgeOptions(slots=2, rules=SHORT, workers=workers)

@@ -18,7 +18,7 @@ from eval.sensors.sensors_file import PERFECT, load_sensors, scale_sensors, sens
 from eval.worlds.trial import Rules, TrialSpec
 from policies.observation import View
 from policies.spec import PolicySpec
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.pilots import Pursuit, random_network
 from tests.support.reference import fly
 from tracks.geometry.camera import Camera
@@ -161,7 +161,7 @@ def filtered_flights(wanted, trials, monkeypatch, slots=40, seconds=1.6):
 
 @pytest.mark.parametrize(
     ("believed", "trials", "least", "most"),
-    [slow(1.0, 20, 0.9, 1.0), slow(0.25, 5, 0.0, 0.5)],
+    [more(1.0, 20, 0.9, 1.0), more(0.25, 5, 0.0, 0.5)],
 )
 def test_nees_is_within_its_bounds_if_the_corners_variance_is_right(
     monkeypatch, believed, trials, least, most
@@ -190,6 +190,7 @@ def test_an_ideal_imu_reads_nothing_in_free_fall_and_the_turn():
     np.testing.assert_allclose(found.rate_b, turn_b / 0.002, atol=1e-6)
 
 
+@pytest.mark.extended
 def test_a_trials_outcome_is_the_same_at_any_batch(monkeypatch):
     together, _ = filtered_flights(filtering(), TWO_TRACKS[:2], monkeypatch, 2, 0.3)
     alone, _ = filtered_flights(filtering(), TWO_TRACKS[:2], monkeypatch, 1, 0.3)

@@ -13,7 +13,7 @@ from eval.quadrotor.loops.filters import Pair, Request, butterworth, layout_of, 
 from eval.quadrotor.plant import Command, make_plant
 from eval.quadrotor.stepper import Inputs, hover_state, rollout, step
 from eval.quadrotor.vehicle_file import load_vehicle, parse_vehicle, vehicle_table
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.vehicles import at_rest
 
 LAYOUT = layout_of(load_vehicle("crazyflie21").rotors)
@@ -247,7 +247,7 @@ def test_numpy_and_jax_fly_the_same_and_follow_the_rates(kind):
     assert np.abs(rates[48]).max() < 1e-9
 
 
-@pytest.mark.parametrize("kind", ["crazyflie", *(slow(k) for k in ("betaflight", "px4"))])
+@pytest.mark.parametrize("kind", ["crazyflie", *(more(k) for k in ("betaflight", "px4"))])
 def test_a_batch_flies_as_each_alone_and_has_gradients(kind):
     plant = make_plant(vehicle(kind), DT)
     given = inputs(60, [1.0, 0.0, 0.0])
@@ -295,7 +295,7 @@ def test_first_order_by_hand():
     np.testing.assert_allclose(pt1(np.array([1.0]), np.array([3.0]), np.asarray(0.0), 0.002), 3.0)
 
 
-@pytest.mark.parametrize(("hz", "gain"), [slow(0.01, 1.0), (30.0, 2.0**-0.5), (240.0, 0.01)])
+@pytest.mark.parametrize(("hz", "gain"), [more(0.01, 1.0), (30.0, 2.0**-0.5), (240.0, 0.01)])
 def test_second_order_has_half_the_power_at_its_cutoff(hz, gain):
     memory, out, dt = Pair(np.zeros(1), np.zeros(1)), [], 0.002
     time = np.arange(0, 1 if hz > 1 else 30, dt)

@@ -240,7 +240,7 @@ def smooth_command(t):
     return 11.0 + 3.0 * np.sin(9.0 * t), np.array(rate)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_flight_converges_to_an_independent_integration_with_order_one():
     vehicle = with_lag(PLAIN, 0.03)
     hover = np.sqrt(0.75 * 9.81 / 4 / 1.6e-6)
@@ -313,7 +313,7 @@ def end_of(flight):
     return np.concatenate([np.ravel(field[-1]) for field in flight.motion])
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_half_the_step_is_a_quarter_of_the_error():
     fine = end_of(flown(FINEST_S))
     coarse, half = (np.abs(end_of(flown(h)) - fine).max() for h in (0.004, 0.002))

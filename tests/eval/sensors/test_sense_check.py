@@ -11,7 +11,7 @@ import pytest
 from eval.sensors import SENSORS
 from eval.sensors.interface import Needs, Parameter, Sensor
 from eval.sensors.sense_check import sensor_problem
-from tests.support.marks import slow
+from tests.support.marks import more
 
 CALLS = count(1)
 
@@ -55,7 +55,7 @@ def write(values, memory, seen, moment):
     return seen, memory
 
 
-@pytest.mark.parametrize("name", [slow(one) if n > 3 else one for n, one in enumerate(SENSORS)])
+@pytest.mark.parametrize("name", [more(one) if n > 3 else one for n, one in enumerate(SENSORS)])
 def test_the_suites_models_pass(name):
     assert sensor_problem(SENSORS[name]) is None
 

@@ -21,7 +21,7 @@ from eval.view.solids import flat_normals, join_solids, outline, track_solids
 from eval.view.video import DEPTH_RANGE_M, VideoOptions, frame_times, video_frames, write_video
 from eval.view.video_file import write_video_file
 from tests.support.flights import rollout, small_track
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.pixels import opened, share
 from tests.support.recordings import columns
 from tracks.geometry.camera import Camera
@@ -29,6 +29,7 @@ from tracks.geometry.camera import Camera
 SMALL = VideoOptions(size=(160, 96), fps=10, hold_s=0.3)
 
 
+@pytest.mark.extended
 def test_a_diverged_flight_can_still_be_seen(tmp_path):
     track, flight, result = rollout("finished", 1.5)
     pos, vel = flight.pos_w.copy(), flight.vel_w.copy()
@@ -42,6 +43,7 @@ def test_a_diverged_flight_can_still_be_seen(tmp_path):
     assert len(strips) == len(pos) - 4
 
 
+@pytest.mark.extended
 def test_a_trial_without_a_row_can_still_be_seen(tmp_path):
     track, flight, result = rollout()
     arrays = {name: getattr(flight, name)[:0] for name in type(flight)._fields[:-2]}
@@ -88,7 +90,7 @@ def test_a_name_with_dollar_signs_is_a_name(tmp_path):
     assert opened(tmp_path / "grid.png").size[0] > 300
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_a_grid_has_a_panel_a_trial(tmp_path):
     trials = [rollout(), rollout("collision", 1.5, False), (small_track(4, seed=2), None, None)]
     write_grid(tmp_path / "one.png", trials[:1])
@@ -219,7 +221,7 @@ def test_bad_video_requests_are_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("kind", ["mp4", slow("gif")])
+@pytest.mark.parametrize("kind", ["mp4", more("gif")])
 def test_a_video_plays_the_whole_flight(tmp_path, kind):
     done = []
     path = tmp_path / f"a.{kind}"

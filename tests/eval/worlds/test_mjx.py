@@ -14,7 +14,7 @@ from eval.worlds.collision import NEAR
 from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
 from tests.support.courses import fly_on, straight
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.pilots import Pursuit, Steady
 from tracks.geometry.scene import Boxes
 
@@ -38,7 +38,7 @@ def both(trials, rules=None, record=None, vehicle=VEHICLE, tracks=None):
     return found
 
 
-@pytest.fixture(scope="module", params=["small", slow("families")])
+@pytest.fixture(scope="module", params=["small", more("families")])
 def few(request):
     """Flights on small tracks, whose program compiles soon, or on those of the families."""
     how = Rules(time_limit_s=1.6), Record(depth=True)

@@ -90,7 +90,7 @@ def test_what_the_vehicle_loses_is_said(stand_in):
 # From here on RotorPy itself flies.
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_one_trial_is_finished_and_another_ends_at_a_wall():
     clear, walled = straight((0.6, 1.2), name="clear"), straight((4.0, 5.0), 0.8, name="walled")
     record = Record(depth=True)

@@ -17,7 +17,7 @@ from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
 from tests.support import reference as reference_world
 from tests.support.courses import fly_on, straight
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.pilots import Pursuit, Scripted, Steady, Watcher
 from tests.support.reference import fly
 from tests.support.vehicles import PLAIN, with_effects, with_lag
@@ -50,7 +50,7 @@ def test_a_flight_through_all_gates_is_finished(world):
     assert result.v_mean == pytest.approx(4.0 / result.time_s, rel=0.02)
 
 
-@pytest.mark.parametrize("world", ["mujoco", slow("reference")])
+@pytest.mark.parametrize("world", ["mujoco", more("reference")])
 def test_contact_with_the_wall_or_the_ground_is_a_collision(world):
     result = one(Pursuit(3.0), straight((1.0, 4.0), wall_at=2.0), world)
     assert (result.ended_by, result.collided_with) == ("collision", "the wall")
@@ -67,6 +67,7 @@ def test_contact_with_the_wall_or_the_ground_is_a_collision(world):
     assert result.time_s == pytest.approx(t[np.searchsorted(fallen, 1.475)] + 0.06, rel=0.03)
 
 
+@pytest.mark.extended
 def test_a_load_on_a_line_is_the_trials_own():
     """It begins hanging in each slot's trial, whatever flew there before and flies beside it."""
     loaded = replace(VEHICLE, effects={**VEHICLE.effects, "slung_load": SlungLoad(0.2, 0.5)})
@@ -85,7 +86,7 @@ def test_a_load_on_a_line_is_the_trials_own():
     assert ours[0][2] < without[0][2] - 0.1, "nothing makes up for its weight"
 
 
-@pytest.mark.parametrize("world", ["mujoco", slow("reference")])
+@pytest.mark.parametrize("world", ["mujoco", more("reference")])
 def test_a_gate_crossed_outside_its_opening_does_not_count(world):
     track = straight((1.0,))
     track.scene.gates.opening_g[:] *= 0.01  # 1 cm: the pursuit is not that exact
@@ -105,7 +106,7 @@ def with_forces(world, change, monkeypatch):
     monkeypatch.setattr(module, "autopilot_step", step_of)
 
 
-@pytest.mark.parametrize("world", ["mujoco", slow("reference")])
+@pytest.mark.parametrize("world", ["mujoco", more("reference")])
 def test_diverged_ends_that_trial_only(world, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # MuJoCo would leave its log here
 
@@ -149,7 +150,7 @@ def shown(world, trial, seconds, **more):
 
 
 in_every_world = pytest.mark.parametrize(
-    "world", ["mujoco", *(slow(w) for w in ("reference", "mjx"))]
+    "world", ["mujoco", *(more(w) for w in ("reference", "mjx"))]
 )
 
 
@@ -220,7 +221,7 @@ def moved(world, motion, frequency=1 / STEP_S, vehicle=PARITY, seconds=1.0):
 
 
 each_motion = pytest.mark.parametrize(
-    "motion", ["manoeuvre", *(slow(m) for m in list(MOTIONS)[:3])]
+    "motion", ["manoeuvre", *(more(m) for m in list(MOTIONS)[:3])]
 )
 """The manoeuvre has everything; the others at full size."""
 
@@ -273,7 +274,7 @@ def test_what_differs_from_rotorpy_halves_with_the_step(motion):
     assert 1.8 < attitude < 2.3 or motion == "fall"
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_rotorpy_falls_as_continuous_equations_say():
     """Rotors that run down from a hover with lag tau push with g exp(-2 t / tau)."""
     tau, end = 0.03, 0.3

@@ -13,7 +13,7 @@ from policies.formats import model_process as process
 from policies.formats.model_process import ModelProcess
 from policies.policy import load_policy
 from policies.spec import NoAnswer, PolicyError
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.policy_files import WEIGHT, onnx_model, port, save_onnx
 from tests.support.tools import python
 
@@ -55,7 +55,7 @@ def no_shape(name):
     return helper.make_tensor_value_info(name, TensorProto.FLOAT, None)
 
 
-@pytest.mark.parametrize("start", [slow("constant"), "state"])
+@pytest.mark.parametrize("start", [more("constant"), "state"])
 def test_a_loop_without_an_end_is_refused_in_time(start, tmp_path, monkeypatch):
     monkeypatch.setattr(process, "LOAD_S", 2.0)
     monkeypatch.setattr(process, "ANSWER_S", 1.0)

@@ -368,7 +368,7 @@ def test_the_memory_of_a_script_is_that_of_its_contract(tmp_path, in_process):
         load_policy(path, trust=True)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_answers_are_those_of_torch_here_to_the_bit(exported):
     """In a process of its own a program gives what it gives in this one, with one thread."""
     policy = load_policy(exported / "tiny.pt2", trust=True)

@@ -16,7 +16,7 @@ from policies.networks.layers import conv_valid, gru_update, patch_product, unif
 from policies.networks.network import LEAK
 from policies.networks.tree_arrays import tree_from_arrays, tree_to_arrays
 from policies.spec import PolicyError, PolicySpec
-from tests.support.marks import slow
+from tests.support.marks import more
 
 
 @partial(jax.jit, static_argnums=0)
@@ -146,7 +146,7 @@ def learn(params, optimizer, key):
     return optax.apply_updates(params, change), optimizer, loss, hidden
 
 
-@pytest.mark.parametrize("seed", [slow(k) for k in (0, 1, 3)])
+@pytest.mark.parametrize("seed", [more(k) for k in (0, 1, 3)])
 def test_one_action_for_all_is_learned_without_saturating_the_memory(seed):
     # What the first gradient steps of a training ask for. With outputs that start near zero the
     # memory's mean size comes to 0.85 to 0.91, and nothing that is seen changes it any more.
@@ -162,10 +162,10 @@ def test_one_action_for_all_is_learned_without_saturating_the_memory(seed):
 @pytest.mark.parametrize(
     ("seen", "spec", "columns"),
     [
-        slow(SMALL, SECOND, slice(0, 12)),
-        slow(AXIS, BOTH, np.r_[0:12, 15:18]),
-        slow(AXIS, PACED, slice(0, 15)),
-        slow(PACED, replace(PACED, second_axis=True), np.r_[0:15, 18]),
+        more(SMALL, SECOND, slice(0, 12)),
+        more(AXIS, BOTH, np.r_[0:12, 15:18]),
+        more(AXIS, PACED, slice(0, 15)),
+        more(PACED, replace(PACED, second_axis=True), np.r_[0:15, 18]),
         (PACED, replace(PACED, second_gate=True, speed=1.0), np.r_[0:12, 15:19]),
     ],
 )

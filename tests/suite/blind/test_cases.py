@@ -100,6 +100,7 @@ def info(flights):
     return oracle.information(BARE, flights, SENSORS["capture"])
 
 
+@pytest.mark.extended
 def test_information_grows_with_flights_and_knows_hand_worked_parts(flights, info):
     one = oracle.information(BARE, flights[:1], SENSORS["capture"], NAMES)
     of_both = [info.columns.index(column) for column in one.columns]
@@ -195,7 +196,7 @@ def test_a_case_is_the_same_to_the_bit_and_its_seed_matters(made_set, monkeypatc
     np.testing.assert_allclose(across, -coefficient[:2] * vel_b[:-1, :2], rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_outside_cases_say_how_much_the_catalogue_cannot_explain(short_flights):
     built = build(Case("outside", ("ripple",), 6.0, "bare", "capture", (5, 3)))
     outside = built.answer["outside"]
@@ -238,6 +239,7 @@ def test_a_strength_is_the_multiple_of_the_table_or_cut_at_a_bound():
 CONTINUOUS = replace(SINGLE, seed=(6, 70_001), simulator="continuous")
 
 
+@pytest.mark.extended
 def test_a_continuous_cases_vehicle_has_the_loop_that_its_seed_draws(monkeypatch, short_flights):
     """That a flight is the same to the bit again is asked in test_flights.py."""
     judged = []

@@ -38,7 +38,7 @@ def fifth():
     return run(5)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(fifth):
     (_, first), (_, again), (_, other) = fifth, run(5), run(6)
     for one, two in zip(first, again, strict=True):
@@ -105,7 +105,7 @@ def test_an_effect_that_rotorpy_does_not_have_as_it_is_is_refused():
         rotorpy_flight.fly_rotorpy(LAGGED, truth, SHORT, 100.0)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_flights_side_by_side_are_each_as_if_alone_and_move_as_their_accelerometers_say():
     pytest.importorskip("rotorpy")
     truth = with_effects(LAGGED, rotor_drag=(4e-4,))
@@ -121,6 +121,7 @@ def test_flights_side_by_side_are_each_as_if_alone_and_move_as_their_acceleromet
     np.testing.assert_allclose(moved, between, atol=2e-3)
 
 
+@pytest.mark.extended
 def test_without_air_it_flies_as_mujoco_does_and_into_the_ground_it_fails():
     pytest.importorskip("rotorpy")
     way = [replace(SHORT[0], duration_s=0.2)]

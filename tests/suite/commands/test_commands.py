@@ -45,7 +45,7 @@ def test_tracks_command_lists_and_draws(tmp_path, capfd, monkeypatch):
     assert "--speed is 2.0, allowed is 0 to 1" in refused(capfd, "eval --speed 2")
 
 
-@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.extended)])
 def test_doubts_about_a_vehicle_file_are_printed_once_and_stop_nothing(workers, tmp_path, capfd):
     """Two processes could each say them again."""
     vehicle = load_vehicle("reference")

@@ -232,7 +232,7 @@ def test_the_real_flights_come_as_published(tmp_path, capsys):
     assert packed < 320_000
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_the_real_flights_tell_a_vehicle_at_the_first_try(tmp_path, capsys):
     assert run("example --real --out", tmp_path) == 0
     raw, log = tmp_path / "B3_figure8_fast_rep1.csv", tmp_path / "eight.parquet"

@@ -219,7 +219,7 @@ def test_links_within_the_repository_lead_somewhere():
                 assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_the_site_is_whole_and_loads_nothing_from_elsewhere(tmp_path):
     # The tool says that its own next version may never come; nothing of ours hangs on that.
     quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}

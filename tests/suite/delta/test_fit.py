@@ -77,7 +77,7 @@ def push(vel_b, action_b):
     return -0.1 * action_b + np.array([0.0, 0.8, -0.5], np.float32)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(tmp_path, monkeypatch):
     """As many flights are held out as are fitted: the errors of both are one program."""
     for number, log in enumerate(fly(nominal_model(PHYSICS), 8, extra_b=push)):

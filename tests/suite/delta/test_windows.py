@@ -160,7 +160,7 @@ def errors(plant, windows, delta=None):
     return np.abs(pos - windows.pos_w[:, 1:]).max(), np.abs(vel - windows.vel_w[:, 1:]).max()
 
 
-@pytest.mark.parametrize("delay", [pytest.param(0.0, marks=pytest.mark.slow), 1.7])
+@pytest.mark.parametrize("delay", [pytest.param(0.0, marks=pytest.mark.extended), 1.7])
 def test_flights_of_the_point_mass_replay_as_they_were_flown(delay):
     """Rounding in float32 and the start's acceleration from velocities 1 ms apart."""
     plant = PointMassModel(np.float32(10.0), np.zeros(3, np.float32), np.float32(delay))
@@ -274,7 +274,7 @@ def of_point_mass():
 
 @pytest.mark.parametrize(
     ("model", "rtol"),
-    [("of_point_mass", 0.0), pytest.param("of_true", 1e-6, marks=pytest.mark.slow)],
+    [("of_point_mass", 0.0), pytest.param("of_true", 1e-6, marks=pytest.mark.extended)],
 )
 def test_a_fresh_delta_changes_nothing_and_a_constant_one_acts_as_the_action(model, rtol, request):
     """With and without it are two programs, which may round otherwise in the last digit or two."""
@@ -323,7 +323,7 @@ def test_a_fit_cuts_the_error_and_says_what_it_corrects(logs, tmp_path, monkeypa
     assert "| quadrotor with Delta Action Model |" in (tmp_path / "out" / "table.md").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_a_firmwares_rate_loop_replays_too(logs):
     """Its memory is of the loop, which looks for the first time where a window starts."""
     windows, replay = replayed(logs[:1], QuadrotorConfig(load_vehicle("crazyflie21")), 0.5, 0.3)
@@ -347,7 +347,7 @@ def test_windows_of_two_parts_have_one_grid(logs):
     assert len(cut_quadrotor_windows([slow], config, 0.5, 0.3)[0].pos_w) > 0
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_a_load_on_a_line_hangs_still_where_a_window_starts_and_then_swings(logs):
     own = {name: tuple(values) for name, values in TRUE.effects.items()}
     loaded = QuadrotorConfig(with_effects(TRUE, **own, slung_load=(0.1, 0.5)))

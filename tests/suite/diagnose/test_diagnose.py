@@ -141,7 +141,7 @@ def outcome(logs, drive="commands", limits=THRESHOLDS):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_broken_flights_among_sound_ones(sound):
     rng = np.random.default_rng(0)
     broken = [breakage(log, rng) for breakage, log in zip(BREAKAGES[-3:], sound, strict=True)]
@@ -287,7 +287,7 @@ def test_commands_between_the_rows_of_a_log_are_no_effect(monkeypatch):
     assert uncertain == [True, False], "the noise counts as certain only if no command is lacking"
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_the_noise_counts_as_certain_only_if_no_command_is_lacking(monkeypatch):
     """If the log has every command, its slow rows limit nothing."""
     say, limits = lambda line: None, Thresholds()

@@ -249,7 +249,7 @@ def test_plans_name_catalogue_effects_and_end_in_flights():
 FILES = sorted(example.FOLDER.glob("*.parquet"))
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_the_files_are_what_the_script_makes():
     made = example.make_flights()
     assert [path.stem for path in FILES] == [log.name for log in made]

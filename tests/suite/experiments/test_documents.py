@@ -57,6 +57,7 @@ def sky(monkeypatch):
     return Sky(monkeypatch)
 
 
+@pytest.mark.extended
 def test_robustness(sky, tmp_path):
     args = "--trials 1 --difficulty 0 --policy race-paper --only wind mass_offset".split()
     sky.stop_after = 5
@@ -75,7 +76,7 @@ def test_robustness(sky, tmp_path):
     assert (tmp_path / "docs" / "robustness-2.png").is_file()
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_perception(sky, tmp_path):
     args = "--only vio stereo --difficulty 0,3 --trials 1 --growing-trials 1 --policy race-paper"
     trained = tmp_path / "trained"
@@ -248,6 +249,7 @@ def measured(monkeypatch):
     return recipes
 
 
+@pytest.mark.extended
 def test_shipped_policies_fly_the_ablations_tracks_in_the_dynamics_of_their_training(
     tmp_path, measured, capsys
 ):

@@ -55,7 +55,7 @@ def test_both_sides_compute_the_same_loss_and_gradient():
         assert float((value.grad - expected[name]).abs().max()) < 0.01 * size, name
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_both_sides_have_the_same_residuals():
     task = make_task(20_000, 2.5)
     model = RolloutModel(task.nominal, rotor_input=True, voltage=False, integrator="euler")
@@ -77,7 +77,7 @@ def test_both_sides_have_the_same_residuals():
     np.testing.assert_allclose(theirs[seen], ours[seen], rtol=2e-3, atol=2e-2)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler: cc, or what CC names")
 def test_every_engine_is_timed_and_the_ratio_is_of_the_times(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -128,7 +128,7 @@ def test_without_a_compiler_or_packages_it_says_what_to_install(monkeypatch):
         diagnose.run()
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_both_sides_fly_the_same_trials_to_the_same_end(tmp_path, monkeypatch, capsys):
     folder, run = str(small_checkpoint(tmp_path)), judge.run
     monkeypatch.setattr(judge, "run", lambda: run(folder, trials=3, time_limit_s=0.2))

@@ -43,7 +43,7 @@ def test_collect_writes_logs_that_read_back_and_goes_on(pilots, tmp_path, monkey
     assert "other.parquet" in refused(capfd, *args)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_an_interrupted_collection_names_the_setting_that_differs(
     pilots, tmp_path, monkeypatch, capfd
 ):
@@ -102,7 +102,7 @@ def test_flights_are_the_same_where_policy_and_vehicle_were_moved(
     assert run(*args, moved) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_a_simulator_that_differs_from_the_vehicle_file_writes_the_file_that_describes_its_flights(
     pilots, tmp_path, monkeypatch, capfd
 ):

@@ -18,7 +18,7 @@ from tests.support import commands
 from tests.support.judged_cells import result
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_the_hierarchical_bootstrap_of_a_difference_covers_as_it_says():
     rng, hit, count = np.random.default_rng(3), 0, 500
     seeds, trials, spread = 8, 60, 0.5

@@ -118,7 +118,7 @@ def test_an_interrupted_eval_goes_on_to_the_same_result(pilots, tmp_path, monkey
     assert read_trials(again / "trials.parquet") == read_trials(whole / "trials.parquet")
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_trials_flown_before_under_another_label_are_the_same_policys(
     pilots, tmp_path, monkeypatch
 ):
@@ -255,7 +255,7 @@ def test_view_finds_the_trials_of_every_policy_of_a_run(pilots, tmp_path, capfd)
     assert "unknown --policy 'rac'" in refused(capfd, *again, "--policy", "rac")
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_view_flies_at_the_speed_of_the_shown_trials(pilots, tmp_path, monkeypatch, unpainted):
     out = tmp_path / "out"
     assert evaluate(out, "--trials 1 --track zigzag --speed 0.4 0.7 --policy", pilots["other"]) == 0

@@ -141,7 +141,7 @@ def test_stages_of_several_versions_of_the_code_are_reported(whole, tmp_path, mo
     assert "!old" in json.loads((out / "loop.json").read_text())["stage_commits"]
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_a_loop_goes_on_where_its_folder_was_moved(whole, tmp_path, monkeypatch):
     """In the middle of recording: what was flown counts. An evaluation goes on by itself."""
     given, small = whole[0] / "train" / "policy", Small(monkeypatch)
@@ -229,7 +229,7 @@ def test_a_loop_with_a_hidden_effect_leaves_tables_report_and_recording(hidden):
     assert "<td>offset z [m]</td><td>not identifiable</td>" in rows
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_without_the_delta_none_is_fitted_and_two_policies_are_tuned(
     hidden, tmp_path, monkeypatch, root
 ):

@@ -205,7 +205,7 @@ def test_a_stopped_world_leaves_the_loss_and_a_remembered_state_is_flown():
     assert np.abs(np.asarray(first - records.hidden[0])).max() > 0.1
 
 
-@pytest.mark.parametrize("finish", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize("finish", [pytest.param(False, marks=pytest.mark.extended), True])
 def test_a_world_that_has_passed_its_last_gate_leaves_the_loss_where_that_is_the_finish(finish):
     config = replace(NOISY, episode=replace(NOISY.episode, finish=finish))
     worlds = boxes_worlds(config)
@@ -273,7 +273,7 @@ def test_the_point_before_the_gate_that_progress_is_measured_to(place_g, shift):
 
 
 @pytest.mark.parametrize(
-    ("pass_first", "speed"), [(False, -3.0), pytest.param(True, 3.0, marks=pytest.mark.slow)]
+    ("pass_first", "speed"), [(False, -3.0), pytest.param(True, 3.0, marks=pytest.mark.extended)]
 )
 def test_a_step_through_a_gate_and_its_numbers(pass_first, speed):
     """From 0.1 m before the first gate to 0.1 m behind it at 3 m/s; the second is straight on."""

@@ -101,8 +101,8 @@ class Killed(BaseException):
     [
         (run, "sample_worlds", KeyboardInterrupt, 3),
         (training_loop, "save_arrays", Killed, 2),
-        pytest.param(curve, "append", Killed, 2, marks=pytest.mark.slow),
-        pytest.param(training_loop, "save_policy", Killed, 2, marks=pytest.mark.slow),
+        pytest.param(curve, "append", Killed, 2, marks=pytest.mark.extended),
+        pytest.param(training_loop, "save_policy", Killed, 2, marks=pytest.mark.extended),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -151,7 +151,7 @@ run.train(NOISY, Path(sys.argv[1]), Console())
 """
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_a_bare_machine_trains_and_a_real_kill_while_saving_loses_nothing(
     whole, tmp_path, root, monkeypatch
 ):
@@ -257,7 +257,7 @@ def test_every_parameter_has_a_gradient_within_the_loop_or_through_images():
     assert min(sizes.values()) > 1e-7, sizes
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_shards_and_images_outside_the_loop_give_the_gradient_of_the_plain_loop(monkeypatch):
     """Sums of float32 in another order: 1e-4 of an array's largest. Noise is a world's own."""
     config, plain = replace(NOISY, episode=replace(NOISY.episode, shards=1)), gradient_of(NOISY)

@@ -105,7 +105,7 @@ def flights(family):
     return scene, jnp.asarray(pos, jnp.float32), jnp.asarray(rot, jnp.float32)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 @pytest.mark.parametrize("family", FAMILIES)
 def test_culled_images_and_distances_are_exact_where_they_matter(family):
     """All but a few far pixels, and distances within 1 m, where the loss of an obstacle starts."""
@@ -186,10 +186,10 @@ def unrounded(*names):
     return replace(ALL.seen, models={name: models[name] for name in names or models})
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "names",
-    [("delay", "state_noise", "stereo"), pytest.param((), marks=pytest.mark.slow, id="all")],
+    [("delay", "state_noise", "stereo"), pytest.param((), marks=pytest.mark.extended, id="all")],
 )
 def test_at_magnitude_nothing_the_truth_is_seen(names):
     few = unrounded(*names)
@@ -204,7 +204,7 @@ def test_at_magnitude_nothing_the_truth_is_seen(names):
     assert np.ptp(last.image[-1] - none.image[-1]) > 1e-2
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_the_state_carries_a_finite_gradient_and_the_image_none():
     """Along a change of all positions, then one of all attitudes: forwards compiles faster."""
     _, worlds, state = seen(sensed(perfect_share=0.0, magnitude=(2.0, 2.0)))

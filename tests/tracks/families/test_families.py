@@ -374,7 +374,7 @@ def steepest(track):
     return np.rad2deg(np.arccos(shape_numbers(track)[2])).max()
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_hairpins_are_met_as_steeply_as_the_hardest_ellipses_apexes():
     """Half of the hardest ellipses have a gate that is met from beyond its side."""
     ellipses = [steepest(make_track("ellipse", 9, seed)) for seed in range(150)]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from tests.support.marks import slow
+from tests.support.marks import more
 from tracks.formats import mesh_reader
 from tracks.formats.custom import load_track
 from tracks.formats.mesh_reader import load_convex_parts
@@ -345,7 +345,7 @@ def test_more_memory_than_allowed_is_refused_by_its_size(tmp_path):
     [
         ("import time; time.sleep(100)", "cannot be read as a mesh within 0.5 s"),
         ("import os; os.abort()", "ended with -6"),
-        slow("import sys; sys.stdout.write('{'); sys.exit(3)", "to the end, its reader ended with"),
+        more("import sys; sys.stdout.write('{'); sys.exit(3)", "to the end, its reader ended with"),
     ],
 )
 def test_a_reader_that_hangs_or_dies_is_named_and_replaced(tmp_path, monkeypatch, program, said):

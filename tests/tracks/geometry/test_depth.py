@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.scene_poses import POSES, batch, by_mujoco, free_poses, model_of
 from tracks.common.masks import take
 from tracks.families import MAX_COUNTS, make_track
@@ -42,7 +42,7 @@ def seen(scene, pos_w, rot_w, limits=None):
     return np.asarray(render(scene, pos_w, rot_w, RAYS, CAMERA.range_m, limits=limits))
 
 
-@pytest.mark.parametrize("family", ["zigzag", slow("random")])
+@pytest.mark.parametrize("family", ["zigzag", more("random")])
 def test_depth_is_what_mujocos_rays_see_in_each_world_of_a_batch(family):
     tracks = [make_track(family, 9, seed) for seed in (1, 2)]
     poses, expected, kinds = [], [], set()
@@ -71,7 +71,7 @@ def test_meshes_and_polygonal_gates_are_seen_alike(root):
     assert_same_but_at_silhouettes(seen(batch(track, 40), pos_w, rot_w), expected)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_culling_that_keeps_enough_changes_nothing():
     track = make_track("ellipse", 9, 3)
     poses = free_poses(*model_of(track), track, np.random.default_rng(7), 2 * POSES)
@@ -226,7 +226,7 @@ def unbatched(scene):
     return jax.tree.map(lambda a: np.asarray(a, np.float32), scene)
 
 
-@pytest.mark.parametrize("family", ["zigzag", slow("random")])
+@pytest.mark.parametrize("family", ["zigzag", more("random")])
 def test_distances_outside_are_mujocos(family):
     track = make_track(family, 9, 6)
     spec = mujoco.MjSpec()
@@ -272,7 +272,7 @@ def box_distance(mesh, point):
     return np.where(height.max(-1) < 0, -gap, gap)
 
 
-@pytest.mark.parametrize("seed", [0, slow(1)])
+@pytest.mark.parametrize("seed", [0, more(1)])
 def test_the_nearest_point_is_on_a_surface_and_the_way_out_is_free(seed):
     track = make_track("zigzag", 9, seed)
     scene = unbatched(track.scene)

@@ -15,7 +15,7 @@ from eval.judging.policy_checks.rows import check_rows
 from policies.block_policy import BlockPolicy
 from policies.policy import checked_act, load_policy
 from policies.spec import ActionSpec, PolicySpec
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.pilots import Pursuit, Steady
 from tracks.geometry.camera import Camera
 
@@ -54,7 +54,7 @@ shipped = cache(load_policy)
 
 
 @pytest.mark.parametrize(
-    "order", [slow(one) if one[0] == 2 else one for one in permutations(range(3))]
+    "order", [more(one) if one[0] == 2 else one for one in permutations(range(3))]
 )
 def test_any_order_of_the_actions_axes_is_named_and_shipped_policies_have_none(order):
     expected = [] if order == (0, 1, 2) else ["action_order"]

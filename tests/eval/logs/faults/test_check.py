@@ -28,7 +28,7 @@ from suite.commands.check import Config, run
 from suite.common.console import Console
 from tests.support.diagnosis_flights import part_of, without_fault
 from tests.support.imported import flight
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.vehicles import PLAIN
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -80,8 +80,8 @@ def test_a_time_takes_a_unit_or_a_positive_factor(text):
     )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("factor", [slow(0.95), 1.08])
+@pytest.mark.extended
+@pytest.mark.parametrize("factor", [more(0.95), 1.08])
 def test_a_small_error_of_a_clocks_rate_needs_gyro_and_velocity(factor):
     log = flown(8.0)
     scaled = {
@@ -98,7 +98,7 @@ def test_a_small_error_of_a_clocks_rate_needs_gyro_and_velocity(factor):
         assert noted <= {name} and (noted or name in ("clock", "position"))
 
 
-@pytest.mark.parametrize("factor", [slow(0.5), 1.25])
+@pytest.mark.parametrize("factor", [more(0.5), 1.25])
 def test_a_clock_of_another_rate_is_one_fault(factor):
     parts = flight(100.0, 10.0, 0.3)
     parts["time"] = factor * parts["time"]

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from eval.logs.faults.check import CheckContext, check_log
 from eval.logs.faults.heading import check_heading
 from tests.support.diagnosis_flights import fly, without_fault
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.vehicles import PLAIN, with_effects
 
 
@@ -36,7 +36,7 @@ def findings(log):
     return open_ones, [f for f in found if "position delay" in (f.signal, f.fault)]
 
 
-@pytest.mark.parametrize("late_s", [-0.4, slow(0.06), 0.2])
+@pytest.mark.parametrize("late_s", [-0.4, more(0.06), 0.2])
 def test_a_late_position_and_a_set_point_are_the_only_finding(log, late_s):
     (found,), _ = findings(shifted(log, late_s))
     assert found.fault == "position_delay" and found.size == pytest.approx(late_s, abs=0.005)
@@ -49,7 +49,7 @@ def test_a_late_position_and_a_set_point_are_the_only_finding(log, late_s):
     ("names", "late_s", "fault", "evidence"),
     [
         (("vel_w",), -0.2, "velocity_delay", "as a set point is"),
-        slow(("vel_w",), 0.2, "velocity_delay", "late against the path"),
+        more(("vel_w",), 0.2, "velocity_delay", "late against the path"),
         (("quat_wxyz",), -0.1, "attitude", "early against path and gyro, as a set point is"),
         (("pos_w", "vel_w", "quat_wxyz"), 0.3, "clock_offset", "late against the gyro"),
         (("rate_b",), 0.2, "clock_offset", "late against the attitude"),
@@ -61,7 +61,7 @@ def test_set_points_and_late_signals_are_the_only_finding(log, names, late_s, fa
     assert abs(found.size) == pytest.approx(abs(late_s), abs=0.005)
 
 
-@pytest.mark.parametrize("name", ["quat_wxyz", slow("rate_b")])
+@pytest.mark.parametrize("name", ["quat_wxyz", more("rate_b")])
 def test_rows_without_a_value_do_not_hide_that_the_attitude_is_a_set_point(log, name):
     early = shifted(log, -0.1, ("quat_wxyz",))
     values = getattr(early, name).copy()
@@ -108,7 +108,7 @@ def test_another_heading_of_the_path_is_the_only_finding(log, turn_deg):
     assert f"turned by {found.size:+.0f} deg" in found.evidence
 
 
-@pytest.mark.parametrize("seed", [0, slow(3)])
+@pytest.mark.parametrize("seed", [0, more(3)])
 def test_a_heading_near_a_quarter_turn_is_swapped_axes_and_another_one_is_not(log, seed):
     log = fly(PLAIN, seed, duration_s=8.0) if seed else log
     for turn_deg, faults in ((60.0, {"heading"}), (90.0, {"position_axes", "velocity_frame"})):

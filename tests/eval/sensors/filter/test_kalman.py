@@ -20,7 +20,7 @@ from eval.sensors.filter.kalman import (
     update_gate,
 )
 from eval.sensors.interface import rotation_since
-from tests.support.marks import slow
+from tests.support.marks import more
 from tracks.geometry.rotation import exp_rot
 
 FLIGHTS, IMU_HZ, FRAME_EVERY = 100, 100.0, 5
@@ -125,7 +125,7 @@ def test_nees_is_within_its_bounds():
 
 
 @pytest.mark.parametrize(
-    ("which", "factor"), [slow("imu", 4.0), ("corners", 0.25), ("start", 0.25)]
+    ("which", "factor"), [more("imu", 4.0), ("corners", 0.25), ("start", 0.25)]
 )
 def test_nees_leaves_its_bounds_where_a_variance_is_wrong_by_four(which, factor):
     # What was believed at the start is forgotten later.

@@ -21,7 +21,7 @@ from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.formats.spec_json import KEY, labels
 from policies.policy import load_policy
 from policies.spec import NoAnswer, PolicyError
-from tests.support.marks import slow
+from tests.support.marks import more
 from tests.support.policy_files import SPEC, action_of, lively
 from tracks.geometry.camera import Camera
 
@@ -91,7 +91,11 @@ def checked(folder, *flags, name="check"):
 
 @pytest.mark.parametrize(
     ("name", "kind"),
-    [slow("odd", "-DPOLICY_PLAIN"), ("odd", "-march=native"), slow("odd8", "-march=native")],
+    [
+        more("odd", "-DPOLICY_PLAIN"),
+        ("odd", "-march=native"),
+        more("odd8", "-march=native"),
+    ],
 )
 def test_it_compiles_strictly_and_runs_under_the_sanitizers(exports, name, kind):
     flags = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", kind)
@@ -100,6 +104,7 @@ def test_it_compiles_strictly_and_runs_under_the_sanitizers(exports, name, kind)
     assert "12 steps, 0 numbers wrong" in done.stdout
 
 
+@pytest.mark.extended
 def test_it_does_not_compile_without_its_checks_for_nan_or_with_another_header(exports, tmp_path):
     def said(folder, *flags):
         command = [*(find_compiler() or ()), "-std=c99", *flags, str(folder / "policy.c")]
@@ -142,7 +147,7 @@ def test_the_vectors_find_one_wrong_weight(exports, tmp_path):
     assert checked(folder).returncode == 1
 
 
-@pytest.mark.parametrize(("name", "steps"), [slow("float32", 300), ("odd", 100)])
+@pytest.mark.parametrize(("name", "steps"), [more("float32", 300), ("odd", 100)])
 def test_parity_with_jax_over_many_steps_with_memory(exports, name, steps):
     export = exports[name]
     observed = random_observations(export.checkpoint.spec, steps, seed=9)
@@ -234,7 +239,7 @@ def test_what_is_not_trusted_or_compiled_is_said_in_plain_words(exports, tmp_pat
             load_c(exports["odd"].folder, trust=True)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_a_folder_of_links_flies_with_its_own_header(exports, tmp_path):
     """As caches keep files: by what they hold, in another folder and under other names."""
     (tmp_path / "linked").mkdir()
@@ -246,7 +251,7 @@ def test_a_folder_of_links_flies_with_its_own_header(exports, tmp_path):
     assert load_c(tmp_path / "linked", trust=True).name == "odd.c"
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_a_name_with_signs_that_c_reads_otherwise_comes_back(exports, tmp_path):
     """Of two ? and a third sign C99 makes another sign, a backslash even."""
     name = r'run ??) "one" ??/ \ü'

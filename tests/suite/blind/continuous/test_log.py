@@ -40,7 +40,7 @@ def stepped(nominal, truth, ways, conditions, step_s):
     return fly_continuous(nominal, truth, ways, conditions, rng, step_s=step_s)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 @pytest.mark.parametrize("lag", [0.0, 0.02])
 def test_a_finer_step_changes_a_flight_by_far_less_than_the_noise(lag):
     drag = {"linear_drag": ((0.3, 0.2, 0.1),), "quadratic_drag": ((0.03, 0.02, 0.04),)}
@@ -59,7 +59,7 @@ def test_a_finer_step_changes_a_flight_by_far_less_than_the_noise(lag):
     assert np.abs(coarse.acc_b - fine.acc_b).max() < 1e-4 * noise.acc
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_the_error_falls_with_the_fourth_power_of_the_step():
     # Without ticks in between: a loop as slow as the rows, so that steps are as long as allowed.
     truth = with_lag(with_effects(quadratic_drag=((0.5, 0.4, 0.3),)), 0.02)

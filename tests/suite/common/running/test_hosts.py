@@ -95,6 +95,7 @@ def ends(processes, seconds=300):
             process.kill()
 
 
+@pytest.mark.extended
 def test_two_processes_meet_agree_and_hear_that_one_is_gone(tmp_path, root):
     where = f"127.0.0.1:{free_port()}"
     environment = {**os.environ, "PYTHONPATH": str(root), "JAX_PLATFORMS": "cpu"}

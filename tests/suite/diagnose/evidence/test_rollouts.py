@@ -33,14 +33,14 @@ DRAG = (0.3, 0.35, 0.1)
 flown = cache(lambda layout: jax.jit(rollouts.compiled(layout, False, False, "continuous")[0]))
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 @pytest.mark.usefixtures("compiled_quickly")
 @pytest.mark.parametrize(
     ("frequency", "rate_hz", "lag", "delay"),
     [
         (500.0, 50.0, 0.03, 0.0273),
         # A delay of part of a step, which no lag smooths.
-        pytest.param(500.0, 100.0, 0.0, 0.0013, marks=pytest.mark.slow),
+        pytest.param(500.0, 100.0, 0.0, 0.0013, marks=pytest.mark.extended),
         pytest.param(1000.0, 100.0, 0.015, 0.0, marks=pytest.mark.slow),
         pytest.param(2000.0, 100.0, 0.0, 0.01, marks=pytest.mark.slow),
         pytest.param(200.0, 100.0, 0.03, 0.0273, marks=pytest.mark.slow),

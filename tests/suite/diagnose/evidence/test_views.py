@@ -169,7 +169,7 @@ def before():
     return {view.name: task_of(logs, view) for view in (FORCE, TORQUE)}
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 @pytest.mark.parametrize("share", [0.8, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_a_change_stands_out_of_how_flights_differ_though_the_file_is_wrong(before, share):
     motor = {"weak_motor": ((1.0, 1.0, share, 1.0),)} if share < 1.0 else {}
@@ -221,7 +221,7 @@ def test_sizes_are_drawn_as_the_spread_is_estimated():
     assert sizes["torque"].var(axis=0) == pytest.approx(np.full(3, both / 36.0), rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_more_drag_is_named_with_its_whole_size_and_other_speeds_are_no_change(monkeypatch):
     p_values, welch = list[float](), change.ttest_ind
 

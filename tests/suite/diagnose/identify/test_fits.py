@@ -178,7 +178,7 @@ def test_noise_of_the_rotor_speeds_widens_the_interval_and_makes_no_body_heavier
     assert not rolled(0.0, high=0.3).identifies("inertia_x")
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_flapping_is_within_its_interval_and_none_without_what_it_needs():
     true, flights = 4e-7, real_flights.flights
     blown = flights(3, 5, 4.0, blade_flapping=(true,))

@@ -60,6 +60,7 @@ def test_identified_numbers_are_near_the_truth(drive, least):
     assert found.drive == drive and len(near_truth(found)) >= least
 
 
+@pytest.mark.extended
 def test_rotor_speeds_of_another_flight_are_a_warning():
     one, other = known.logs("rotors", 0)[::3]
     rows = np.arange(len(one.time_s)) % len(other.time_s)
@@ -113,7 +114,7 @@ def test_an_inertia_that_is_ten_times_too_large_is_identified():
         assert moment == pytest.approx(true, rel=0.1)
 
 
-@pytest.mark.parametrize("drive", [pytest.param("rotors", marks=pytest.mark.slow), "pwm"])
+@pytest.mark.parametrize("drive", [pytest.param("rotors", marks=pytest.mark.extended), "pwm"])
 def test_time_on_the_ground_does_not_count(drive):
     (log, *_), leave = known.logs(drive, 0), (*TURNING, "drag")
     resting = on_the_ground(log, log.duration_s, 3.0)  # for most of the log
@@ -173,6 +174,7 @@ def without_voltage(logs):
     return [replace(log, voltage=None) for log in logs]
 
 
+@pytest.mark.extended
 def test_a_file_without_motors_gets_them_and_keeps_its_voltage_for_flights_without_one():
     logs, bare = known.logs("pwm", 0)[:3], replace(known.start(), motors=None)
     begun = identify(logs, bare, leave=TURNING)
@@ -198,6 +200,7 @@ def test_what_lag_and_delay_make_together_does_not_pass_for_a_delay():
     assert any(line.startswith("command_delay: only its sum with") for line in found.not_identified)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("drive", "column", "key", "line"),
     [
@@ -211,6 +214,7 @@ def test_commands_that_stop_early_do_not_identify_what_needs_them(drive, column,
     assert any(text.startswith(line) and "with both" in text for text in found.not_identified)
 
 
+@pytest.mark.extended
 def test_a_flight_without_commands_or_voltage_takes_nothing_from_the_others():
     logs = known.logs("pwm", 0)
     alone = numbers_json(identify(logs[:3], known.start(), leave=TURNING).numbers)
@@ -225,6 +229,7 @@ def test_a_flight_without_commands_or_voltage_takes_nothing_from_the_others():
             np.testing.assert_allclose(entry["value"], alone[key]["value"], rtol=1e-3)
 
 
+@pytest.mark.extended
 def test_rotors_that_are_logged_in_turn_identify_all_but_their_lag():
     def in_turn(speed):
         return np.where(np.arange(len(speed))[:, None] % 4 == np.arange(4), speed, np.nan)

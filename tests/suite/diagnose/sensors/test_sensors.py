@@ -136,6 +136,7 @@ def test_a_drift_and_a_tilt_by_neglected_drag_are_found_where_they_are():
     assert drag.high - drag.low < 0.05
 
 
+@pytest.mark.extended
 def test_a_flight_without_a_part_of_the_estimate_does_not_count_for_it():
     has, lacks = (parts(log, group) for log, group in zip(short(), ("vel", "quat"), strict=True))
     one, two = (fit_sensors(logs) for logs in ([has], [has, lacks]))

@@ -73,7 +73,7 @@ def test_a_drag_of_the_file_makes_way_for_what_rotors_do_and_none_stands_for_ano
         assert effects[name].coefficient == pytest.approx(value, rel=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_an_inertia_is_named_though_the_trim_of_each_flight_is_larger():
     logs = flights(4, seed=9, speed=4.0, inertia_scale=((0.8, 0.8, 0.8),))
     names, found = found_in(logs)
@@ -85,7 +85,7 @@ def test_an_inertia_is_named_though_the_trim_of_each_flight_is_larger():
     assert after.energy.sum() < before.energy.sum()
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_flights_of_two_vehicles_give_no_name_whose_interval_has_the_files_value():
     other = flights(2, 3, 5.0, hidden={"thrust_scale": (0.9,)})
     names, found = found_in([*flights(2, 1, 5.0), *other])
@@ -108,7 +108,7 @@ def test_a_battery_that_sags_is_named_with_its_size(rate, duration_s, fall):
         assert sag.rate == pytest.approx(rate, rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_an_attitude_alone_shows_the_torque_as_finely_as_a_gyro():
     moved = flights(4, 5, 5.0, com_offset=((0.006, -0.002, 0.0),))
     lost, about = np.full_like(moved[0].rate_b, np.nan), {"partial": ["rate"]}
@@ -129,6 +129,7 @@ def test_a_black_box_explains_what_depends_on_the_motion_and_no_noise(by_views):
     assert np.abs(centred(real, flight)[flight == 0].mean(axis=0)).max() < 1e-12
 
 
+@pytest.mark.extended
 def test_a_reference_flight_that_never_flies_is_not_listed_as_one():
     new, old = flights(2, 8, 2.0), flights(2, 9, 2.0)
     still = {key: 0.0 * getattr(old[0], key) for key in ("vel_w", "thrust_cmd", "rotor_speed")}
@@ -189,7 +190,7 @@ def hysteresis(motion, t):
     return (2.0 if motion.vel_w[2] > 0.0 else -1.0) * motion.rot_w[:, 2]
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("extra", "seed", "duration_s"),
     [(drag_to_one_side, 20, 4.0), (hysteresis, 40, 12.0)],

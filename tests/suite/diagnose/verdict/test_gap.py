@@ -223,6 +223,7 @@ def slow():
     return fly_all([truth] * 3, range(3), duration_s=3.0, motors=True)
 
 
+@pytest.mark.extended
 def test_a_longer_rotor_lag_is_named_next_to_what_the_views_name(slow):
     found = diagnose(slow, LAGGED, by="views")
     written = diagnosis_json(found)

@@ -227,7 +227,7 @@ def straight(wall_x=50.0):
     return straight_worlds(sample_worlds(FLOWN, 0), SPEED, wall_x)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_a_straight_flight_through_two_gates_is_a_success_and_a_wall_before_the_last_a_collision(
     measure,
 ):

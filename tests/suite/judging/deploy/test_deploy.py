@@ -57,7 +57,7 @@ def test_a_card_of_an_earlier_export_does_not_stay(folder, tmp_path, monkeypatch
 
 
 @needs_cc
-@pytest.mark.slow
+@pytest.mark.extended
 def test_int8_is_scaled_by_flights(folder, tmp_path, monkeypatch, capsys):
     observed = random_observations(load_policy_checkpoint(folder).spec, 30, seed=3)
     monkeypatch.setattr(exporting, "observed_flights", lambda policy: observed)
@@ -93,7 +93,7 @@ def test_without_a_policy_the_default_one_is_exported(monkeypatch):
 
 @pytest.mark.parametrize(
     ("wanted", "file"),
-    [("onnx", "policy.onnx"), pytest.param("c", "policy.c", marks=pytest.mark.slow)],
+    [("onnx", "policy.onnx"), pytest.param("c", "policy.c", marks=pytest.mark.extended)],
 )
 def test_an_export_of_another_policy_is_not_written_over(
     wanted, file, folder, tmp_path, monkeypatch, capsys
@@ -166,8 +166,9 @@ def test_what_a_policy_is_given_on_flights_is_kept_but_for_rows_in_which_nothing
     assert observed.fresh.tolist() == [True, False, False, True]
 
 
+@pytest.mark.extended
 @needs_cc
-@pytest.mark.parametrize("kind", ["acceleration", pytest.param("ctbr", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["acceleration", pytest.param("ctbr", marks=pytest.mark.extended)])
 def test_the_engines_that_are_timed_are_one_policy(kind, tmp_path):
     spec = replace(SPEC, action=ActionSpec(kind))
     folder = save_policy(tmp_path / "tiny", lively(spec, 2), spec, seed=1)

@@ -146,7 +146,7 @@ def test_a_delay_that_creeps_in_is_found(bench):
     assert one.now - begin == pytest.approx(2.0, abs=0.15)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_clocks_may_drift_apart(bench):
     one = bench().fly(1)
     for drift in (1.0 - 5e-4, 1.0 + 5e-4):

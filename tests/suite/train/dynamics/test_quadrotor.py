@@ -112,7 +112,7 @@ def test_on_the_judges_steps_the_trainers_quadrotor_flies_the_judges_flight(floa
         np.testing.assert_allclose(one, two, atol=2e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_the_default_recipe_draws_vehicles_that_fly():
     """A second of mild actions tips none over, around the lightest of the shipped vehicles."""
     config = with_quadrotor(named_recipe("race"), load_vehicle("crazyflie21")).quadrotor
@@ -121,7 +121,7 @@ def test_the_default_recipe_draws_vehicles_that_fly():
     assert np.isfinite(pos_w).all() and rot_w[..., 2, 2].min() > 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_the_rollouts_gradient_is_that_of_finite_differences(float64, monkeypatch):
     """Where nothing is cut, heading held, with a Delta Action network, which sees the attitude.
 
@@ -221,7 +221,7 @@ def test_draws_stay_within_what_a_vehicle_can_have_and_move_no_other_draw():
     np.testing.assert_allclose(torque.std(0), [0.0192, 0.0192, 0.00384], rtol=0.08)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_effects_of_every_kind_fly_in_training_together():
     drawn = drawn_effects(np.random.default_rng(0)).effects
     effects = {name: values for name, values in drawn.items() if EFFECTS[name].in_flight}

@@ -135,6 +135,7 @@ def test_an_interrupt_ends_it_at_once_and_keeps_what_came(two):
     assert time.monotonic() - started < 100, "in processes the pieces take 30,000 s"
 
 
+@pytest.mark.extended
 def test_a_piece_whose_process_died_is_done_again_and_once_only(tmp_path):
     found = []
     pieces = range(4)
@@ -239,7 +240,7 @@ os._exit(late)
 """Asks at a port of nobody, at one of who is silent, of a web server and of who hangs up."""
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_a_port_of_something_else_is_refused_in_the_time_that_is_promised():
     """In a process of its own, as Dask's client tries on beside when we gave it up."""
     pytest.importorskip("distributed")
@@ -275,7 +276,7 @@ def test_messages_are_encrypted_where_the_address_says_so(tmp_path, monkeypatch)
                 worker_count(found.address)
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_a_node_that_dies_costs_its_pieces_once_and_a_piece_that_kills_ends_the_work(tmp_path):
     with cluster(tmp_path) as found:
         check_numbers(found.address)
