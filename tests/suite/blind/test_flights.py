@@ -64,6 +64,7 @@ def test_a_flight_that_cannot_be_flown_fails_by_name():
         run(5, heavy)
 
 
+@pytest.mark.extended
 def test_physics_from_outside_acts_and_is_recorded(fifth):
     plain, _ = fifth
     flown, _ = run(5, extra=outside.KINDS["tether"].make(0.1, 0.75))

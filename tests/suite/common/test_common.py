@@ -335,6 +335,7 @@ def test_more_processes_than_cores_are_refused_where_each_needs_some(monkeypatch
         read_workers_option("3", whole_cores=True)
 
 
+@pytest.mark.extended
 @pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
 def test_jobs_come_back_in_order_from_processes_that_share_no_core_or_say_what_failed():
     console = Recorded()

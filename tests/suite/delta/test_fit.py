@@ -53,6 +53,7 @@ PHYSICS = PointMassConfig(drag=(0.3, 0.3), drag_up=(0.3, 0.3), action_delay=(0.5
 CONFIG = FitConfig(horizon_s=0.6, stride_s=0.3, iterations=100, batch=32, rate=1e-2, held_out=0.5)
 
 
+@pytest.mark.extended
 def test_lag_drag_and_delay_of_a_point_mass_are_identified_in_a_third_of_the_steps(monkeypatch):
     """Far from the middle: a rival that is fitted by half would flatter the network."""
     truth = PointMassModel(np.float32(6.0), np.array([0.1, 0.6, 0.25], np.float32), np.float32(1.6))
