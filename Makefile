@@ -1,11 +1,12 @@
-# make env    the environment in .venv, from requirements.lock
-# make race   fly a policy where the dynamics hide an effect, name it, train for it, fly again
-# make gpu    speed, a short training and the CPU's outcomes on this machine's GPU: docs/results/gpu.md
-# make test   lint, types and tests
-# make lint   ruff, pyrefly, and docs/reference against the code
-# make docs   the pages of docs/ as a site in site/, links checked
-# make lock   requirements.lock from what is installed in .venv
-# make clean  remove caches and build products (runs/ and .venv stay)
+# make env       the environment in .venv, from requirements.lock
+# make race      fly a policy where the dynamics hide an effect, name it, train for it, fly again
+# make gpu       speed, a short training and the CPU's outcomes on this machine's GPU: docs/results/gpu.md
+# make test      lint, types and tests
+# make extended  further cases of the tests, which make test leaves out
+# make lint      ruff, pyrefly, and docs/reference against the code
+# make docs      the pages of docs/ as a site in site/, links checked
+# make lock      requirements.lock from what is installed in .venv
+# make clean     remove caches and build products (runs/ and .venv stay)
 
 VENV ?= .venv
 OUT ?= runs/race
@@ -16,7 +17,7 @@ USABLE := import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3,
 
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: env race gpu test tests lint style types docs lock clean
+.PHONY: env race gpu test tests extended lint style types docs lock clean
 
 env: $(STAMP)
 
@@ -52,9 +53,13 @@ types: $(STAMP)
 	$(PY) -m pyrefly check --python-interpreter-path $(PY) --output-format min-text
 
 # Tests start dozens of programs, each of which would compile the modules anew.
-tests: export PYTHONDONTWRITEBYTECODE =
+tests extended: export PYTHONDONTWRITEBYTECODE =
+PYTEST := $(PY) -m pytest -n $(JOBS) --dist loadgroup --no-loadscope-reorder
 tests: $(STAMP)
-	$(PY) -m pytest -n $(JOBS) --dist loadgroup --no-loadscope-reorder
+	$(PYTEST)
+
+extended: $(STAMP)
+	$(PYTEST) -m extended
 
 # The types are checked on one core, beside the tests.
 test: style

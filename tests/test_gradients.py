@@ -122,13 +122,7 @@ def compiled(function):
     return jax.jit(jax.vmap(both))
 
 
-LONGEST = "action, from rest"
-"""Takes most of the time of all cases; the functions in it have cases of their own."""
-
-
-@pytest.mark.parametrize(
-    "case", [pytest.param(c, marks=pytest.mark.extended) if c == LONGEST else c for c in CASES]
-)
+@pytest.mark.parametrize("case", CASES)
 def test_a_gradient_is_the_limit_of_differences(case):
     function, at = CASES[case]
     with jax.enable_x64(True):
