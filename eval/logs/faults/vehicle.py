@@ -51,12 +51,20 @@ FOV_DEG = 2.0
 """Fields of view that differ by at most this belong to the same camera [deg]."""
 
 
+def has_unusual_arms(vehicle: Vehicle) -> bool:
+    """Return whether the rotors are at no usual distance from the middle."""
+    return not ARM_M[0] <= _arm_m(vehicle) <= ARM_M[1]
+
+
+def _arm_m(vehicle: Vehicle) -> float:
+    hubs = np.asarray(vehicle.rotors.position)
+    return float(np.mean(np.hypot(hubs[:, 0], hubs[:, 1])))
+
+
 def check_vehicle_numbers(vehicle: Vehicle) -> list[Finding]:
     """Return findings on implausible arms, thrust, inertia, torque, gains, body and camera."""
-    found = []
-    hubs = np.asarray(vehicle.rotors.position)
-    arm = float(np.mean(np.hypot(hubs[:, 0], hubs[:, 1])))
-    if not ARM_M[0] <= arm <= ARM_M[1]:
+    found, arm = [], _arm_m(vehicle)
+    if has_unusual_arms(vehicle):
         text = f"rotors are {arm:.3g} m from the middle; usual are {ARM_M[0]:g} to {ARM_M[1]:g}"
         # Positions in cm or mm: prefer the unit by which the inertia is usual as well.
         units = [k for k in (100, 1000) if ARM_M[0] <= arm / k <= ARM_M[1]]
