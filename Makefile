@@ -59,7 +59,7 @@ tests: $(STAMP)
 	$(PYTEST)
 
 extended: $(STAMP)
-	$(PYTEST) -m extended
+	$(PYTEST) -m "extended and not slow"
 
 # The types are checked on one core, beside the tests.
 test: style

@@ -231,7 +231,7 @@ def inputs(count, rate_b):
     return Inputs(command=Command(np.full(count, 9.81), rate))
 
 
-@pytest.mark.parametrize("kind", loops.KINDS)
+@pytest.mark.parametrize("kind", ["px4", *(more(k) for k in ("betaflight", "crazyflie"))])
 def test_numpy_and_jax_fly_the_same_and_follow_the_rates(kind):
     plant = make_plant(vehicle(kind), DT)
     given = inputs(160, [1.0, -0.7, 0.4])

@@ -53,6 +53,7 @@ def test_without_rotorpy_the_install_line_is_said(missing, monkeypatch, tmp_path
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.extended
 def test_the_body_falls_as_the_simulator_says_and_touches_our_ground(stand_in):
     (result,), (flight,) = flown(Steady(), TRACK, record=Record(), rules=RULES)
     assert result[8:10] == ("collision", "ground") and result.world == "rotorpy"

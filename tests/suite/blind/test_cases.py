@@ -172,6 +172,7 @@ def test_an_effect_that_is_not_in_the_table_is_worked_out(monkeypatch):
     assert late == oracle.Column("imu_fault", "late", 0)
 
 
+@pytest.mark.extended
 def test_a_case_is_the_same_to_the_bit_and_its_seed_matters(made_set, monkeypatch, short_flights):
     monkeypatch.setattr(module, "_expected_names", lambda *_: {})  # how strong it is takes longest
     first, again = build(SINGLE), made_set / "cases" / "case_001" / "flight_1.parquet"

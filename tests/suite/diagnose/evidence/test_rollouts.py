@@ -249,6 +249,7 @@ GIVEN = with_lag(PLAIN, 0.02)
 TURN = (0.01, -0.015, 0.02)
 
 
+@pytest.mark.extended
 def test_a_fault_from_a_package_is_a_candidate_and_in_the_simulated_log(
     monkeypatch, compiled_quickly
 ):

@@ -11,6 +11,7 @@ from suite.diagnose.identify.numbers import numbers_json
 from tests.support import identified as known
 from tests.support.broken_logs import changed, on_the_ground
 from tests.support.diagnosis_flights import fly_all
+from tests.support.marks import more
 from tests.support.tools import program
 from tests.support.vehicles import PLAIN, with_effects
 
@@ -53,7 +54,7 @@ def near_truth(found, most=2.5):
 
 
 @pytest.mark.parametrize(
-    ("drive", "least"), [("rates", 9), ("pwm", 7), ("rotors", 9), ("torques", 9)]
+    ("drive", "least"), [("rates", 9), ("pwm", 7), more("rotors", 9), ("torques", 9)]
 )
 def test_identified_numbers_are_near_the_truth(drive, least):
     found = known.found(drive)
@@ -99,6 +100,7 @@ TURNING = ("inertia", "lag")
 """Parts that tests of forces leave: their fits take most of the time."""
 
 
+@pytest.mark.extended
 def test_parts_that_are_left_stay():
     begun = known.start()
     found = identify(known.logs("rates", 0, known.HOVER), begun, leave=(*TURNING, "drag", "loop"))

@@ -321,6 +321,7 @@ def test_effects_that_cancel_each_other_are_no_names(found_drag):
     assert found.named and kept is after and sizes == {"linear_drag": large} and out == []
 
 
+@pytest.mark.extended
 def test_an_error_that_is_small_enough_is_not_structure(found_drag):
     bare, both = found_drag.search.refitted(()), (found_drag.before, found_drag.before)
 

@@ -32,6 +32,9 @@ from tests.support.training import (
     small_config,
 )
 
+pytestmark = pytest.mark.extended
+"""PPO is a method that ours is compared with."""
+
 STEPS, BATCH = 5, 3
 PLAIN = PpoConfig(spec=SPEC, entropy=0.0)
 
@@ -236,7 +239,6 @@ def means_of(actor, records, hidden):
     return means(actor.params, embeddings.reshape(6, 4, -1), sequences)
 
 
-@pytest.mark.extended
 def test_exploration_is_not_the_image_noise_of_a_world():
     """A policy that sees the noise of its own action could learn to correct it."""
     worlds = boxes_worlds(CONFIG.shared)
@@ -248,7 +250,6 @@ def test_exploration_is_not_the_image_noise_of_a_world():
         assert (np.abs(pixels - explored.ravel()).max(1) > 0.1).all()
 
 
-@pytest.mark.extended
 def test_the_learner_meets_the_actions_density_that_the_rollout_recorded():
     """Through delays, collisions and recurrent states of the start: a ratio of one everywhere."""
     worlds = crashing(boxes_worlds(CONFIG.shared))
@@ -281,7 +282,6 @@ def worlds():
     return drawn._replace(scene=boxes_only(drawn.scene))
 
 
-@pytest.mark.extended
 def test_mapped_it_flies_what_the_batch_of_the_trainers_ppo_flies(worlds):
     seen, state = reset(KEYS, worlds)
     assert seen.state.shape == (3, 12) and seen.image.shape == (3, 20, 20)
