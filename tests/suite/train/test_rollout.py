@@ -241,8 +241,8 @@ def test_the_encoders_gradient_is_that_of_its_chunks_and_on_average_of_every_oth
 
     @jax.jit
     def whole(params):
-        encode = lambda params: network.encode(params, images.reshape(12, 20, 20))  # noqa: E731
-        return jax.vjp(encode, params)[1](cotangents.reshape(12, 8))[0]
+        encoded = jax.vjp(lambda own: network.encode(own, images.reshape(12, 20, 20)), params)
+        return encoded[1](cotangents.reshape(12, 8))[0]
 
     monkeypatch.setattr("suite.train.gradient.CHUNK", 4)  # two chunks of three images
     keys = {int(jax.random.randint(key, (), 0, 2)): key for key in jax.random.split(KEY, 8)}
