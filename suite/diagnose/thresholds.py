@@ -172,6 +172,9 @@ class Thresholds:
     hopeless_chi2: float = 10.0
     """Largest mean squared error, in noise variances, after a fit of all effects together. If it is
     exceeded, force and torque are used instead of rollouts of 1 s."""
+    hopeless_m: float = 0.01
+    """Largest RMS error of positions in rollouts of 1 s after that fit, whatever the noise [m]. A
+    force below the threshold of relevance causes as much."""
     hopeless_windows: int = 16
     """Windows of that fit with the nonlinear model, after a linear fit above the limit."""
     hopeless_rounds: int = 6

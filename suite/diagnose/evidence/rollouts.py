@@ -202,7 +202,8 @@ def is_hopeless(model: RolloutModel, linear: Linearisation, limits: Thresholds) 
     """Return whether even a fit of all parameters leaves the rollouts far from the flights.
 
     It uses `linear`, along all parameters. If its error is too large, which may be because effects
-    are large, some windows are fitted with the full model.
+    are large, some windows are fitted with the full model. Without noise in the logs any error is
+    many times the noise: positions within a small distance are near enough.
     """
     evidence, block = rollout_evidence(model, linear, limits)
 
@@ -218,7 +219,12 @@ def is_hopeless(model: RolloutModel, linear: Linearisation, limits: Thresholds) 
     evidence, block = rollout_evidence(model, take(linear, few), limits)
     at = Estimate(start, linear.offset[few])
     best = evidence.fitted(at, informed, limits.hopeless_rounds, block)
-    return is_far(float((best.block.residual**2).sum()))
+    if not is_far(float((best.block.residual**2).sum())):
+        return False
+    position = SLICES["position"]
+    has_position = np.asarray(evidence.windows.valid)[..., position].all(axis=-1)
+    error_w = model.residual(best.at, evidence.windows)[..., position][has_position]
+    return float(np.sqrt((error_w**2).sum(axis=-1).mean())) > limits.hopeless_m
 
 
 class RolloutModel:

@@ -21,6 +21,7 @@ from eval.quadrotor.loops import KINDS
 from suite.common.report import html
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import candidates, make_space
+from suite.diagnose.evidence.rollouts import is_hopeless, rollouts_along
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.sources import rollout_source, rollouts
@@ -47,6 +48,21 @@ def test_flights_of_the_vehicle_itself_have_no_gap():
     found = by_rollout(flights(LAGGED, duration_s=3.5))
     assert (found["verdict"], found["effects"]) == ("no_gap", [])
     assert 0.8 < found["gap"]["before"] < 1.2
+
+
+def test_without_noise_rollouts_near_a_flight_are_no_hopeless_ones():
+    """A fin that no effect of the catalogue has moves the vehicle by many times no noise."""
+
+    def fin(motion, t):
+        side_w = motion.rot_w[:, 1]
+        speed = float(motion.vel_w @ side_w)
+        return -0.02 * abs(speed) * speed * side_w
+
+    logs = flights(LAGGED, count=2, duration_s=3.0, noise=0.0, motors=True, extras=[fin] * 2)
+    model, windows, start = rollouts_along(logs, LAGGED, False)
+    linear = model.linearise(start, windows)
+    assert not is_hopeless(model, linear, THRESHOLDS)
+    assert is_hopeless(model, linear, replace(THRESHOLDS, hopeless_m=0.0))
 
 
 @pytest.mark.slow
