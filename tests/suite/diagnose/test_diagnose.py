@@ -50,6 +50,7 @@ def test_flights_of_the_vehicle_itself_have_no_gap():
     assert 0.8 < found["gap"]["before"] < 1.2
 
 
+@pytest.mark.extended
 def test_without_noise_rollouts_near_a_flight_are_no_hopeless_ones():
     """A fin that no effect of the catalogue has moves the vehicle by many times no noise."""
 
@@ -59,7 +60,7 @@ def test_without_noise_rollouts_near_a_flight_are_no_hopeless_ones():
         return -0.02 * abs(speed) * speed * side_w
 
     logs = flights(LAGGED, count=2, duration_s=3.0, noise=0.0, motors=True, extras=[fin] * 2)
-    model, windows, start = rollouts_along(logs, LAGGED, False)
+    model, windows, start = rollouts_along(logs, LAGGED, False, integrator="euler")
     linear = model.linearise(start, windows)
     assert not is_hopeless(model, linear, THRESHOLDS)
     assert is_hopeless(model, linear, replace(THRESHOLDS, hopeless_m=0.0))
