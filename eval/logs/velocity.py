@@ -17,8 +17,6 @@ HALF_WINDOW_S = 0.05
 """Positions within this time of a row are used [s]; slower logs use the five nearest rows."""
 GAP_STEPS = 6.0
 """Rows further away than this many median steps (and the half window) are not used."""
-
-
 KEPT, KEPT_ROWS = 8, 20_000
 """The last results are kept, of logs with at most so many rows: checks repeat the same fit."""
 

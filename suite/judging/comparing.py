@@ -23,8 +23,8 @@ CONDITIONS = ("simulator", "time_limit_s", "deadline_s")
 """Settings that change the result of a trial, besides the trial itself and the input files."""
 PACKAGES = ("numpy", "mujoco", "jax", "torch", "onnxruntime")
 """Packages of the judge and of policies, whose versions may change a result."""
-OF_SIMULATOR = {"mjx": "mujoco-mjx", "rotorpy": "rotorpy"}
-"""Simulator -> the package that only it needs."""
+OF_SIMULATOR = {"mjx": ("mujoco-mjx",), "rotorpy": ("rotorpy",)}
+"""Simulator -> the packages that only it needs."""
 
 
 class Run(NamedTuple):
@@ -66,7 +66,7 @@ def read_runs(folder: Path) -> list[Run]:
     versions = {key: summary.get(key) for key in ("suite_version", "git_commit")}
     if (record := folder / "run.json").is_file():
         run = read_json(record, packages=dict, machine=dict)
-        used = (*PACKAGES, OF_SIMULATOR.get(str(conditions["simulator"]), "mujoco"))
+        used = (*PACKAGES, *OF_SIMULATOR.get(str(conditions["simulator"]), ()))
         versions |= {name: run["packages"].get(name) for name in used}
         versions |= {"plugins": run.get("plugins"), "processor": run["machine"].get("processor")}
     names = list(dict.fromkeys(row.policy for row in results))

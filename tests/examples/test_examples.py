@@ -24,6 +24,7 @@ from suite.train import run as train_run
 from suite.train.overrides import with_changes
 from tests.support.judged_cells import cut_short
 from tests.support.loops import made_update
+from tests.support.marks import more
 from tests.support.policy_files import InProcess
 
 RECIPE = train_command.named_recipe
@@ -80,7 +81,7 @@ def as_a_program(tmp_path, monkeypatch):
     ("name", "short"),
     [
         *((name, True) for name in EXAMPLES if name not in IN_FULL),
-        *(pytest.param(name, False, marks=pytest.mark.extended) for name in EXAMPLES),
+        *(more(name, False) for name in EXAMPLES),
     ],
 )
 def test_the_example_runs(name, short, tmp_path, monkeypatch, capsys):

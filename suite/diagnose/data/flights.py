@@ -144,15 +144,10 @@ def ready(
             )
             views.remove(view)
             del parts[view.name]
-    spacing_s = [rotors[k].spacing_s for k in kept]
-    hidden_s = [
-        step_s
-        for step_s in spacing_s
-        if not rows_show_torque(vehicle, step_s) and torque_between_rows(vehicle, step_s).any()
-    ]
-    if hidden_s and TORQUE.name in parts:
-        lag_ms = 1e3 * vehicle.rotors.time_constant
-        notes.append(HIDDEN_TORQUE.format(1e3 * max(hidden_s), lag_ms))
+    step_s = max(rotors[k].spacing_s for k in kept)
+    is_hidden = torque_between_rows(vehicle, step_s).any() and not rows_show_torque(vehicle, step_s)
+    if is_hidden and TORQUE.name in parts:
+        notes.append(HIDDEN_TORQUE.format(1e3 * step_s, 1e3 * vehicle.rotors.time_constant))
     return ViewFlights(
         tuple(views),
         tuple(given[k] for k in kept),

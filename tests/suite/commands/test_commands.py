@@ -21,6 +21,7 @@ from suite.judging.flying import checkpoint_folder
 from suite.train import run as training
 from tests.support.commands import answer, refused, run
 from tests.support.documents import unpainted
+from tests.support.marks import more
 
 
 def test_tracks_command_lists_and_draws(tmp_path, capfd, monkeypatch):
@@ -45,7 +46,7 @@ def test_tracks_command_lists_and_draws(tmp_path, capfd, monkeypatch):
     assert "--speed is 2.0, allowed is 0 to 1" in refused(capfd, "eval --speed 2")
 
 
-@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.extended)])
+@pytest.mark.parametrize("workers", [1, more(2)])
 def test_doubts_about_a_vehicle_file_are_printed_once_and_stop_nothing(workers, tmp_path, capfd):
     """Two processes could each say them again."""
     vehicle = load_vehicle("reference")

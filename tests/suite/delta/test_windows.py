@@ -26,6 +26,7 @@ from suite.train.config import PointMassConfig, QuadrotorConfig
 from suite.train.dynamics import point_mass
 from tests.support.broken_logs import rows
 from tests.support.courses import straight
+from tests.support.marks import more
 from tests.support.pilots import Pursuit
 from tests.support.point_mass_flights import fly
 from tests.support.vehicles import PLAIN, with_effects, with_lag
@@ -160,7 +161,7 @@ def errors(plant, windows, delta=None):
     return np.abs(pos - windows.pos_w[:, 1:]).max(), np.abs(vel - windows.vel_w[:, 1:]).max()
 
 
-@pytest.mark.parametrize("delay", [pytest.param(0.0, marks=pytest.mark.extended), 1.7])
+@pytest.mark.parametrize("delay", [more(0.0), 1.7])
 def test_flights_of_the_point_mass_replay_as_they_were_flown(delay):
     """Rounding in float32 and the start's acceleration from velocities 1 ms apart."""
     plant = PointMassModel(np.float32(10.0), np.zeros(3, np.float32), np.float32(delay))
@@ -274,7 +275,7 @@ def of_point_mass():
 
 @pytest.mark.parametrize(
     ("model", "rtol"),
-    [("of_point_mass", 0.0), pytest.param("of_true", 1e-6, marks=pytest.mark.extended)],
+    [("of_point_mass", 0.0), more("of_true", 1e-6)],
 )
 def test_a_fresh_delta_changes_nothing_and_a_constant_one_acts_as_the_action(model, rtol, request):
     """With and without it are two programs, which may round otherwise in the last digit or two."""

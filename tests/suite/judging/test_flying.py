@@ -37,7 +37,7 @@ from suite.judging.flying import Manner, manners, policy_labels, workers_for
 from suite.judging.requests import Collection, Evaluation
 from suite.judging.trials import read_trial_set, trial_list
 from tests.support.commands import evaluate, refused
-from tests.support.courses import IN_CONTACT
+from tests.support.courses import IN_CONTACT, ONE_GATE
 from tests.support.engines import STAND_IN
 from tests.support.pilots import Pursuit
 from tests.support.tools import python
@@ -156,7 +156,7 @@ def test_a_track_file_is_flown_once_a_seed_and_once_where_nothing_acts_by_chance
 )
 def test_sensors_without_random_numbers_give_equal_flights(tmp_path, stage, text, flights, noted):
     (tmp_path / "mine.toml").write_text(f'name = "mine"\n[[{stage}]]\n{text}\n')
-    (track := tmp_path / "course.toml").write_text(IN_CONTACT.replace("0.02", "1.3"))
+    (track := tmp_path / "course.toml").write_text(ONE_GATE)
     options = Evaluation(track=str(track), trials=3, sensors=str(tmp_path / "mine.toml"))
     trial_set = read_trial_set(options)
     assert len(trial_set.trials) == flights

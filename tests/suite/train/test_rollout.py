@@ -19,6 +19,7 @@ from suite.train.losses import UNIT_FIELD, speed_to_goal
 from suite.train.rollout import view_in
 from suite.train.step import BEYOND_M, PATH_SAMPLES, approach_shift, make_step, target_gate
 from suite.train.worlds import sample_worlds
+from tests.support.marks import more
 from tests.support.training import (
     KEY,
     NOISY,
@@ -205,7 +206,7 @@ def test_a_stopped_world_leaves_the_loss_and_a_remembered_state_is_flown():
     assert np.abs(np.asarray(first - records.hidden[0])).max() > 0.1
 
 
-@pytest.mark.parametrize("finish", [pytest.param(False, marks=pytest.mark.extended), True])
+@pytest.mark.parametrize("finish", [more(False), True])
 def test_a_world_that_has_passed_its_last_gate_leaves_the_loss_where_that_is_the_finish(finish):
     config = replace(NOISY, episode=replace(NOISY.episode, finish=finish))
     worlds = boxes_worlds(config)
@@ -272,9 +273,7 @@ def test_the_point_before_the_gate_that_progress_is_measured_to(place_g, shift):
     assert approach_shift(LossConfig(), jnp.array([place_g])) == 0.0
 
 
-@pytest.mark.parametrize(
-    ("pass_first", "speed"), [(False, -3.0), pytest.param(True, 3.0, marks=pytest.mark.extended)]
-)
+@pytest.mark.parametrize(("pass_first", "speed"), [(False, -3.0), more(True, 3.0)])
 def test_a_step_through_a_gate_and_its_numbers(pass_first, speed):
     """From 0.1 m before the first gate to 0.1 m behind it at 3 m/s; the second is straight on."""
     worlds = boxes_worlds(small_config(2))

@@ -20,6 +20,7 @@ from suite.train.recipes import with_quadrotor
 from suite.train.rollout import make_rollout
 from suite.train.shards import check_processes, curve_numbers, flight_numbers, sample_hidden
 from suite.train.update import make_optimizer, start_state
+from tests.support.marks import more
 from tests.support.tools import BLOCKER, python
 from tests.support.training import (
     NOISY,
@@ -101,8 +102,8 @@ class Killed(BaseException):
     [
         (run, "sample_worlds", KeyboardInterrupt, 3),
         (training_loop, "save_arrays", Killed, 2),
-        pytest.param(curve, "append", Killed, 2, marks=pytest.mark.extended),
-        pytest.param(training_loop, "save_policy", Killed, 2, marks=pytest.mark.extended),
+        more(curve, "append", Killed, 2),
+        more(training_loop, "save_policy", Killed, 2),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

@@ -189,7 +189,7 @@ def unrounded(*names):
 @pytest.mark.extended
 @pytest.mark.parametrize(
     "names",
-    [("delay", "state_noise", "stereo"), pytest.param((), marks=pytest.mark.extended, id="all")],
+    [("delay", "state_noise", "stereo"), pytest.param((), id="all")],
 )
 def test_at_magnitude_nothing_the_truth_is_seen(names):
     few = unrounded(*names)

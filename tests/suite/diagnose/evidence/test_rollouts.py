@@ -40,7 +40,7 @@ flown = cache(lambda layout: jax.jit(rollouts.compiled(layout, False, False, "co
     [
         (500.0, 50.0, 0.03, 0.0273),
         # A delay of part of a step, which no lag smooths.
-        pytest.param(500.0, 100.0, 0.0, 0.0013, marks=pytest.mark.extended),
+        (500.0, 100.0, 0.0, 0.0013),
         pytest.param(1000.0, 100.0, 0.015, 0.0, marks=pytest.mark.slow),
         pytest.param(2000.0, 100.0, 0.0, 0.01, marks=pytest.mark.slow),
         pytest.param(200.0, 100.0, 0.03, 0.0273, marks=pytest.mark.slow),

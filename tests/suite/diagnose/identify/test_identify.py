@@ -116,7 +116,7 @@ def test_an_inertia_that_is_ten_times_too_large_is_identified():
         assert moment == pytest.approx(true, rel=0.1)
 
 
-@pytest.mark.parametrize("drive", [pytest.param("rotors", marks=pytest.mark.extended), "pwm"])
+@pytest.mark.parametrize("drive", [more("rotors"), "pwm"])
 def test_time_on_the_ground_does_not_count(drive):
     (log, *_), leave = known.logs(drive, 0), (*TURNING, "drag")
     resting = on_the_ground(log, log.duration_s, 3.0)  # for most of the log

@@ -20,6 +20,7 @@ from policies.spec import ActionSpec, PolicySpec
 from suite.judging.deploy import exporting, latency, parity
 from suite.judging.flying import default_policy
 from tests.support.commands import answer, refused, run
+from tests.support.marks import more
 from tests.support.pilots import Steady
 from tests.support.policy_files import SPEC, lively, small_checkpoint
 
@@ -93,7 +94,7 @@ def test_without_a_policy_the_default_one_is_exported(monkeypatch):
 
 @pytest.mark.parametrize(
     ("wanted", "file"),
-    [("onnx", "policy.onnx"), pytest.param("c", "policy.c", marks=pytest.mark.extended)],
+    [("onnx", "policy.onnx"), more("c", "policy.c")],
 )
 def test_an_export_of_another_policy_is_not_written_over(
     wanted, file, folder, tmp_path, monkeypatch, capsys
@@ -168,7 +169,7 @@ def test_what_a_policy_is_given_on_flights_is_kept_but_for_rows_in_which_nothing
 
 @pytest.mark.extended
 @needs_cc
-@pytest.mark.parametrize("kind", ["acceleration", pytest.param("ctbr", marks=pytest.mark.extended)])
+@pytest.mark.parametrize("kind", ["acceleration", "ctbr"])
 def test_the_engines_that_are_timed_are_one_policy(kind, tmp_path):
     spec = replace(SPEC, action=ActionSpec(kind))
     folder = save_policy(tmp_path / "tiny", lively(spec, 2), spec, seed=1)

@@ -7,7 +7,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialSpec, track_of
 from suite.judging.link.companion import Companion
 from suite.judging.link.messages import State, Wire, image_packets
-from tests.support.courses import IN_CONTACT
+from tests.support.courses import ONE_GATE
 from tests.support.pilots import Pursuit
 
 TRIAL = TrialSpec("zigzag", 0, 0)
@@ -55,7 +55,7 @@ class Bench:
 @pytest.fixture
 def track(tmp_path):
     """Return a track file that is read faster than one with a mesh."""
-    (file := tmp_path / "yard.toml").write_text(IN_CONTACT.replace("0.02", "1.3"))
+    (file := tmp_path / "yard.toml").write_text(ONE_GATE)
     return file
 
 
