@@ -3,7 +3,8 @@
 Stamps of the arrival of messages jitter, while the signal was sampled evenly. A measured path is
 smooth in the times of its measurement. If it is smoother in even times than in those of the stamps,
 the stamps jitter. A sampling that is really uneven makes it less smooth. Messages may also arrive
-in bursts of a few; a sample is then compared with samples outside its burst.
+in bursts of a few; a sample is then compared with samples outside its burst. Errors of stamps that
+last longer than a burst are those of a sampling whose rate changes.
 """
 
 from __future__ import annotations
@@ -31,12 +32,11 @@ LEAST_ROWS, FIRST = 100, 32
 """Least number of samples for the test, and number of those that the clock is first fitted to."""
 BLOCKS, LEAST_BLOCKS = 8, 7
 """Number of parts of a flight, and in how many of them even times must be smoother."""
+BURST, LASTS = 16, 0.45
+"""Number of samples over which the errors of arrival cancel, and the largest share of the errors
+that may remain in a mean over them. Where more remains, the rate of the sampling changed."""
 WANDER_S = 1.0
 """Time over which the true sampling may wander against a constant rate [s]."""
-TICK, MOST_LOST = 0.1, 4.0
-"""Stamps are ticks of an even clock, of which some were lost, if their steps are multiples of the
-shortest step. The first is the tolerance, as a share of that step, the second the largest
-multiple."""
 STRIDES = (1, 2, 3)
 """Distances between compared samples. Within a burst, and at distances that are multiples of its
 length, samples seem to be even."""
@@ -121,26 +121,21 @@ def even_stamps(time_s: np.ndarray, signals: Sequence[np.ndarray]) -> np.ndarray
 
     None if the stamps do not jitter by `LEAST_S`, or no signal shows that the sampling is even.
     """
-    if len(time_s) < LEAST_ROWS or _has_ticks(time_s):
+    if len(time_s) < LEAST_ROWS:
         return None
     best, least = None, SMOOTHER
     for number in (np.arange(len(time_s)), _number_with_lost(time_s)):
         even_s = _even(time_s, number)
-        if jitter_s(time_s, even_s) < LEAST_S or np.min(np.diff(even_s)) <= 0.0:
+        error_s = time_s - even_s
+        if np.std(error_s) < LEAST_S or np.min(np.diff(even_s)) <= 0.0:
+            continue
+        if np.std(uniform_filter1d(error_s, BURST)) > LASTS * np.std(error_s):
             continue
         shares = [_share(time_s, even_s, x, stride) for x in signals for stride in STRIDES]
         share = min(shares, default=1.0)
         if share < least:
             best, least = even_s, share
     return best
-
-
-def _has_ticks(time_s: np.ndarray) -> bool:
-    """Return whether the stamps are ticks of an even clock, of which many were lost."""
-    step_s = np.diff(time_s)
-    count = step_s / max(float(np.quantile(step_s, 0.05)), 1e-12)
-    is_tick = (np.abs(count - np.round(count)) < TICK) & (count < MOST_LOST + TICK)
-    return bool(is_tick.mean() > 0.9 and (count > 2.0 - TICK).mean() > 0.05)
 
 
 def _number_with_lost(time_s: np.ndarray) -> np.ndarray:

@@ -68,10 +68,18 @@ def test_ticks_of_a_clock_of_which_many_are_lost_are_no_jitter():
     kept = np.random.default_rng(2).uniform(size=len(even_s)) > 0.4
     smoother = [path(STEP_S * np.arange(kept.sum()))]
     assert even_stamps(even_s[kept], smoother) is None
-    assert even_stamps(stamps[kept], smoother) is not None
+    assert even_stamps(stamps[kept], smoother) is None
     assert (
         even_stamps(np.delete(stamps, [200, 900]), [np.delete(pos, [200, 900], axis=0)]) is not None
     )
+
+
+def test_stretches_of_half_the_rate_are_no_jitter():
+    """Poses that repeat are left out, and the stamps of the others are ticks of 4 ms."""
+    even_s, _, _ = flight()
+    is_kept = (np.arange(len(even_s)) % 60 < 30) | (np.arange(len(even_s)) % 2 == 0)
+    stamps = 0.004 * np.ceil(even_s[is_kept] / 0.004)
+    assert even_stamps(stamps, [path(even_s[is_kept])]) is None
 
 
 def test_a_check_names_it_and_later_checks_get_even_times():
