@@ -157,8 +157,8 @@ def _answer(result: Mapping[str, Any]) -> Section:
         share = "exempt" if removed is None else f"{100 * removed:.0f} %"
         first = [effect["name"], ", ".join(effect["alternatives"]) or "none", effect["view"]]
         for component in components(effect):
-            file = "" if component.file is None else f"{component.file:.4g}"
-            rows.append((*first, superscripts(component.label), file, *component.texts(), share))
+            label, texts = superscripts(component.label), component.texts()
+            rows.append((*first, label, component.file_text, *texts, share))
             # What holds for the whole effect is in its first row only.
             first, share = ["", "", ""], ""
     names = [effect["name"] for effect in effects]

@@ -263,6 +263,11 @@ class Component(NamedTuple):
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
     @property
+    def file_text(self) -> str:
+        """The value in the vehicle file as text; empty if it is unknown."""
+        return "" if self.file is None else f"{self.file:.4g}"
+
+    @property
     def is_significant(self) -> bool:
         """Whether there is a value that differs significantly from that of the vehicle file."""
         if self.value is None or self.file is None:
