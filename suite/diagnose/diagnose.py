@@ -168,7 +168,7 @@ class Diagnosis:
 
     @property
     def main(self) -> Finding:
-        """The finding with named effects, or else that with the best explainable error."""
+        """The finding whose gap is reported, see `main_of`."""
         return main_of(self.findings)
 
     @property
@@ -178,8 +178,15 @@ class Diagnosis:
 
 
 def main_of(findings: Sequence[Finding]) -> Finding:
-    """Return a finding with names, or any if none has; of these, that a black box explains best."""
-    return max(findings, key=lambda one: (bool(one.names), one.remaining.explainable))
+    """Return a finding with names, or any if none has; of these, one that is more than noise.
+
+    Of several, it is the one that a black box explains best.
+    """
+
+    def rank(one: Finding) -> tuple[bool, bool, float]:
+        return bool(one.names), one.remaining.structured, one.remaining.explainable
+
+    return max(findings, key=rank)
 
 
 def tested_in(

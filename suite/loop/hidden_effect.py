@@ -119,7 +119,13 @@ def verdict(
         f"and {significance(to_nominal, 'above', 'below')} the policy where nothing is hidden "
         f"(difference {points(to_nominal)})."
     )
-    if minus(NOMINAL)[BEFORE].low <= 0.0:
+    lost = minus(NOMINAL)[BEFORE]
+    if lost.high < 0.0:
+        text += (
+            " The policy flies the hidden vehicle better than the simulation's: perhaps --vehicle "
+            "and --hidden-vehicle are swapped."
+        )
+    elif lost.low <= 0.0:
         text += (
             " The hidden effect does not lower the success rate significantly here, so there is "
             "nothing to regain: raise --difficulty or --trials."
@@ -136,11 +142,17 @@ def _diagnosis_section(config: LoopConfig, diagnosis: Mapping[str, Any]) -> Sect
     """Return the section with the result of the diagnosis, and with what is hidden in truth."""
     gap = diagnosis["gap"]
     rows = [
-        (effect["name"], ", ".join(effect["alternatives"]), component.label, *component.texts())
+        (
+            effect["name"],
+            ", ".join(effect["alternatives"]),
+            component.label,
+            component.file_text,
+            *component.texts(),
+        )
         for effect in diagnosis["effects"]
         for component in components(effect)
     ]
-    headers = ["effect", "or", "parameter", "value", "95 %"]
+    headers = ["effect", "or", "parameter", "vehicle file", "value", "95 %"]
     return Section(
         "What the diagnosis found in the flights",
         [

@@ -8,7 +8,8 @@ files are written completely or not at all, folder locks belong to the system, a
 removes partial files.
 
 An exception in a destructor or in a callback of the garbage collector is lost: Python only reports
-it. An interrupt that is lost in this way is sent again.
+it. An interrupt that is lost in this way is sent again. So is one after which the command still
+works `LOST_S` later, as a library may swallow any exception.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ RESEND_S = 0.05
 """Time between the loss of an interrupt and its repetition [s]."""
 PATIENCE_S = 3.0
 """Time that the main thread has to handle a signal [s]."""
+LOST_S = 10.0
+"""Time that a command has to end after an interrupt that the main thread handled [s]."""
 MESSAGE = (
     "suite: interrupted in a step that cannot be stopped (mostly the compiler), so ended at once; "
     "what was saved is kept\n"
@@ -72,7 +75,9 @@ def ends_in_seconds() -> Iterator[None]:
     # thread reads.
     source, sink = os.pipe()
     os.set_blocking(sink, False)
-    listener = threading.Thread(target=_listen, args=(source, signals, handled), daemon=True)
+    listener = threading.Thread(
+        target=_listen, args=(source, signals, handled, finished), daemon=True
+    )
     old_handlers = {number: signal.signal(number, interrupt) for number in signals}
     old_fd = signal.set_wakeup_fd(sink, warn_on_full_buffer=False)
     sys.unraisablehook = resend_lost_interrupt
@@ -100,10 +105,22 @@ def end_at_once(code: int) -> NoReturn:
     os._exit(code)
 
 
-def _listen(source: int, signals: list[signal.Signals], handled: threading.Event) -> None:
-    """Read the numbers of signals until the pipe closes; end the process at an unhandled one."""
+def _listen(
+    source: int,
+    signals: list[signal.Signals],
+    handled: threading.Event,
+    finished: threading.Event,
+) -> None:
+    """Read the numbers of signals until the pipe closes; end the process at an unhandled one.
+
+    If the command is not `finished` after a handled one, it is sent again.
+    """
     while numbers := os.read(source, 1):
-        if numbers[0] in signals and not handled.wait(PATIENCE_S):
+        if numbers[0] not in signals:
+            continue
+        if not handled.wait(PATIENCE_S):
             message = (_SHOW_CURSOR if os.isatty(2) else "") + MESSAGE
             os.write(2, message.encode())
             os._exit(INTERRUPTED)
+        if not finished.wait(LOST_S):
+            os.kill(os.getpid(), numbers[0])

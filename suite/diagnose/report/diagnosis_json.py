@@ -130,7 +130,12 @@ def gap_json(diagnosis: Diagnosis) -> dict[str, Any]:
 def effects_json(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return an entry for each named effect (one for several motors), separate tests last."""
     searched = [
-        _effect(finding, name, [named for named in finding.names if named.candidate.name == name])
+        _effect(
+            finding,
+            name,
+            [named for named in finding.names if named.candidate.name == name],
+            diagnosis.vehicle.rotors.position,
+        )
         for finding in diagnosis.findings
         for name in dict.fromkeys(named.candidate.name for named in finding.names)
     ]
@@ -147,8 +152,13 @@ def effects_json(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     return [*searched, *tested]
 
 
-def _effect(finding: Finding, name: str, names: Sequence[NamedEffect]) -> dict[str, Any]:
-    """Return the entry of the effect `name`; `names` are its named effects, one for each motor."""
+def _effect(
+    finding: Finding, name: str, names: Sequence[NamedEffect], rotors_b: Sequence[Sequence[float]]
+) -> dict[str, Any]:
+    """Return the entry of the effect `name`; `names` are its named effects, one for each motor.
+
+    `rotors_b` are the positions of the rotors in body axes [m].
+    """
     indices = sorted(index for named in names for index in named.candidate.indices)
     space, width, size = finding.source.space, finding.half_width, finding.sizes.get(name)
     limits, names_small = finding.source.limits, finding.source.names_small
@@ -162,10 +172,13 @@ def _effect(finding: Finding, name: str, names: Sequence[NamedEffect]) -> dict[s
         and index not in indices
         and f"{name} {_motor_number(space, index)}" in close
     ]
+    parameters = parameters_json(space, name, indices, finding.theta, width, undecided)
+    if motors := parameters.get("index"):  # autopilots number the rotors in other orders
+        motors["place"] = [rotor_place(rotors_b[n - 1]) for n in np.atleast_1d(motors["value"])]
     return {
         "name": name,
         "alternatives": sorted({rival for named in names for rival in named.rivals} - {name}),
-        "parameters": parameters_json(space, name, indices, finding.theta, width, undecided),
+        "parameters": parameters,
         "gap_removed": finding.removed(names),
         "p_value": max(named.p_value for named in names),
         "size": size and size._asdict(),
@@ -173,6 +186,14 @@ def _effect(finding: Finding, name: str, names: Sequence[NamedEffect]) -> dict[s
         "relevant": not (names_small and size) or size.relevant(limits),
         "view": finding.source.name,
     }
+
+
+def rotor_place(position_b: Sequence[float]) -> str:
+    """Return where the rotor at `position_b` (3,) in body axes [m] is, such as "front right"."""
+    x, y = position_b[:2]
+    least = 0.25 * float(np.hypot(x, y))
+    words = {("front" if x > 0 else "rear"): abs(x), ("left" if y > 0 else "right"): abs(y)}
+    return " ".join(word for word, distance in words.items() if distance > least)
 
 
 def parameters_json(
@@ -214,6 +235,7 @@ def parameters_json(
             )
             present = sorted({*indices, *of_file})
             values, spans = zip(*map(value_and_interval, present), strict=True)
+            file = [space.entries[index].start for index in present]
             motors = [_motor_number(space, index) for index in present]
             is_single, ranges = len(present) == 1, [[motor, motor] for motor in motors]
             if len(indices) == 1:
@@ -225,14 +247,21 @@ def parameters_json(
             ):
                 value, ci95 = (column[0] if is_single else list(column) for column in columns)
                 entries[key] = {"value": value, "unit": unit, "ci95": ci95}
+            entries[parameter.name]["file"] = file[0] if is_single else file
             continue
         # A vector has None for components that were not fitted.
         keys = [(parameter.name, k) for k in range(parameter.size)] or [(parameter.name, None)]
         if not any(key in fitted for key in keys):
             continue
-        parts = [value_and_interval(fitted[k]) if k in fitted else (None, None) for k in keys]
-        value, ci95 = map(list, zip(*parts, strict=True)) if parameter.size else parts[0]
-        entries[parameter.name] = {"value": value, "unit": parameter.unit, "ci95": ci95}
+        parts = [
+            (*value_and_interval(fitted[k]), space.entries[fitted[k]].start)
+            if k in fitted
+            else (None, None, None)
+            for k in keys
+        ]
+        value, ci95, file = map(list, zip(*parts, strict=True)) if parameter.size else parts[0]
+        unit = parameter.unit
+        entries[parameter.name] = {"value": value, "unit": unit, "ci95": ci95, "file": file}
     return entries
 
 

@@ -83,8 +83,9 @@ def page(
         facts["not examined"] = ", ".join(result["not_examined"])
     if result["reference"]:
         facts["reference"] = f"{len(result['reference'])} flights"
+    units = {one.source.name: one.source.unit for one in diagnosis.findings}
     details = [
-        Section("Errors on held-out flights", [channels_grid(gap["channels"])]),
+        Section("Errors on held-out flights", [channels_grid(gap["channels"], units)]),
         *([logs_section(flown.logs), noise_section(diagnosis)] if flown else []),
         *([actuators_section(result)] if result.get("actuators") else []),
         candidates_section(diagnosis),
@@ -118,8 +119,13 @@ def _findings(findings: Sequence[Mapping[str, Any]]) -> Section:
     return Section("Findings about the logs", [table(headers, rows)] if rows else [])
 
 
-def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Grid:
-    """Return a table of the gap by channel, without channels that no log measured."""
+def channels_grid(
+    channels: Mapping[str, Mapping[str, Mapping[str, Any]]], units: Mapping[str, str]
+) -> Grid:
+    """Return a table of the gap by channel, without channels that no log measured.
+
+    `units` are those of the groups whose channels are axes (force, torque).
+    """
     optional = {"repeatability": ".3g", "closed": ".0%", "explainable": ".0%"}
     errors = [error for values in channels.values() for error in values.values()]
     shown = [key for key in optional if any(error.get(key) is not None for error in errors)]
@@ -129,11 +135,11 @@ def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Gr
             floor = error["noise_floor"]
             if floor < 1e-9:  # in any unit; no log measured this channel
                 continue
-            unit = f" [{UNITS[channel]}]" if channel in UNITS else ""
+            unit = superscripts(UNITS.get(channel) or units[group])
             tone = "good" if error["after"] < 1.2 * floor else ""
             # The channel, then errors (green if about as small as the noise), then the shares.
             after = Cell(f"{error['after']:.4g}", tone)
-            row = [group, f"{channel}{unit}", f"{error['before']:.4g}", after, f"{floor:.4g}"]
+            row = [group, f"{channel} [{unit}]", f"{error['before']:.4g}", after, f"{floor:.4g}"]
             texts = ["" if error.get(k) is None else format(error[k], optional[k]) for k in shown]
             rows.append([*row, *texts])
     headers = ["", "channel", "as given", "with the named effects", "noise floor"]
@@ -151,14 +157,16 @@ def _answer(result: Mapping[str, Any]) -> Section:
         share = "exempt" if removed is None else f"{100 * removed:.0f} %"
         first = [effect["name"], ", ".join(effect["alternatives"]) or "none", effect["view"]]
         for component in components(effect):
-            rows.append((*first, superscripts(component.label), *component.texts(), share))
+            label, texts = superscripts(component.label), component.texts()
+            rows.append((*first, label, component.file_text, *texts, share))
             # What holds for the whole effect is in its first row only.
             first, share = ["", "", ""], ""
     names = [effect["name"] for effect in effects]
     words: list[Part] = [f"{name}: {EFFECTS[name].equation}." for name in names]
     words += in_words([(e["name"], *e["alternatives"]) for e in effects])
     headers = [
-        "effect", "not distinguishable from", "view", "parameter", "total", "95 %", "of the gap"
+        "effect", "not distinguishable from", "view", "parameter", "vehicle file", "total", "95 %",
+        "of the gap",
     ]  # fmt: skip
     note = (
         "Values are totals: they replace those of the vehicle file. Of the gap: the share that "

@@ -165,10 +165,14 @@ def _effect_words(effect: Mapping[str, Any]) -> str:
     # At most three significant digits, and no more than the interval supports.
     values = ", ".join(
         with_unit(f"{one.name} {min(f'{one.value:.3g}', one.texts()[0], key=len)}", one.unit)
+        + (f" (vehicle file: {one.file:.3g})" if one.file else "")
         for one in known
         if one.is_significant
     ) or ", ".join(f"{one.name} {one.texts()[0]}" for one in known)
     words = f"{summary} ({names}){': ' if values else ''}{values}."
+    if motors := effect["parameters"].get("index"):
+        pairs = zip(np.atleast_1d(motors["value"]), motors["place"], strict=True)
+        words += f" Rotor {', '.join(f'{number} is {place}' for number, place in pairs)}."
     if effect["size"] is None:
         return words
     return f"{words} On these flights it causes {EffectSize(**effect['size']).words()} (RMS)."
@@ -250,8 +254,8 @@ class Component(NamedTuple):
     """Value, or None if it is not identifiable."""
     ci95: Sequence[float] | None
     """95 % interval."""
-    neutral: float | None
-    """Value at which the effect does not act, if it is the same for every vehicle."""
+    file: float | None
+    """Value in the vehicle file; that of no effect if the file lacks the effect."""
 
     @property
     def label(self) -> str:
@@ -259,11 +263,17 @@ class Component(NamedTuple):
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
     @property
+    def file_text(self) -> str:
+        """The value in the vehicle file as text; empty if it is unknown."""
+        return "" if self.file is None else f"{self.file:.4g}"
+
+    @property
     def is_significant(self) -> bool:
-        """Whether there is a value that differs significantly from the neutral one."""
-        if self.value is None or self.ci95 is None or self.neutral is None:
+        """Whether there is a value that differs significantly from that of the vehicle file."""
+        if self.value is None or self.file is None:
             return self.value is not None
-        return not self.ci95[0] <= self.neutral <= self.ci95[1]
+        low, high = self.ci95 or (self.value, self.value)
+        return not low <= self.file <= high
 
     def texts(self) -> tuple[str, str]:
         """Return value and interval as texts, with as many digits as the interval supports."""
@@ -276,7 +286,7 @@ class Component(NamedTuple):
         numbers = (self.value, *self.ci95)
         value, low, high = (in_digits(number, numbers) for number in numbers)
         if not self.is_significant:
-            value += f" (not different from {self.neutral:g})"
+            value += f" (not different from {self.file:g})"
         return value, f"{low} to {high}"
 
 
@@ -299,7 +309,6 @@ def components(effect: Mapping[str, Any]) -> list[Component]:
     """Return the components of a named `effect` in diagnosis.json, significant ones first."""
     found = list[Component]()
     parameters = EFFECTS[effect["name"]].parameters if effect["name"] in EFFECTS else ()
-    neutrals = {p.name: p.neutral for p in parameters if not callable(p.neutral)}
     by_motor = {p.name for p in parameters if p.one_at_a_time}
     motors = effect["parameters"].get("index", {}).get("value")
     for name, entry in effect["parameters"].items():
@@ -309,14 +318,14 @@ def components(effect: Mapping[str, Any]) -> list[Component]:
             if not isinstance(value, list):
                 found.append(Component(name, "", value, None if span[0] == span[1] else span, None))
         elif not isinstance(value, list):
-            found.append(Component(name, unit, value, span, neutrals.get(name)))
+            found.append(Component(name, unit, value, span, entry.get("file")))
         else:
             axes = "xyz" if len(value) <= 3 else range(1, len(value) + 1)
             if name in by_motor and isinstance(motors, list):
                 axes = motors
-            for axis, number, pair in zip(axes, value, span or [None] * len(value), strict=False):
-                label, neutral = f"{name} {axis}", neutrals.get(name)
-                found.append(Component(label, unit, number, pair, neutral))
+            spans, files = (part or [None] * len(value) for part in (span, entry.get("file")))
+            for axis, *one in zip(axes, value, spans, files, strict=False):
+                found.append(Component(f"{name} {axis}", unit, *one))
     return sorted(found, key=lambda component: not component.is_significant)
 
 

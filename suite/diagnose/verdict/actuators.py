@@ -342,5 +342,6 @@ def find_rotor_lag(
     if p_value > limits.name_p_value or closed < limits.lag_closed_share:
         return None
     lag, low = float(lags.mean()), max(float(lags.mean()) - half_width, 0.0)
-    parameters = {"time_constant": {"value": lag, "unit": "s", "ci95": [low, lag + half_width]}}
+    entry = {"value": lag, "unit": "s", "ci95": [low, lag + half_width], "file": known}
+    parameters = {"time_constant": entry}
     return TestedEffect(LAG, EFFECTS[LAG].values(lag), parameters, closed, p_value, "commands")

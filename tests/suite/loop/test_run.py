@@ -330,6 +330,7 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
         (20, 10, 40, ("and above the policy where nothing is hidden",)),
         (40, 10, 20, ("and below the policy where nothing is hidden",)),
         (11, 10, 11, ("does not lower the success rate significantly here", "raise --difficulty")),
+        (1, 10, 11, ("perhaps --vehicle and --hidden-vehicle are swapped",)),
     ],
 )  # fmt: skip
 def test_the_verdict_claims_what_the_intervals_hold(nominal, control, named, words):

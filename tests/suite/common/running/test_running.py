@@ -199,6 +199,19 @@ def test_an_interrupt_that_python_loses_is_sent_again(capfd):
     assert capfd.readouterr().err == ""
 
 
+def test_an_interrupt_that_a_library_swallows_is_sent_again(monkeypatch):
+    monkeypatch.setattr(interrupts, "LOST_S", 0.2)
+    reached = []
+    with pytest.raises(KeyboardInterrupt), ends_in_seconds():
+        with contextlib.suppress(BaseException):
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.1)
+        reached.append("past the lost one")
+        time.sleep(10.0)
+        reached.append("the end")
+    assert reached == ["past the lost one"]
+
+
 def test_other_threads_and_ignored_signals_are_left_alone():
     met = []
 

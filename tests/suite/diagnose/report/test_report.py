@@ -91,6 +91,7 @@ def test_each_view_names_its_own_effect_and_the_page_has_its_headline_first(by_v
     text = html(page(by_views, found, "mass = 1", {"vehicle.toml"}))
     assert text.index(found["headline"][:40]) < text.index("data:image/png") < text.index("<table")
     assert "What was written" in text and "mass = 1" in text and "black box" in text
+    assert "x [m/s²]" in text and "x [rad/s²]" in text
 
 
 def test_numbers_of_views_are_those_that_are_judged_and_the_rest_has_its_reason(by_views):
@@ -148,6 +149,7 @@ def test_what_no_source_tests_is_listed(by_views, drag, monkeypatch, capsys, tmp
 def test_components_are_named_by_axis_and_shown_in_digits_that_the_interval_supports():
     entry = {"value": [0.012, 0.0004, None], "ci95": [[0.0119, 0.0121], [-0.001, 0.0018], None],
              "unit": "m"}  # fmt: skip
+    entry["file"] = [0.0, 0.0, None]
     x, y, z = summary.components({"name": "com_offset", "parameters": {"offset": entry}})
     assert (x.label, x.texts()) == ("offset x [m]", ("0.01200", "0.01190 to 0.01210"))
     assert x.is_significant and not y.is_significant and not z.is_significant
@@ -169,6 +171,7 @@ def test_a_weak_motor_has_its_number_and_the_motors_that_it_may_be():
     assert index.texts() == ("2", "2 to 3")
     several = as_json.parameters_json(space, "weak_motor", [at[1], at[3]], theta, width)
     assert several["index"] == {"value": [2, 4], "unit": "1", "ci95": [[2, 2], [4, 4]]}
+    assert several["scale"]["file"] == [1.0, 1.0]
     shown = summary.components({"name": "weak_motor", "parameters": several})
     assert [one.label for one in shown] == ["scale 2 [1]", "scale 4 [1]"]
     # A motor that is weak in the vehicle file stays so, and is in the total.
@@ -179,9 +182,16 @@ def test_a_weak_motor_has_its_number_and_the_motors_that_it_may_be():
     assert total["index"] == {"value": [1, 3], "unit": "1", "ci95": [[1, 1], [3, 4]]}
     assert total["scale"]["value"] == [0.9, 0.8] and total["scale"]["ci95"][0] is None
     shown = summary.components({"name": "weak_motor", "parameters": total})
-    assert [(one.label, one.texts()[0]) for one in shown] == [
-        ("scale 1 [1]", "0.9"),
-        ("scale 3 [1]", "0.800"),
+    assert [(one.label, one.texts()[0], one.is_significant) for one in shown] == [
+        ("scale 3 [1]", "0.800", True),
+        ("scale 1 [1]", "0.9", False),
+    ]
+    assert [
+        as_json.rotor_place((x, y, 0.0)) for x, y in ((0.1, 0.1), (-0.1, 0.0), (0.0, -0.1))
+    ] == [
+        "front left",
+        "rear",
+        "right",
     ]
 
 
@@ -203,7 +213,8 @@ def test_sections_show_the_numbers(drag, found):
     none = {"before": 0.0, "after": 0.0, "noise_floor": 1e-12}
     every = found["gap"]["channels"].items()
     none["repeatability"] = None
-    table = channels_grid({horizon: {**groups, "velocity": none} for horizon, groups in every})
+    rows = {horizon: {**groups, "velocity": none} for horizon, groups in every}
+    table = channels_grid(rows, {})
     assert "repeatability" not in table.headers
     assert not any("velocity" in row[1] for row in texts(table)) and len(table.rows) > 3
 

@@ -16,7 +16,8 @@ DRAG = {
     "name": "linear_drag",
     "alternatives": ["rotor_drag"],
     "parameters": {"coefficient": {"value": [0.31, 0.302, 0.01], "unit": "1/s",
-                                   "ci95": [[0.3, 0.32], [0.29, 0.31], [-0.01, 0.03]]}},
+                                   "ci95": [[0.3, 0.32], [0.29, 0.31], [-0.01, 0.03]],
+                                   "file": [0.0, 0.0, 0.0]}},
     "size": {"force": 0.8, "torque": 0.0, "drift": 0.4},
     "view": "force",
     "gap_removed": 0.9,
@@ -120,13 +121,31 @@ def test_an_effect_that_lowers_the_offsets_alone_explains_no_gap():
         assert "explains the gap" in measured("named", 17.3, effects, offset=left)
 
 
-def test_a_drag_of_the_file_that_the_flights_do_not_show_is_not_said_to_be_missing():
-    interval = [[0.0, 0.01]] * 3
-    none = {"coefficient": {"value": [0.0, 1e-17, 0.004], "unit": "1/s", "ci95": interval}}
-    answer = summary.answer(entries("named", [{**DRAG, "parameters": none}]))
-    assert (
-        "(linear_drag or rotor_drag): coefficient x 0.0000 (not different from 0), coefficient y"
-        in answer
+def test_an_answer_has_the_values_that_differ_from_the_vehicle_file_and_those_of_the_file():
+    interval = [[0.0, 0.01], [0.0, 0.01], [0.17, 0.19]]
+    drag = {
+        "value": [0.0, 0.004, 0.18],
+        "unit": "1/s",
+        "ci95": interval,
+        "file": [0.2, 0.005, 0.18],
+    }
+    answer = summary.answer(entries("named", [{**DRAG, "parameters": {"coefficient": drag}}]))
+    assert "rotor_drag): coefficient x 0 1/s (vehicle file: 0.2). On these flights" in answer
+    # All values are listed if only together they differ from the file.
+    drag["file"] = [0.0, 0.005, 0.18]
+    answer = summary.answer(entries("named", [{**DRAG, "parameters": {"coefficient": drag}}]))
+    assert "coefficient x 0.0000 (not different from 0), coefficient y 0.0040 (not diff" in answer
+
+
+def test_an_answer_says_where_a_weak_rotor_is():
+    index = {"value": [1, 3], "unit": "1", "ci95": None, "place": ["front right", "rear left"]}
+    scale = {"value": [0.7, 0.8], "unit": "1", "ci95": None, "file": [1.0, 1.0]}
+    weak = {**DRAG, "name": "weak_motor", "alternatives": [], "size": None}
+    weak["parameters"] = {"index": index, "scale": scale}
+    assert summary.answer(entries("named", [weak])).startswith(
+        "Wrong or missing in the vehicle file: One or several rotors give less thrust and torque "
+        "than nominal (weak_motor): scale 1 0.7 (vehicle file: 1), scale 3 0.8 (vehicle file: 1). "
+        "Rotor 1 is front right, 3 is rear left."
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data.windows import SLICES, STATE
-from suite.diagnose.diagnose import Verdict, verdict_on
+from suite.diagnose.diagnose import Verdict, main_of, verdict_on
 from suite.diagnose.estimate.gauss_newton import Intervals
 from suite.diagnose.estimate.parameters import Candidate
 from suite.diagnose.estimate.permutation import CandidateScore
@@ -72,6 +72,15 @@ def test_one_place_decides_by_names_structure_and_share(drag, named, remaining, 
     # A wind or a lag is a name as well.
     label = "named" if verdict.label == "no_gap" else verdict.label
     assert verdict_on(findings, True, THRESHOLDS).label == label
+
+
+def test_the_reported_gap_is_of_a_name_or_else_of_what_is_more_than_noise(drag):
+    quiet, loud = Remaining(False, 0.0, explainable=0.4), Remaining(True, 1.0, explainable=0.0)
+    nameless = replace(drag.main, names=())
+    torque, force = (replace(nameless, remaining=one) for one in (quiet, loud))
+    named = replace(drag.main, remaining=quiet)
+    assert main_of([torque, force]) is force is main_of([force, torque])
+    assert main_of([force, named]) is named
 
 
 def test_structure_is_a_shape_a_colour_or_the_largest_channel():
