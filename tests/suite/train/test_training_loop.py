@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -162,6 +163,20 @@ def test_a_folder_of_another_run_is_refused_by_what_differs(tmp_path):
         with pytest.raises(ValueError, match=words):
             train(tmp_path, counting(2), **other)
     # The folder is of a version with a further setting.
+def test_other_plugins_than_at_the_start_give_a_warning_and_a_record(tmp_path, monkeypatch, capfd):
+    def with_plugins(digest, stop=None):
+        monkeypatch.setattr(provenance, "added_digest", lambda: digest)
+        with pytest.raises(KeyboardInterrupt) if stop else nullcontext():
+            train(tmp_path, counting(stop=stop))
+        record = json.loads((tmp_path / "run.json").read_text())
+        return "with other plugins (" in capfd.readouterr().err, record.get("earlier_plugins")
+
+    assert with_plugins("a", stop=3) == with_plugins("a", stop=6) == (False, None)
+    assert with_plugins("b", stop=8) == (True, ["a"])
+    assert with_plugins("b") == (False, ["a"])
+    assert with_plugins(None) == (True, ["a"]), "nothing is trained, with other plugins"
+
+
     path = tmp_path / "state" / "config.json"
     record = json.loads(path.read_text())
     record["training"]["config"]["loss"]["survival"] = 0.0
