@@ -12,6 +12,7 @@ the timeline `time` in seconds from the trial's start.
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -110,7 +111,11 @@ def open_recording(
             texts = {key: str(value) for key, value in origin.items() if value is not None}
             recording.send_property("suite", rr.AnyValues(drop_untyped_nones=True, **texts))
             yield recording
-            recording.flush()
+            try:
+                recording.flush()
+            except RuntimeError as error:  # of rerun's writing thread, which drops the cause
+                text = f"cannot be written ({error}), the disk may be full"
+                raise OSError(errno.EIO, text, str(path)) from error
         finally:
             recording.disconnect()
 

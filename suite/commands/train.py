@@ -19,6 +19,7 @@ from suite.train.overrides import (
     check_owned,
     check_phases,
     phase_configs,
+    rate_loop_warnings,
     warmup_warnings,
     with_changes,
 )
@@ -148,7 +149,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         )
     if text := narrow_view(resolved.spec.camera.fov_deg):
         console.note(f"warning: the policy: {text}; spec.camera.fov_deg is in degrees, not radians")
-    for warning in warmup_warnings(resolved):
+    for warning in (*warmup_warnings(resolved), *rate_loop_warnings(resolved)):
         console.note(f"warning: {warning}")
     params, delta = None, None
     if config.init_from is not None:

@@ -28,6 +28,10 @@ PACKAGES = (
 """Names of the packages that can change a result."""
 
 
+_KEPT = (("git_commit", "earlier_commits", "unknown"), ("plugins", "earlier_plugins", "none"))
+"""Key of a record -> key under which its earlier values are kept, and the name of a missing one."""
+
+
 @functools.cache
 def package_versions() -> dict[str, str | None]:
     """Return the installed version of each of `PACKAGES`; None if it is missing."""
@@ -127,8 +131,8 @@ def write_run_record(
     """Write everything that is needed to repeat a run to `folder`/run.json.
 
     The dataclass `config` has all defaults filled in. The seed is None if the run has none. With
-    `resumed`, an interrupted run in this folder continues. The git commits in its record are kept
-    as `earlier_commits`, since their code made a part of the run.
+    `resumed`, an interrupted run in this folder continues. The git commits and the plugins in its
+    record are kept as `earlier_commits` and `earlier_plugins`, since their code made a part of it.
 
     Raises:
         ValueError: if the existing record cannot be read.
@@ -144,15 +148,21 @@ def write_run_record(
         "config_type": _type_name(config),
         "config": config,
     }
-    commits: set[str] = set()
     if resumed and path.is_file():
         try:
             old_record = read_json(path)
-            commits = {
-                *old_record.get("earlier_commits", []),
-                old_record["git_commit"] or "unknown",
-            }
+            for key, kept, missing in _KEPT:
+                before = {*old_record.get(kept, []), old_record.get(key) or missing}
+                if earlier := sorted(before - {record[key] or missing}):
+                    record[kept] = earlier
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path}: not the record of a run ({error}); move it away") from error
-    earlier = sorted(commits - {record["git_commit"]})
-    write_json(path, {**record, "earlier_commits": earlier} if earlier else record)
+    write_json(path, record)
+
+
+def has_other_plugins(folder: str | os.PathLike[str]) -> bool:
+    """Return whether the plugins are not those in the record of the run in `folder`."""
+    try:
+        return read_json(Path(folder) / "run.json")["plugins"] != added_digest()
+    except (OSError, ValueError, KeyError, TypeError):
+        return False

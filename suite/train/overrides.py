@@ -192,6 +192,19 @@ def warmup_warnings(config: TrainConfig) -> list[str]:
     ]
 
 
+def rate_loop_warnings(config: TrainConfig) -> list[str]:
+    """Return a warning if the rate loop overshoots at every physics step of the training."""
+    for quadrotor in (phase.quadrotor for phase in phase_configs(config) if phase.quadrotor):
+        controller, hz = quadrotor.vehicle.controller, quadrotor.physics_hz
+        if controller.kind == "p" and max(controller.rate_gain) > hz:
+            return [
+                f"vehicle {quadrotor.vehicle.name!r}: controller.rate_gain has "
+                f"{max(controller.rate_gain):g} 1/s, too fast for the training's {hz:g} physics "
+                f"steps a second; give --set quadrotor.physics_hz={controller.frequency:g}"
+            ]
+    return []
+
+
 def phase_configs(config: TrainConfig) -> tuple[TrainConfig, ...]:
     """Return the settings of each phase, as if the phase were a whole run.
 

@@ -21,15 +21,15 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from policies.formats.checkpoint import load_arrays, read_config, save_arrays
+from policies.formats.checkpoint import is_whole, load_arrays, read_config, save_arrays
 from policies.formats.policy_file import save_policy
 from policies.networks import network
 from policies.networks.tree_arrays import tree_from_arrays, tree_to_arrays
-from policies.spec import PolicySpec
+from policies.spec import PolicyError, PolicySpec
 from suite.common import curve
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
-from suite.common.provenance import refuse_other_run, write_run_record
+from suite.common.provenance import has_other_plugins, refuse_other_run, write_run_record
 from suite.common.running import hosts
 from suite.common.stages import Estimate, announce
 from suite.train.worlds import Worlds, WorldsAhead
@@ -126,6 +126,12 @@ def train_in_folder(
     # The state must be on the device of the update; otherwise the second iteration compiles again.
     state = jax.device_put(hosts.broadcast_from_first(fresh), jax.local_devices()[0])
     done, total = int(state.iteration), phases[-1].end
+    if done and has_other_plugins(folder):
+        console.note(
+            f"warning: {folder} was trained until here with other plugins (packages that add "
+            "effects or sensor models) than those installed now; give another --out to train all "
+            "of it with these"
+        )
     if not hosts.is_writer():
         return Outcome(folder / "policy", int(_iterate(phases, run, state, console).iteration), {})
     if done < total or _is_missing(watch, folder, done, total):
@@ -140,7 +146,7 @@ def train_in_folder(
             f"{folder} holds this training, finished: nothing is trained; to train its policy "
             f"further, give another --out with --init-from {folder / 'policy'}"
         )
-        if not (folder / "policy").exists():  # it was moved: the state has the same weights
+        if not is_whole(folder / "policy"):  # missing or damaged: the state has the same weights
             _save(run, _last_phase(phases, done), state)
     # The outcome, from the last tenth of the curve.
     rows = curve.read(folder)
@@ -303,16 +309,19 @@ def _check_finite(iteration: int, row: dict[str, float], folder: Path) -> None:
 def _save(run: Run, phase: RunPhase, state: Any) -> None:
     """Write the policy and the state to the run's folder."""
     training = {**run.origin, "iteration": int(state.iteration), "threads": threads()}
-    policy = run.folder / "policy"
-    save_policy(policy, state.params, phase.spec, seed=run.config.seed, training=training)
-    # The state is written last. If it is on the disk, so are the policy and the curve up to it.
-    save_arrays(
-        run.folder / "state",
-        tree_to_arrays(state),
-        kind="training",
-        seed=run.config.seed,
-        extra={"training": training},
-    )
+    seed, folder = run.config.seed, run.folder / "state"
+
+    def save_state() -> None:
+        arrays = tree_to_arrays(state)
+        save_arrays(folder, arrays, kind="training", seed=seed, extra={"training": training})
+
+    # The state is written last, so that the policy and the curve up to it are on the disk as well.
+    # Only the first one is written before the policy, which could not be resumed without a state.
+    if is_first := not folder.exists():
+        save_state()
+    save_policy(run.folder / "policy", state.params, phase.spec, seed=seed, training=training)
+    if not is_first:
+        save_state()
 
 
 def _refuse_lost_state(policy: Path) -> None:
@@ -349,7 +358,14 @@ def _resume(run: Run, fresh: Any) -> Any:
         curve.cut(folder, 0)
         curve.cut(folder, 0, curve.WATCHED)
         return fresh
-    stored = read_config(saved)["training"]
+    try:
+        arrays, stored = load_arrays(saved, kind="training").arrays, read_config(saved)["training"]
+    except PolicyError as error:
+        raise ValueError(
+            f"{error}. Without a copy the training cannot be resumed: give another --out (with "
+            f"--init-from {folder / 'policy'} to train its policy further), or remove the folder "
+            "to start over"
+        ) from error
     flags = {"from": "--init-from", "delta": "--delta"}
     options = [f"another {flag}" for key, flag in flags.items() if stored.get(key) != origin[key]]
     changes = options + differences(stored["config"], origin["config"])
@@ -367,7 +383,7 @@ def _resume(run: Run, fresh: Any) -> Any:
             f"would round differently from here on. Set NPROC={before} in the environment to "
             "resume with the same bits, or give another --out"
         )
-    state = tree_from_arrays(fresh, load_arrays(saved, kind="training").arrays, str(saved))
+    state = tree_from_arrays(fresh, arrays, str(saved))
     # A measurement after the last finished iteration stays.
     curve.cut(folder, int(state.iteration))
     curve.cut(folder, int(state.iteration) + 1, curve.WATCHED)

@@ -151,11 +151,7 @@ class Table:
             if not isinstance(value, list | tuple) or len(value) != len(parts):
                 raise self.error(key, value, _describe(kind))
             entries = enumerate(zip(value, parts, strict=True))
-            # Messages give the index of a list within a list.
-            nested = get_origin(parts[0]) is tuple
-            return tuple(
-                self._typed(f"{key}[{i}]" if nested else key, v, part) for i, (v, part) in entries
-            )
+            return tuple(self._typed(f"{key}[{i}]", v, part) for i, (v, part) in entries)
         plain: Any = kind
         valid = isinstance(value, plain) if plain in (bool, str) else is_number(value)
         if not valid or value == "" or (plain is int and value != int(value)):

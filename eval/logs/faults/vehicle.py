@@ -25,6 +25,9 @@ TORQUE_M = (0.002, 0.1)
 """Plausible ratio of a rotor's torque to its thrust [m]; usual are 0.005 to 0.05."""
 GAIN = 1.0
 """Smallest plausible gain of the nominal rate loop [1/s]."""
+GAIN_LAG = (1.0, 5.0)
+"""Largest plausible gain of the nominal rate loop times its period, and times the time constant of
+the rotors: above, the rates overshoot at every step, or oscillate."""
 GAINS = {
     "betaflight": ("p_roll", "p_pitch"),
     "px4": ("MC_ROLLRATE_P", "MC_PITCHRATE_P"),
@@ -97,9 +100,12 @@ def check_vehicle_numbers(vehicle: Vehicle) -> list[Finding]:
             fix = "PX4's KM is this ratio: torque_coefficient = KM * thrust_coefficient"
         about = ("vehicle_torque", ratio_m, 0.95, fix)
         found.append(Finding("doubt", "vehicle", text + "0.005 to 0.05 m", *about))
-    gain = min(vehicle.controller.rate_gain)
-    if vehicle.controller.kind == "p" and not gain >= GAIN:
-        text = f"the smallest controller.rate_gain is {gain:.3g} 1/s; usual are 5 to 40 1/s"
+    gains = vehicle.controller.rate_gain
+    lags = 1.0 / vehicle.controller.frequency, vehicle.rotors.time_constant
+    too_fast = any(max(gains) * lag > most for lag, most in zip(lags, GAIN_LAG, strict=True))
+    if vehicle.controller.kind == "p" and (too_fast or not min(gains) >= GAIN):
+        gain = max(gains) if too_fast else min(gains)
+        text = f"controller.rate_gain has {gain:.3g} 1/s; usual are 5 to 40 1/s"
         fix = (
             "gains are 1/s: angular acceleration for each rad/s of rate error; a firmware's PID "
             "gains have other units (docs/measure.md)"

@@ -94,6 +94,12 @@ REFUSED = [
     ("controller.kind", ["px4"], r"controller\.kind is \['px4'\], allowed is 'p' or 'beta"),
     ("controller.kind", "ardupilot", r"controller\.kind is 'ardupilot'"),
     ("massa", 2, "'massa' at the top is unknown. Did you mean 'mass'"),
+    (
+        "inertia",
+        [[0.001, 0, 0]] * 3,
+        r"inertia\[0\] is \[0.001, 0, 0\], allowed is a finite number",
+    ),
+    ("rotors.spin", ["ccw", "cw", "ccw", "cw"], r"rotors\.spin\[0\] is 'ccw', allowed is a whole"),
     ("inertia", [0.001, 0.001, 0.003], "inertia.*sum of the other two"),
     ("rotors.spin", [1, 1, -1, 2], r"rotors\.spin.*1 .*or -1"),
     ("rotors.spin", [1, 1, 1, 1], "independently"),

@@ -123,6 +123,16 @@ def test_obstacles_path_end_and_events_are_there(recorded):
     assert {"schema", "suite_version"} <= {name.split(":")[-1] for name in about}
 
 
+def test_a_full_disk_names_the_recording_and_leaves_none(tmp_path, monkeypatch):
+    def full(self, **options):
+        raise RuntimeError("File-writer thread shut down prematurely")
+
+    monkeypatch.setattr(rerun.RecordingStream, "flush", full)
+    with pytest.raises(OSError, match=r"the disk may be full.*flight\.rrd"):
+        write_recording(tmp_path / "flight.rrd", [rollout()])
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_recordings_of_nothing_are_refused(tmp_path):
     with pytest.raises(ValueError, match="at least one rollout"):
         write_recording(tmp_path / "a.rrd", [])

@@ -19,6 +19,7 @@ from suite.commands.train import Config, resolve
 from suite.delta.replay import describe_dynamics
 from suite.judging.flying import checkpoint_folder
 from suite.train import run as training
+from suite.train.overrides import rate_loop_warnings
 from tests.support.commands import answer, refused, run
 from tests.support.documents import unpainted
 from tests.support.marks import more
@@ -209,6 +210,17 @@ def test_the_command_line_asks_for_model_and_vehicle_together():
         resolve(Config(recipe="race-paper", vehicle="racer5"))
     with pytest.raises(ValueError, match="Did you mean 'racer5'"):
         resolve(Config(model="quad", vehicle="racer6"))
+
+
+def test_a_rate_loop_faster_than_the_physics_of_the_training_gives_a_warning(tmp_path):
+    nominal = load_vehicle("racer5")
+    fast = replace(nominal, controller=replace(nominal.controller, rate_gain=(200.0, 20.0, 8.0)))
+    save_vehicle(fast, tmp_path / "fast.toml")
+    (warning,) = rate_loop_warnings(resolve(Config(vehicle=str(tmp_path / "fast.toml"))))
+    assert "rate_gain has 200 1/s" in warning and "quadrotor.physics_hz=500" in warning
+    slow = [Config(), Config(recipe="quick")]
+    slow.append(Config(vehicle=str(tmp_path / "fast.toml"), set=("quadrotor.physics_hz=500",)))
+    assert all(rate_loop_warnings(resolve(config)) == [] for config in slow)
 
 
 @pytest.mark.parametrize(

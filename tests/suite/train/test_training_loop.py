@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from policies.formats.policy_file import load_policy_checkpoint
-from suite.common import curve
+from suite.common import curve, provenance
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.stages import Estimate
@@ -76,6 +77,8 @@ def test_the_outcome_is_of_the_last_tenth_and_the_policy_is_measured_on_the_way(
     assert "finished: nothing is trained" in capfd.readouterr().err
     (tmp_path / "policy").rename(tmp_path / "moved")
     train(tmp_path, counting(20))
+    (tmp_path / "policy" / "weights.safetensors").write_bytes(b"cut off")
+    train(tmp_path, counting(20))
     assert load_policy_checkpoint(tmp_path / "policy").spec == SPEC
     lines = (tmp_path / "metrics.jsonl").read_text().splitlines(keepends=True)
     for kept in (lines[:19], []):  # means over its last rows would not be of the end
@@ -102,8 +105,7 @@ def test_rows_of_a_save_that_was_cut_off_are_computed_again(tmp_path, monkeypatc
         with pytest.raises(OSError, match="No space"):
             train(tmp_path, counting(3))
     assert len(curve.read(tmp_path)) == 3 and not (tmp_path / "state").exists()
-    shutil.rmtree(tmp_path / "policy")
-    train(tmp_path, counting(3))
+    train(tmp_path, counting(3))  # with more space on the disk
     assert [row["iteration"] for row in curve.read(tmp_path)] == [0, 1, 2]
 
 
@@ -121,6 +123,16 @@ def test_a_trained_policy_without_its_state_is_not_written_over(tmp_path):
                 train(folder, counting())
             assert len(curve.read(folder)) == trained
     assert train(folder, counting()).iterations == 10, "of random weights nothing is lost"
+
+
+@pytest.mark.parametrize("name", ["config.json", "weights.safetensors"])
+def test_a_damaged_state_is_refused_with_what_is_left_to_do(tmp_path, name):
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path, counting(stop=6))
+    (tmp_path / "state" / name).write_bytes(b"")
+    with pytest.raises(ValueError, match=f"state/{name}: .*--init-from .*/policy to train its"):
+        train(tmp_path, counting())
+    assert len(curve.read(tmp_path)) == 6
 
 
 def test_a_number_that_is_not_finite_ends_the_run_with_the_last_good_state(tmp_path):
@@ -149,6 +161,20 @@ def test_a_run_that_goes_on_says_from_where_and_how_long(tmp_path, capsys):
     capsys.readouterr()
     train(tmp_path, counting(8))
     assert "from step 6 of 8 on" in capsys.readouterr().err
+
+
+def test_other_plugins_than_at_the_start_give_a_warning_and_a_record(tmp_path, monkeypatch, capfd):
+    def with_plugins(digest, stop=None):
+        monkeypatch.setattr(provenance, "added_digest", lambda: digest)
+        with pytest.raises(KeyboardInterrupt) if stop else nullcontext():
+            train(tmp_path, counting(stop=stop))
+        record = json.loads((tmp_path / "run.json").read_text())
+        return "with other plugins (" in capfd.readouterr().err, record.get("earlier_plugins")
+
+    assert with_plugins("a", stop=3) == with_plugins("a", stop=6) == (False, None)
+    assert with_plugins("b", stop=8) == (True, ["a"])
+    assert with_plugins("b") == (False, ["a"])
+    assert with_plugins(None) == (True, ["a"]), "nothing is trained, with other plugins"
 
 
 def test_a_folder_of_another_run_is_refused_by_what_differs(tmp_path):
