@@ -174,7 +174,14 @@ FOUND = ComOffset((0.011, 0.0, 0.0))
 NAMED = {
     "name": "com_offset",
     "alternatives": ["torque_trim"],
-    "parameters": {"offset": {"value": [0.011, 0.0, None], "unit": "m", "ci95": None}},
+    "parameters": {
+        "offset": {
+            "value": [0.011, 0.0, None],
+            "unit": "m",
+            "ci95": None,
+            "file": [0.001, 0.0, None],
+        }
+    },
 }
 
 
@@ -225,8 +232,8 @@ def test_a_loop_with_a_hidden_effect_leaves_tables_report_and_recording(hidden):
     assert all(f"| {label} |" in table for label in LABELS.values())
     assert "com_offset (offset [0.012, 0.0, 0.0] m)." in page
     rows = page.replace("\n", "")
-    assert "<td>offset x [m]</td><td>0.011</td><td></td>" in rows
-    assert "<td>offset z [m]</td><td>not identifiable</td>" in rows
+    assert "<td>offset x [m]</td><td>0.001</td><td>0.011</td><td></td>" in rows
+    assert "<td>offset z [m]</td><td></td><td>not identifiable</td>" in rows
 
 
 @pytest.mark.extended
