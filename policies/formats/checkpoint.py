@@ -125,15 +125,6 @@ def load_arrays(folder: Path, *, kind: str) -> Stored:
     return Stored(arrays, config)
 
 
-def is_whole(folder: Path) -> bool:
-    """Return whether `folder` is a checkpoint of any kind without a missing or damaged file."""
-    try:
-        load_arrays(folder, kind=read_config(folder)["kind"])
-    except PolicyError:
-        return False
-    return True
-
-
 def read_config(folder: Path) -> dict[str, Any]:
     """Read and check only the config.json of a checkpoint.
 

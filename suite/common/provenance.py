@@ -26,8 +26,6 @@ PACKAGES = (
     *("pyarrow", "rerun-sdk"),
 )
 """Names of the packages that can change a result."""
-
-
 _KEPT = (("git_commit", "earlier_commits", "unknown"), ("plugins", "earlier_plugins", "none"))
 """Key of a record -> key under which its earlier values are kept, and the name of a missing one."""
 

@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from policies.formats.checkpoint import is_whole, load_arrays, read_config, save_arrays
-from policies.formats.policy_file import save_policy
+from policies.formats.checkpoint import load_arrays, read_config, save_arrays
+from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.networks import network
 from policies.networks.tree_arrays import tree_from_arrays, tree_to_arrays
 from policies.spec import PolicyError, PolicySpec
@@ -146,7 +146,9 @@ def train_in_folder(
             f"{folder} holds this training, finished: nothing is trained; to train its policy "
             f"further, give another --out with --init-from {folder / 'policy'}"
         )
-        if not is_whole(folder / "policy"):  # missing or damaged: the state has the same weights
+        try:
+            load_policy_checkpoint(folder / "policy")
+        except PolicyError:  # missing or damaged: the state has the same weights
             _save(run, _last_phase(phases, done), state)
     # The outcome, from the last tenth of the curve.
     rows = curve.read(folder)
@@ -359,13 +361,14 @@ def _resume(run: Run, fresh: Any) -> Any:
         curve.cut(folder, 0, curve.WATCHED)
         return fresh
     try:
-        arrays, stored = load_arrays(saved, kind="training").arrays, read_config(saved)["training"]
+        checkpoint = load_arrays(saved, kind="training")
     except PolicyError as error:
         raise ValueError(
             f"{error}. Without a copy the training cannot be resumed: give another --out (with "
             f"--init-from {folder / 'policy'} to train its policy further), or remove the folder "
             "to start over"
         ) from error
+    stored = checkpoint.config["training"]
     flags = {"from": "--init-from", "delta": "--delta"}
     options = [f"another {flag}" for key, flag in flags.items() if stored.get(key) != origin[key]]
     changes = options + differences(stored["config"], origin["config"])
@@ -383,7 +386,7 @@ def _resume(run: Run, fresh: Any) -> Any:
             f"would round differently from here on. Set NPROC={before} in the environment to "
             "resume with the same bits, or give another --out"
         )
-    state = tree_from_arrays(fresh, arrays, str(saved))
+    state = tree_from_arrays(fresh, checkpoint.arrays, str(saved))
     # A measurement after the last finished iteration stays.
     curve.cut(folder, int(state.iteration))
     curve.cut(folder, int(state.iteration) + 1, curve.WATCHED)

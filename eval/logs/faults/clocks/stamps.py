@@ -126,10 +126,10 @@ def even_stamps(time_s: np.ndarray, signals: Sequence[np.ndarray]) -> np.ndarray
     best, least = None, SMOOTHER
     for number in (np.arange(len(time_s)), _number_with_lost(time_s)):
         even_s = _even(time_s, number)
-        error_s = time_s - even_s
-        if np.std(error_s) < LEAST_S or np.min(np.diff(even_s)) <= 0.0:
+        jitter = jitter_s(time_s, even_s)
+        if jitter < LEAST_S or np.min(np.diff(even_s)) <= 0.0:
             continue
-        if np.std(uniform_filter1d(error_s, BURST)) > LASTS * np.std(error_s):
+        if np.std(uniform_filter1d(time_s - even_s, BURST)) > LASTS * jitter:
             continue
         shares = [_share(time_s, even_s, x, stride) for x in signals for stride in STRIDES]
         share = min(shares, default=1.0)
