@@ -128,7 +128,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
         warnings.append(LACKING)
         # Rotor speeds follow the unknown commands, so they are not compared.
         inputs = [replace(log, rotor_speed=None) for log in logs]
-        few = replace(limits, most_windows=limits.most_rotor_windows)
+        few = replace(limits, most_windows=limits.most_lacking_windows)
         held_of = partial(cut, inputs, vehicle, False, limits=few, integrator=integrator)
         windows_of = partial(held_of, between=True)
         windows, _ = windows_of()
