@@ -24,6 +24,8 @@ class Thresholds:
     most_rotor_windows: int = 100
     """Largest number of windows if measured rotor speeds are the input. Their errors within a
     window are estimated too, which takes twice as long."""
+    most_lacking_windows: int = 50
+    """Largest number of windows if the log lacks commands, whose errors are estimated as well."""
     most_rows: int = 100_000
     """Number of rows of all flights for force and torque above which logs are thinned."""
     longest_hole_s: float = 0.1

@@ -3,8 +3,10 @@
 A window's start state is measured with the same noise as its other rows. So it is a nuisance
 parameter: what a change of its 12 numbers could explain is removed (projected out) from residuals
 and slopes. Errors of the rotor speeds are nuisance parameters, too. If measured speeds are the
-model's input, they have errors at knots all along a window, else only at its start. Additional rows
-hold a prior on the size of these errors. Start numbers are all these parameters of a window.
+model's input, they have errors at knots all along a window, else only at its start. If the drone
+received commands that the log lacks, an unknown thrust and torque at the knots are nuisance
+parameters as well. Additional rows hold a prior on the size of these errors. Start numbers are all
+these parameters of a window.
 """
 
 from __future__ import annotations
@@ -20,6 +22,9 @@ from suite.diagnose.data.windows import KNOTS, SLICES, STATE, FlightWindows
 from suite.diagnose.estimate.block import Block
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
+LEAST_PUSH = 1e-3
+"""Lower limit of the error of thrust [m/s^2] and torque [rad/s^2]."""
+
 
 class Whitening(NamedTuple):
     """What whitens W windows. Each has M whitened rows and F start numbers."""
@@ -27,7 +32,7 @@ class Whitening(NamedTuple):
     weight: np.ndarray
     """(W, N, 19) 1 / noise; 0 where nothing was measured."""
     prior: np.ndarray
-    """(F - 12,) 1 / standard deviation of each rotor-speed error; the last F - 12 rows hold it."""
+    """(W, F - 12) 1 / standard deviation of each error of the inputs, which the last rows hold."""
     start: np.ndarray
     """(W, M, F) orthonormal basis of the changes of the rows by the start numbers."""
     upper: np.ndarray
@@ -53,11 +58,11 @@ def make_whitening(linear: Linearisation, noise: Noise, limits: Thresholds) -> W
     count, rows, channels = weight.shape
     size = linear.offset.shape[1]
     # Basis of what the start numbers can change, with the rows of the prior.
-    prior = np.full(size - STATE, 1.0 / rotor_spread(windows, limits))
+    prior = 1.0 / input_spread(windows, size, limits)
     slope = _filtered(linear.slope[..., -size:] * weight[..., None], filters)
     slope = slope.reshape(count, -1, size)
     prior_rows = np.zeros((count, size - STATE, size))
-    prior_rows[:, :, STATE:] = np.diag(prior)
+    prior_rows[:, :, STATE:] = prior[:, :, None] * np.eye(size - STATE)
     start, upper = orthonormal(np.concatenate([slope, prior_rows], axis=1), limits.singular)
     upper = upper + 1e-9 * np.eye(size)
     # Slow errors: Legendre polynomials over the window. The part of them that start numbers explain
@@ -94,6 +99,14 @@ def orthonormal(matrix: np.ndarray, singular: float) -> tuple[np.ndarray, np.nda
     return base, upper
 
 
+def input_spread(windows: FlightWindows, size: int, limits: Thresholds = THRESHOLDS) -> np.ndarray:
+    """Return the standard deviations (W, F - 12) of the inputs' errors; `size` is F."""
+    spread = np.full((len(windows.flight), size - STATE), rotor_spread(windows, limits))
+    if size == STATE + 4 + 4 * KNOTS:
+        spread[:, 4:] = np.tile(np.maximum(windows.push_error, LEAST_PUSH), (1, KNOTS))
+    return spread
+
+
 def rotor_spread(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> float:
     """Return the standard deviation of the rotor speeds' errors as nuisance parameters [rad/s].
 
@@ -118,7 +131,7 @@ def block_of(whitening: Whitening, linear: Linearisation, along: Sequence[int]) 
     values = np.concatenate([linear.residual[..., None], linear.slope[..., : len(along)]], axis=-1)
     rows = _filtered(values * whitening.weight[..., None], whitening.filters)
     rows = rows.reshape(len(rows), -1, rows.shape[-1])
-    prior_rows = np.zeros((len(rows), len(whitening.prior), rows.shape[-1]))
+    prior_rows = np.zeros((len(rows), whitening.prior.shape[1], rows.shape[-1]))
     prior_rows[..., 0] = -linear.offset[:, STATE:] * whitening.prior
     rows = np.concatenate([rows, prior_rows], axis=1)
     start_part = np.swapaxes(whitening.start, 1, 2) @ rows

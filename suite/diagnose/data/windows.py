@@ -122,6 +122,8 @@ class FlightWindows(NamedTuple):
     """(W, N, 4) bool, whether a rotor speed was measured, for comparison or as the input."""
     start_rotor_error: Array
     """(W,) error of the rotor speeds after the burn-in [rad/s]; 0 if they are the input."""
+    push_error: Array
+    """(W, 4) standard deviation of the unknown thrust [m/s^2] and torque [rad/s^2] at a knot."""
 
 
 def cut(
@@ -136,6 +138,7 @@ def cut(
     like: FlightWindows | None = None,
     stride: int = 1,
     held: int = 1,
+    between: bool = False,
 ) -> tuple[FlightWindows | None, list[str]]:
     """Return the windows of `logs` (None if no flight has one) and warnings.
 
@@ -154,6 +157,7 @@ def cut(
         like: windows of an earlier call, to whose size these are padded.
         stride: factor on the length of the steps; only every `stride`-th rotor speed is used.
         held: only every `held`-th command is used.
+        between: half-way from one command to the next, their mean acts as another command.
     """
     starts, warnings = list[tuple[int, int]](), list[str]()  # (flight, row) each
     states = [on_every_row(log, limits) for log in logs]
@@ -183,7 +187,7 @@ def cut(
     steps_s = [LONGEST_S * stride] * len(logs)
     if integrator == "euler":
         steps_s = [log.step_s or 1.0 / vehicle.controller.frequency for log in logs]
-    inputs = [_input_of(logs[k], row, vehicle, steps_s[k], held) for k, row in starts]
+    inputs = [_input_of(logs[k], row, vehicle, steps_s[k], held, between) for k, row in starts]
     sizes = _padded_sizes(inputs, like)
     windows = [
         _window(logs[k], states[k], k, row, vehicle, spacings_s.get(k), one, stride, sizes)
@@ -239,8 +243,10 @@ class _Input(NamedTuple):
     command: np.ndarray
 
 
-def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, stride: int) -> _Input:
-    """Return the inputs of the window at `row`, by every `stride`-th command; else of a hover."""
+def _input_of(
+    log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, held: int, between: bool
+) -> _Input:
+    """Return the inputs of the window at `row`; without commands those of a hover. See `cut`."""
     time_s, begin_s, period_s = log.time_s, log.time_s[row], 1.0 / vehicle.controller.frequency
     rows = np.flatnonzero((time_s >= begin_s - 1e-9) & (time_s <= begin_s + LENGTH_S + 1e-9))
     signals = (log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b, log.acc_b, log.rotor_speed)
@@ -255,7 +261,11 @@ def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, stri
     first_s, last_s = begin_s - BURN_IN_S - HISTORY_S - 1e-9, begin_s + length_s + 1e-9
     used = slice(max(np.searchsorted(time_s, first_s) - 1, 0), np.searchsorted(time_s, last_s) + 1)
     time_s, command = with_lost_rows(time_s[used] - begin_s, command[used])
-    command = command[np.arange(len(command)) // stride * stride]
+    command = command[np.arange(len(command)) // held * held]
+    if between:
+        time_s, command = (np.repeat(values, 2, axis=0)[:-1] for values in (time_s, command))
+        time_s[1::2] += 0.5 * np.diff(time_s[::2])
+        command[1::2] += 0.5 * np.diff(command[::2], axis=0)
 
     def grid(since_s: float, until_s: float) -> StepGrid:
         inside_s = time_s[(time_s > since_s + 1e-6) & (time_s < until_s - 1e-6)]
@@ -360,4 +370,5 @@ def _window(
         valid=padded(np.concatenate(valid, axis=1)),
         rotor_valid=padded(rotor_valid),
         start_rotor_error=np.asarray(rotor_error),
+        push_error=np.zeros(4),
     )

@@ -32,7 +32,7 @@ class CandidateScore(NamedTuple):
     p_value: float
     """Probability that the best of all candidates gains as much under the null hypothesis."""
     chance: float
-    """Gain that the best of all candidates reaches by chance with a probability of 1 %."""
+    """Gain with a p-value of 1 %."""
 
 
 def permutation_test(
@@ -52,7 +52,9 @@ def permutation_test(
     random sign. A sign for a whole window keeps the correlation within it. First the part that the
     best group explains is subtracted (Freedman and Lane 1983), since otherwise a real effect in a
     few windows would be part of the null; if that part is large, also those of similar groups.
-    With too few windows the null is drawn from the measured noise instead.
+    With too few windows the null is drawn from the measured noise instead. A group on which errors
+    of the model act gains more by chance than others. So each gain is divided by what its own group
+    gains by chance, before the largest counts.
 
     The columns of `hessian` (W, K, K) and `gradient` (W, K) are scaled to similar size. `groups`
     are those of the candidates `among`. They contain the columns `always`; gains are relative to a
@@ -111,11 +113,14 @@ def permutation_test(
         root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
         noise = (root @ rng.standard_normal((draws, *gradient.shape, 1)))[..., 0]
         drawn = [(noise[:, i].sum(axis=1), noise[:, o].sum(axis=1)) for i, o in folds]
-    null = np.max([gain_by_chance(group) for group in groups], axis=0) - gain_by_chance(always)
-    chance = float(np.quantile(null, 0.99))
+    own = np.stack([gain_by_chance(group) for group in groups]) - gain_by_chance(always)
+    usual = np.maximum(np.quantile(own, 0.99, axis=1), limits.rival_chi2)
+    null = (own / usual[:, None]).max(axis=0)
     scores = [
-        CandidateScore(one, fall, _p_value(null >= fall), chance)
-        for one, fall in zip(among, falls, strict=True)
+        CandidateScore(
+            one, fall, _p_value(null >= fall / size), size * float(np.quantile(null, 0.99))
+        )
+        for one, fall, size in zip(among, falls, usual, strict=True)
     ]
     return sorted(scores, key=lambda s: -s.gain)
 

@@ -231,14 +231,23 @@ class RolloutModel:
     """Simulation of windows with one vehicle: their residuals and slopes, compiled."""
 
     def __init__(
-        self, vehicle: Vehicle, rotor_input: bool, voltage: bool, integrator: str = "continuous"
+        self,
+        vehicle: Vehicle,
+        rotor_input: bool,
+        voltage: bool,
+        integrator: str = "continuous",
+        pushed: bool = False,
     ) -> None:
-        """Prepare the rollout of `vehicle`; for the other arguments see `fly_windows`."""
+        """Prepare the rollout of `vehicle`; for the other arguments see `fly_windows`.
+
+        With `pushed` an unknown thrust and torque act at the knots, by commands between the rows.
+        """
         self.space = space = make_space(vehicle)
         self.size = len(space.entries)
-        self.free = STATE + 4 * (KNOTS if rotor_input else 1)
+        self.free = STATE + 4 * (KNOTS if rotor_input else 1 + pushed * KNOTS)
         """Number F of start numbers of each window, which are fitted, too: 12 of its state, and 4
-        errors of rotor speeds (4 at each knot if measured speeds are the input)."""
+        errors of rotor speeds (4 at each knot if measured speeds are the input). With `pushed`
+        these are followed by thrust and torque at each knot."""
         self.starts = list(range(self.size, self.size + self.free))
         """Places of the start numbers among all directions, after the parameters."""
         self.given = arrays_of(vehicle, space)

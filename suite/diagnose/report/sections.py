@@ -139,7 +139,8 @@ def candidates_section(diagnosis: Diagnosis) -> Section:
             "jointly."
         )
         if scores[0].chance > 0.0:
-            words += f" By chance the best gain is above {scores[0].chance:.1f} once in 100."
+            best = scores[0]
+            words += f" For {best.candidate.label}, a gain of {best.chance:.1f} has p = 0.01."
         title = finding.source.name.capitalize()
         parts.append(table(["effect", "gain", "p", ""], rows, title, words))
     return Section("The candidates", parts)

@@ -123,12 +123,9 @@ def _best_candidate(
     # Choose the candidates that are worth a fit: those with good scores ...
     shortlist = list(scores)
     if tested is None:
-        least = limits.near_share * max((s.gain for s in scores.values()), default=0.0)
-        shortlist = [
-            c
-            for c, score in scores.items()
-            if score.p_value <= limits.name_p_value and score.gain >= least
-        ]
+        significant = [c for c, score in scores.items() if score.p_value <= limits.name_p_value]
+        least = limits.near_share * max((scores[c].gain for c in significant), default=0.0)
+        shortlist = [c for c in significant if scores[c].gain >= least]
     # ... that could be the best to first order, and of the single effects only the first few.
     equations, theta = current.block.equations, current.at.theta
     falls = {

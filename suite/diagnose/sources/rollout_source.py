@@ -104,9 +104,11 @@ class RolloutSource(Source):
     """Overlapping 1 s windows of the held-out part."""
     since_s: float
     """Time in a flight at which its held-out part begins [s]; above 0 only for a single flight."""
+    between: bool = False
+    """Whether the mean of two commands acts between them, since the log lacks commands."""
     coarser: FlightWindows | None = None
-    """The fitted windows, but with every second rotor speed only, or with every second command if
-    the log lacks commands; None if neither matters. The difference in the result shows how much."""
+    """The fitted windows, but with every second rotor speed only, or with held commands if the log
+    lacks commands; None if neither matters. The difference in the result shows how much."""
     coarser_share: float = 0.5
     """Share of an effect's change under `coarser` that counts as the model's numerical error."""
 
@@ -263,7 +265,7 @@ class RolloutSource(Source):
         """
         settings = (self.rotor_input, LENGTH_S, self.limits, self.model.integrator)
         shown = np.unique(self.held.flight)[:SHOWN].tolist()
-        windows, _ = cut(self.logs, self.vehicle, *settings, only=shown)
+        windows, _ = cut(self.logs, self.vehicle, *settings, only=shown, between=self.between)
         assert windows is not None  # the diagnosis has cut them before
         windows = take(windows, np.asarray(windows.start_s) >= self.since_s - ROUNDING_S)
         noise, best = of_rollouts(found.last).noise, found.estimate.theta

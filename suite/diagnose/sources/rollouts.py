@@ -15,11 +15,11 @@ import numpy as np
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.hold_out import choose_held_out
-from suite.diagnose.data.noise import Linearisation, Noise, at_least, measured_noise
+from suite.diagnose.data.noise import Linearisation, measured_noise
 from suite.diagnose.data.sampling import own_spacing_s
 from suite.diagnose.data.steps import has_firmware_loop, rows_show_torque
-from suite.diagnose.data.whitening import Whitening, block_of, make_whitening, slow_energy
-from suite.diagnose.data.windows import LENGTH_S, SLICES, cut, take
+from suite.diagnose.data.whitening import block_of, make_whitening
+from suite.diagnose.data.windows import LENGTH_S, FlightWindows, cut, take
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.parameters import candidates
@@ -29,6 +29,11 @@ from suite.diagnose.evidence.rollouts import (
     is_hopeless,
     rollout_evidence,
     start_estimate,
+)
+from suite.diagnose.sources.input_error import (
+    lacks_commands,
+    unknown_commands,
+    with_model_error,
 )
 from suite.diagnose.sources.rollout_source import RolloutSource
 from suite.diagnose.sources.source import FAR, DiagnosisInput, SourceSet
@@ -47,8 +52,8 @@ MEASURE = (
 )
 
 LACKING = (
-    "the drone received commands between the rows of the log, so differences that wrong times of "
-    "commands may cause count as noise: log every command, to find smaller effects"
+    "the drone received commands between the rows of the log; the mean of their neighbours stands "
+    "for them, and what it may change counts as noise: log every command, to find smaller effects"
 )
 
 
@@ -96,9 +101,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     )
     voltage = all(log.voltage is not None for log in logs)
     model = RolloutModel(vehicle, rotor_input, voltage, integrator)
-    start = start_estimate(model, windows)
-    linear = model.linearise(start, windows)
-    is_finite = _finite(linear, limits)
+    linear, is_finite = _simulated(model, windows, limits)
     if not is_finite.all():
         diverged = int((~is_finite).sum())
         warnings.append(f"{diverged} stretches left out: the model's flight from there diverges")
@@ -106,10 +109,8 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     # Flights that a simulator flew with Euler steps, driven by commands, have no such error.
     has_error = integrator != "euler" or rotor_input
     coarser = take(windows_of(like=windows, stride=2)[0], is_finite) if has_error else None
-    linear = take(linear, is_finite)
-    at = Estimate(start.theta, linear.offset)
     if coarser is not None:
-        limits = with_model_error(linear, model.residual(at, coarser) - linear.residual, limits)
+        limits = with_model_error(linear, _difference(model, linear, coarser), limits)
     # See `RolloutSource.sizes` for these shares.
     dense = all(
         log.rotor_speed is None
@@ -119,12 +120,25 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     coarser_share = 0.0 if coarser is None or not rotor_input else (0.5 if dense else 2.0)
     commands = [(log.time_s, log.rate_cmd_b) for log in logs if log.rate_cmd_b is not None]
     are_slow = any(own_spacing_s(*command) > limits.command_spacing_s for command in commands)
+    lacking = False
     if are_slow and not rotor_input:
         fewer = take(windows_of(like=windows, held=2)[0], is_finite)
-        held = with_held_commands(linear, model.residual(at, fewer) - linear.residual, limits)
-        if held is not None:
-            limits, coarser, coarser_share = held, fewer, 1.0
-            warnings.append(LACKING)
+        lacking = lacks_commands(linear, _difference(model, linear, fewer), limits)
+    if lacking:
+        warnings.append(LACKING)
+        # Rotor speeds follow the unknown commands, so they are not compared.
+        inputs = [replace(log, rotor_speed=None) for log in logs]
+        few = replace(limits, most_windows=limits.most_lacking_windows)
+        held_of = partial(cut, inputs, vehicle, False, limits=few, integrator=integrator)
+        windows_of = partial(held_of, between=True)
+        windows, _ = windows_of()
+        assert windows is not None  # the same flights had some before
+        model = RolloutModel(vehicle, False, voltage, integrator, pushed=True)
+        linear, is_finite = _simulated(model, windows, limits)
+        coarser, coarser_share = take(held_of(like=windows)[0], is_finite), 1.0
+        error, limits = unknown_commands(linear, _difference(model, linear, coarser), limits)
+        linear = linear._replace(windows=linear.windows._replace(push_error=error))
+        coarser = coarser._replace(push_error=error)
     if not given.chosen and is_hopeless(model, linear, limits):
         given.say("no effect brings rollouts of 1 s near these flights: using force and torque")
         return SourceSet((), (), "", (FAR,))
@@ -149,6 +163,8 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     held_flights = np.unique(not_fitted.flight).tolist()
     held, _ = windows_of(stride_s=limits.gap_stride_s, only=held_flights, since_s=since_s)
     assert held is not None
+    error = np.sqrt((np.asarray(windows.push_error) ** 2).mean(axis=0))
+    held = held._replace(push_error=np.tile(error, (len(held.flight), 1)))
     flies = _finite(model.linearise(start_estimate(model, held), held, []), limits)
     if not flies.all():
         held = take(held, flies)
@@ -175,6 +191,7 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
         held=held,
         # Of a lone flight the end is held out.
         since_s=since_s if np.isin(not_fitted.flight, fitted.flight).any() else 0.0,
+        between=lacking,
         coarser=take(coarser, is_fitted) if coarser_share else None,
         coarser_share=coarser_share,
     )
@@ -203,6 +220,25 @@ def _check_count(count: int, limits: Thresholds) -> None:
         )
 
 
+def _simulated(
+    model: RolloutModel, windows: FlightWindows, limits: Thresholds
+) -> tuple[Linearisation, np.ndarray]:
+    """Return the linearised windows in which the model does not diverge, and which (W,) these are.
+
+    Raises:
+        ValueError: if the model diverges in all of them.
+    """
+    linear = model.linearise(start_estimate(model, windows), windows)
+    is_finite = _finite(linear, limits)
+    return take(linear, is_finite), is_finite
+
+
+def _difference(model: RolloutModel, linear: Linearisation, other: FlightWindows) -> np.ndarray:
+    """Return the residuals (W, N, 19) of windows with `other` inputs, minus those of `linear`."""
+    at = Estimate(model.space.array("start"), linear.offset)
+    return model.residual(at, other) - linear.residual
+
+
 def _finite(linear: Linearisation, limits: Thresholds) -> np.ndarray:
     """Return which windows (W,) the model simulates without divergence; a ValueError if none."""
     residual = linear.residual
@@ -214,75 +250,3 @@ def _finite(linear: Linearisation, limits: Thresholds) -> np.ndarray:
             "the model diverges on every flight: check the vehicle file and the frames"
         )
     return is_finite
-
-
-def with_model_error(
-    linear: Linearisation, difference: np.ndarray, limits: Thresholds
-) -> Thresholds:
-    """Return `limits` with the lower limits of the noise raised to the model's numerical error.
-
-    It is estimated by step doubling (Hairer, Norsett & Wanner 1993, Sec. II.4): longer steps and
-    fewer rotor speeds change the residuals by the `difference` (W, N, 19), several times the error.
-    `linear` has slopes along all parameters and start numbers.
-    """
-    noise = measured_noise(linear, limits)
-    whitening = make_whitening(linear, noise, limits)
-    return _raised(_unexplained_rms(difference, linear, noise, whitening), limits)
-
-
-def with_held_commands(
-    linear: Linearisation, difference: np.ndarray, limits: Thresholds
-) -> Thresholds | None:
-    """Return `limits` with the noise raised to the error of held commands; None without the error.
-
-    If the drone received commands between the rows of the log, their times are wrong. With every
-    second command the residuals change by the `difference` (W, N, 19). If one command was left out
-    after each row, the true error is half of that. Body rates and rotor speeds follow a command at
-    once, so their residuals limit the error's share of the difference. With a small share, the log
-    has every command. For `linear` see `with_model_error`.
-    """
-    noise = measured_noise(linear, limits)
-    whitening = make_whitening(linear, noise, limits)
-    rms = _unexplained_rms(difference, linear, noise, whitening)
-    residual = _unexplained_rms(linear.residual, linear, noise, whitening)
-    shares = residual / np.maximum(rms, 1e-12)
-    fast = [s for n, s in zip(SLICES, shares, strict=True) if n in ("rates", "rotor speed")]
-    share = min((share for share in fast if share > 0.0), default=0.0)
-    if share < limits.held_share:
-        return None
-    # The error accumulates along a window, so its slow part exceeds that of white noise.
-    share = min(share, 1.0)
-    raised = _raised(share * rms, limits)
-    noise = Noise(at_least(noise.sigma, raised), {})
-    whitening = make_whitening(linear, noise, raised)
-    known = np.isfinite(difference).all(axis=(1, 2), keepdims=True)
-    error = linear._replace(residual=np.where(known, share * difference, 0.0))
-    slow = slow_energy(whitening, block_of(whitening, error, ()).residual).sum(axis=0)
-    expected = np.maximum(whitening.slow_freedom.sum(axis=0), 1e-9)
-    factor = [np.sqrt(max(slow[c].sum() / expected[c].sum(), 1.0)) for c in SLICES.values()]
-    return _raised(share * rms * np.array(factor), limits)
-
-
-def _unexplained_rms(
-    errors: np.ndarray, linear: Linearisation, noise: Noise, whitening: Whitening
-) -> np.ndarray:
-    """Return the RMS (6,) by sensor (of `SLICES`) of the part that no start state explains.
-
-    `errors` are (W, N, 19); windows that diverge are left out. It is 0 where nothing was measured.
-    """
-    known = np.isfinite(errors).all(axis=(1, 2), keepdims=True)
-    errors = np.where(known, errors, 0.0)
-    unexplained = block_of(whitening, linear._replace(residual=errors), ()).residual
-    _, rows, channels = errors.shape
-    over_noise = unexplained[:, : rows * channels].reshape(errors.shape)
-    sigma = np.where(np.isfinite(noise.sigma), noise.sigma, 0.0)
-    valid = np.asarray(linear.windows.valid) & known
-    energy = (np.where(valid, over_noise * sigma, 0.0) ** 2).sum(axis=(0, 1))
-    # Mean of each channel, and then of each group of channels (three or four of one sensor).
-    power = energy / np.maximum(valid.sum(axis=(0, 1)), 1)
-    return np.array([np.sqrt(power[channel].mean()) for channel in SLICES.values()])
-
-
-def _raised(error: np.ndarray, limits: Thresholds) -> Thresholds:
-    """Return `limits` with lower limits of the noise of at least `error` (6,)."""
-    return replace(limits, least_noise=tuple(np.maximum(limits.least_noise, error).tolist()))

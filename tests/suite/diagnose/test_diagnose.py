@@ -318,8 +318,20 @@ def test_the_noise_counts_as_certain_only_if_no_command_is_lacking(monkeypatch):
     source, lacks = source_of(sparse)
     assert lacks and source.coarser is not None and source.coarser_share == 1.0
     assert sum(source.limits.least_noise) > sum(limits.least_noise)
+    assert (source.held.push_error > 0.0).all() and source.between
     source, lacks = source_of(complete)
     assert not lacks and source.coarser is None and source.limits == limits
+
+
+@pytest.mark.extended
+def test_an_effect_at_the_threshold_of_relevance_is_named_without_half_of_the_commands():
+    true = with_effects(LAGGED, linear_drag=((0.02, 0.02, 0.02),))
+    logs = flights(true, count=3, duration_s=6.0, noise=0.1)
+    found = diagnose([rows(log, slice(0, None, 2)) for log in logs], LAGGED, drive="commands")
+    assert rollouts.LACKING in found.warnings
+    assert [one.candidate.name for _, one in found.named] == ["linear_drag"]
+    ((effect, size),) = found.main.sizes.items()
+    assert effect == "linear_drag" and size.force < 2.0 * THRESHOLDS.relevance[0]
 
 
 @pytest.mark.slow

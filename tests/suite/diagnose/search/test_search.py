@@ -90,11 +90,12 @@ def test_intervals_by_flights_hold_the_truth_however_many_parameters_are_fitted(
     assert np.mean(windows) < 0.7 and 0.93 < np.mean(flights) < 0.99
 
 
-def equations(rng, colour=0.0, truth=None, size=0.0, alike=0.0):
+def equations(rng, colour=0.0, truth=None, size=0.0, alike=0.0, misfit=0.0):
     """Return normal equations of noise, plus `size` of what `truth` does in each window.
 
     One row's noise has the correlation `colour` with the next one; other effects have the share
-    `alike` of the slope of `truth`.
+    `alike` of the slope of `truth`. The model has an error like `thrust_scale`, in each window of
+    another size, with the standard deviation `misfit`.
     """
     count = len(SPACE.entries)
     slope = rng.standard_normal((WINDOWS, ROWS, count))
@@ -105,6 +106,8 @@ def equations(rng, colour=0.0, truth=None, size=0.0, alike=0.0):
         true = next(c for c in AMONG if c.name == truth).indices[0]
         slope += alike * slope[..., true, None] * (np.arange(count) != true)
         noise = noise + size * slope[..., true]
+    (scale,) = places("thrust_scale")
+    noise = noise + misfit * rng.standard_normal((WINDOWS, 1)) * slope[..., scale]
     return normal_equations(slope / STEP, noise)
 
 
@@ -148,6 +151,13 @@ def test_the_true_effect_wins_over_one_that_looks_like_it_which_adds_nothing_to_
     found = best_of(10, named, others, truth="rotor_drag", size=0.6, alike=1.0)
     # The null shuffles the named effect's own part as well, which makes it the more careful.
     assert sum(one.p_value <= 0.01 for one in found) < 2
+
+
+def test_an_error_of_the_model_like_one_effect_hides_no_other():
+    for k in range(5):
+        made = equations(np.random.default_rng([9, k]), truth="rotor_drag", size=0.6, misfit=2.0)
+        p_values = {one.candidate.name: one.p_value for one in scores_of(made, seed=k)}
+        assert p_values["rotor_drag"] <= 0.001 and p_values["thrust_scale"] > 0.01
 
 
 def test_other_seeds_draw_another_null_and_one_seed_the_same():

@@ -13,7 +13,7 @@ from suite.diagnose.estimate.parameters import Candidate
 from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.evidence.rollouts import start_estimate
 from suite.diagnose.report.diagnosis_json import diagnosis_json
-from suite.diagnose.sources import rollouts
+from suite.diagnose.sources import input_error
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict import actuators
 from suite.diagnose.verdict import residual_structure as structure
@@ -102,12 +102,12 @@ def test_a_window_that_diverges_is_left_out_and_one_without_an_error_counts(monk
     def block_of(_, linear, *__):
         return SimpleNamespace(residual=linear.residual.reshape(3, -1))
 
-    monkeypatch.setattr(rollouts, "block_of", block_of)
+    monkeypatch.setattr(input_error, "block_of", block_of)
     errors = np.ones((3, 5, 19)) * np.array([2.0, 0.0, 1.0])[:, None, None]
     errors[2, 4, 7] = np.inf
     windows = SimpleNamespace(valid=np.ones(errors.shape, bool))
     linear = Linearisation(np.zeros_like(errors), *np.zeros((2, 0)), windows)
-    rms = rollouts._unexplained_rms(errors, linear, Noise(np.ones(19), {}), None)
+    rms = input_error._unexplained_rms(errors, linear, Noise(np.ones(19), {}), None)
     assert rms == pytest.approx(np.full(6, np.sqrt((2.0**2 + 0.0) / 2.0)))
 
 
