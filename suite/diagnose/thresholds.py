@@ -24,8 +24,6 @@ class Thresholds:
     most_rotor_windows: int = 100
     """Largest number of windows if measured rotor speeds are the input. Their errors within a
     window are estimated too, which takes twice as long."""
-    most_lacking_windows: int = 50
-    """Largest number of windows if the log lacks commands, whose errors are estimated as well."""
     most_rows: int = 100_000
     """Number of rows of all flights for force and torque above which logs are thinned."""
     longest_hole_s: float = 0.1
@@ -73,9 +71,11 @@ class Thresholds:
     command_spacing_s: float = 0.012
     """Rows of commands further apart than this may lack commands in between [s]. Controllers give
     commands at 100 Hz or more."""
-    held_share: float = 0.3
-    """Least residual of body rates and rotor speeds for commands to be lacking, as a share of the
-    difference that leaving out every second command makes."""
+    lacking_share: float = 0.1
+    """Share above which commands are lacking (lower end of its interval): 0 if each logged command
+    acts until the next, 1 if others act half-way."""
+    held_share: float = 0.4
+    """Share up to which each command certainly acts until the next (upper end of its interval)."""
 
     relevance: tuple[float, float, float] = (0.05, 0.5, 0.025)
     """Sizes below which an effect is not reported: force per mass [m/s^2] (0.5 % of the weight),

@@ -143,16 +143,23 @@ def _correlation(time_s: np.ndarray, share: float, lasts_s: float) -> np.ndarray
 
 
 def _without_start(linear: Linearisation, limits: Thresholds) -> tuple[Linearisation, np.ndarray]:
-    """Return the residuals without what errors of start states explain, and their noise (19,)."""
+    """Return the residuals without what errors of start states and inputs explain, and their noise.
+
+    The noise (19,) is that before.
+    """
     residual, first = linear.residual, linear.slope.shape[-1] - linear.offset.shape[1]
-    slope = linear.slope[..., first : first + STATE]
+    slope, error = linear.slope[..., first : first + STATE], linear.windows.input_error
+    if error is not None:
+        slope = np.concatenate([slope, error], axis=-1)
+    prior = (np.arange(slope.shape[-1]) >= STATE).astype(float)  # input errors have unit variance
     sigma = noise_of(residual, linear.windows, limits=limits)
     weight = np.where(linear.windows.valid, 1.0 / sigma, 0.0)
     rows = (slope * np.nan_to_num(weight)[..., None]).reshape(len(slope), -1, slope.shape[-1])
     white = (residual * np.nan_to_num(weight)).reshape(len(slope), -1, 1)
     transposed = np.swapaxes(rows, 1, 2)
     size = np.sqrt(np.einsum("wfm,wmf->wf", transposed, rows))[:, :, None] + 1e-30
-    gram = (transposed / size) @ (rows / np.swapaxes(size, 1, 2)) + 1e-9 * np.eye(slope.shape[-1])
+    gram = (transposed / size) @ (rows / np.swapaxes(size, 1, 2))
+    gram = gram + (1e-9 + prior[:, None] / size**2) * np.eye(slope.shape[-1])
     change = np.linalg.solve(gram, (transposed / size) @ white) / size
     return linear._replace(residual=residual - (slope @ change[:, None])[..., 0]), sigma
 

@@ -3,10 +3,9 @@
 A window's start state is measured with the same noise as its other rows. So it is a nuisance
 parameter: what a change of its 12 numbers could explain is removed (projected out) from residuals
 and slopes. Errors of the rotor speeds are nuisance parameters, too. If measured speeds are the
-model's input, they have errors at knots all along a window, else only at its start. If the drone
-received commands that the log lacks, an unknown thrust and torque at the knots are nuisance
-parameters as well. Additional rows hold a prior on the size of these errors. Start numbers are all
-these parameters of a window.
+model's input, they have errors at knots all along a window, else only at its start. Additional rows
+hold a prior on the size of these errors. Start numbers are all these parameters of a window.
+Errors of commands (`FlightWindows.input_error`) are projected out in the same way.
 """
 
 from __future__ import annotations
@@ -22,21 +21,19 @@ from suite.diagnose.data.windows import KNOTS, SLICES, STATE, FlightWindows
 from suite.diagnose.estimate.block import Block
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
-LEAST_PUSH = 1e-3
-"""Lower limit of the error of thrust [m/s^2] and torque [rad/s^2]."""
-
 
 class Whitening(NamedTuple):
-    """What whitens W windows. Each has M whitened rows and F start numbers."""
+    """What whitens W windows. Each has M whitened rows, F start numbers and E input errors."""
 
     weight: np.ndarray
     """(W, N, 19) 1 / noise; 0 where nothing was measured."""
     prior: np.ndarray
-    """(W, F - 12) 1 / standard deviation of each error of the inputs, which the last rows hold."""
+    """(F + E - 12,) 1 / standard deviation of each error of a rotor speed or the input; as many last
+    rows hold it."""
     start: np.ndarray
-    """(W, M, F) orthonormal basis of the changes of the rows by the start numbers."""
+    """(W, M, F + E) orthonormal basis of the changes of the rows by start numbers and errors."""
     upper: np.ndarray
-    """(W, F, F) upper triangular matrix from start numbers to coordinates in that basis."""
+    """(W, F + E, F + E) upper triangular matrix from these to coordinates in that basis."""
     slow: np.ndarray
     """(W, 19, N, L) polynomials of unit length over the rows of each channel (slow errors)."""
     slow_freedom: np.ndarray
@@ -56,13 +53,12 @@ def make_whitening(linear: Linearisation, noise: Noise, limits: Thresholds) -> W
     weight = np.where(windows.valid, 1.0 / sigma, 0.0)
     filters = {name: colour_filter(noise, name, windows) for name in noise.coloured}
     count, rows, channels = weight.shape
-    size = linear.offset.shape[1]
-    # Basis of what the start numbers can change, with the rows of the prior.
-    prior = 1.0 / input_spread(windows, size, limits)
-    slope = _filtered(linear.slope[..., -size:] * weight[..., None], filters)
-    slope = slope.reshape(count, -1, size)
+    # Basis of what start numbers and errors can change, with the rows of the prior.
+    slope, spread = nuisance_of(linear, limits)
+    prior, size = 1.0 / spread, slope.shape[-1]
+    slope = _filtered(slope * weight[..., None], filters).reshape(count, -1, size)
     prior_rows = np.zeros((count, size - STATE, size))
-    prior_rows[:, :, STATE:] = prior[:, :, None] * np.eye(size - STATE)
+    prior_rows[:, :, STATE:] = np.diag(prior)
     start, upper = orthonormal(np.concatenate([slope, prior_rows], axis=1), limits.singular)
     upper = upper + 1e-9 * np.eye(size)
     # Slow errors: Legendre polynomials over the window. The part of them that start numbers explain
@@ -76,6 +72,20 @@ def make_whitening(linear: Linearisation, noise: Noise, limits: Thresholds) -> W
     explained = np.moveaxis(measured, 1, 3) @ slow
     slow_freedom = (slow**2).sum(axis=(2, 3)) - (explained**2).sum(axis=(2, 3))
     return Whitening(weight, prior, start, upper, slow, slow_freedom, filters)
+
+
+def nuisance_of(linear: Linearisation, limits: Thresholds) -> tuple[np.ndarray, np.ndarray]:
+    """Return the slopes along start numbers and input errors, and the size of these errors.
+
+    The last F slopes in `linear` must be those along the start numbers. Returned are (W, N, 19,
+    F + E), and the standard deviations (F + E - 12,) of all but the start state.
+    """
+    starts, error = linear.offset.shape[1], linear.windows.input_error
+    slope = linear.slope[..., -starts:]
+    spread = np.full(starts - STATE, rotor_spread(linear.windows, limits))
+    if error is None:
+        return slope, spread
+    return np.concatenate([slope, error], axis=-1), np.append(spread, np.ones(error.shape[-1]))
 
 
 def orthonormal(matrix: np.ndarray, singular: float) -> tuple[np.ndarray, np.ndarray]:
@@ -99,14 +109,6 @@ def orthonormal(matrix: np.ndarray, singular: float) -> tuple[np.ndarray, np.nda
     return base, upper
 
 
-def input_spread(windows: FlightWindows, size: int, limits: Thresholds = THRESHOLDS) -> np.ndarray:
-    """Return the standard deviations (W, F - 12) of the inputs' errors; `size` is F."""
-    spread = np.full((len(windows.flight), size - STATE), rotor_spread(windows, limits))
-    if size == STATE + 4 + 4 * KNOTS:
-        spread[:, 4:] = np.tile(np.maximum(windows.push_error, LEAST_PUSH), (1, KNOTS))
-    return spread
-
-
 def rotor_spread(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> float:
     """Return the standard deviation of the rotor speeds' errors as nuisance parameters [rad/s].
 
@@ -126,26 +128,39 @@ def block_of(whitening: Whitening, linear: Linearisation, along: Sequence[int]) 
 
     `along` are the parameters of its first slopes.
     """
-    # Whiten residuals and slopes, and add the rows of the prior: their residuals are the changes of
-    # the rotor speeds, their slopes 0.
-    values = np.concatenate([linear.residual[..., None], linear.slope[..., : len(along)]], axis=-1)
-    rows = _filtered(values * whitening.weight[..., None], whitening.filters)
-    rows = rows.reshape(len(rows), -1, rows.shape[-1])
-    prior_rows = np.zeros((len(rows), whitening.prior.shape[1], rows.shape[-1]))
-    prior_rows[..., 0] = -linear.offset[:, STATE:] * whitening.prior
-    rows = np.concatenate([rows, prior_rows], axis=1)
-    start_part = np.swapaxes(whitening.start, 1, 2) @ rows
-    start_change = np.linalg.solve(whitening.upper, start_part)
-    rows = rows - whitening.start @ start_part
+    rows, change = project_out(whitening, linear, len(along))
+    change = change[:, : linear.offset.shape[1]]
     return Block(
         rows[..., 0],
         rows[..., 1:],
         tuple(along),
         np.asarray(linear.windows.flight),
         np.asarray(linear.windows.start_s),
-        start_change[..., 0],
-        start_change[..., 1:],
+        change[..., 0],
+        change[..., 1:],
     )
+
+
+def project_out(
+    whitening: Whitening, linear: Linearisation, directions: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return whitened residuals and K slopes without what start numbers and errors explain.
+
+    Returned are the remaining rows (W, M, 1 + K), and the change of the start numbers and errors
+    (W, F + E, 1 + K) that explains the other part. `directions` is K.
+    """
+    # Whiten residuals and slopes, and add the rows of the prior: their residuals are the changes of
+    # the rotor speeds, their slopes 0.
+    values = np.concatenate([linear.residual[..., None], linear.slope[..., :directions]], axis=-1)
+    rows = _filtered(values * whitening.weight[..., None], whitening.filters)
+    rows = rows.reshape(len(rows), -1, rows.shape[-1])
+    prior_rows = np.zeros((len(rows), len(whitening.prior), rows.shape[-1]))
+    rotors = linear.offset.shape[1] - STATE
+    prior_rows[:, :rotors, 0] = -linear.offset[:, STATE:] * whitening.prior[:rotors]
+    rows = np.concatenate([rows, prior_rows], axis=1)
+    explained = np.swapaxes(whitening.start, 1, 2) @ rows
+    change = np.linalg.solve(whitening.upper, explained)
+    return rows - whitening.start @ explained, change
 
 
 def _filtered(scaled: np.ndarray, filters: Mapping[str, np.ndarray]) -> np.ndarray:

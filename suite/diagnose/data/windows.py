@@ -122,8 +122,9 @@ class FlightWindows(NamedTuple):
     """(W, N, 4) bool, whether a rotor speed was measured, for comparison or as the input."""
     start_rotor_error: Array
     """(W,) error of the rotor speeds after the burn-in [rad/s]; 0 if they are the input."""
-    push_error: Array
-    """(W, 4) standard deviation of the unknown thrust [m/s^2] and torque [rad/s^2] at a knot."""
+    input_error: Array | None = None
+    """(W, N, 19, E) change of the simulated values by E independent errors of the commands, of one
+    standard deviation each; None if the commands are known."""
 
 
 def cut(
@@ -137,7 +138,6 @@ def cut(
     since_s: float = 0.0,
     like: FlightWindows | None = None,
     stride: int = 1,
-    held: int = 1,
     between: bool = False,
 ) -> tuple[FlightWindows | None, list[str]]:
     """Return the windows of `logs` (None if no flight has one) and warnings.
@@ -156,7 +156,6 @@ def cut(
         since_s: earliest start of a window after its log's start [s].
         like: windows of an earlier call, to whose size these are padded.
         stride: factor on the length of the steps; only every `stride`-th rotor speed is used.
-        held: only every `held`-th command is used.
         between: half-way from one command to the next, their mean acts as another command.
     """
     starts, warnings = list[tuple[int, int]](), list[str]()  # (flight, row) each
@@ -187,7 +186,7 @@ def cut(
     steps_s = [LONGEST_S * stride] * len(logs)
     if integrator == "euler":
         steps_s = [log.step_s or 1.0 / vehicle.controller.frequency for log in logs]
-    inputs = [_input_of(logs[k], row, vehicle, steps_s[k], held, between) for k, row in starts]
+    inputs = [_input_of(logs[k], row, vehicle, steps_s[k], between) for k, row in starts]
     sizes = _padded_sizes(inputs, like)
     windows = [
         _window(logs[k], states[k], k, row, vehicle, spacings_s.get(k), one, stride, sizes)
@@ -244,7 +243,7 @@ class _Input(NamedTuple):
 
 
 def _input_of(
-    log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, held: int, between: bool
+    log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, between: bool
 ) -> _Input:
     """Return the inputs of the window at `row`; without commands those of a hover. See `cut`."""
     time_s, begin_s, period_s = log.time_s, log.time_s[row], 1.0 / vehicle.controller.frequency
@@ -261,7 +260,6 @@ def _input_of(
     first_s, last_s = begin_s - BURN_IN_S - HISTORY_S - 1e-9, begin_s + length_s + 1e-9
     used = slice(max(np.searchsorted(time_s, first_s) - 1, 0), np.searchsorted(time_s, last_s) + 1)
     time_s, command = with_lost_rows(time_s[used] - begin_s, command[used])
-    command = command[np.arange(len(command)) // held * held]
     if between:
         time_s, command = (np.repeat(values, 2, axis=0)[:-1] for values in (time_s, command))
         time_s[1::2] += 0.5 * np.diff(time_s[::2])
@@ -370,5 +368,4 @@ def _window(
         valid=padded(np.concatenate(valid, axis=1)),
         rotor_valid=padded(rotor_valid),
         start_rotor_error=np.asarray(rotor_error),
-        push_error=np.zeros(4),
     )

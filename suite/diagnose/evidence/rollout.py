@@ -45,8 +45,7 @@ def fly_windows(
         voltage: whether the windows have a battery voltage.
         integrator: one of `eval.quadrotor.continuous.INTEGRATORS`.
         offset: (B, F) corrections of the start numbers: 12 of the measured start state, then those
-            of the rotor speeds, at the knots if these are the input, else at the start. After
-            these, there may be an unknown thrust and torque at each knot.
+            of the rotor speeds, at the knots if these are the input, else at the start.
         windows: B windows.
         push: (B, KNOTS, 6) additional force and torque at the knots, see `Inputs.push_b`.
     """
@@ -76,11 +75,7 @@ def fly_windows(
     else:
         before = jax.tree.map(lambda field: field[:burn_in], spans)
         begin_speed = _speeds_after_burn_in(plant, values, before, command[:burn_in], windows)
-        begin_speed = begin_speed + offset[:, STATE : STATE + 4]
-        if offset.shape[1] > STATE + 4:
-            unknown = offset[:, STATE + 4 :].reshape(-1, KNOTS, 4)
-            unknown = jnp.pad(unknown, ((0, 0), (0, 0), (2, 0)))  # no force along body x and y
-            push = unknown if push is None else push + unknown
+        begin_speed = begin_speed + offset[:, STATE:]
     inputs = Inputs(
         unpack_command(command[burn_in:]),
         rotor_speed,

@@ -231,23 +231,14 @@ class RolloutModel:
     """Simulation of windows with one vehicle: their residuals and slopes, compiled."""
 
     def __init__(
-        self,
-        vehicle: Vehicle,
-        rotor_input: bool,
-        voltage: bool,
-        integrator: str = "continuous",
-        pushed: bool = False,
+        self, vehicle: Vehicle, rotor_input: bool, voltage: bool, integrator: str = "continuous"
     ) -> None:
-        """Prepare the rollout of `vehicle`; for the other arguments see `fly_windows`.
-
-        With `pushed` an unknown thrust and torque act at the knots, by commands between the rows.
-        """
+        """Prepare the rollout of `vehicle`; for the other arguments see `fly_windows`."""
         self.space = space = make_space(vehicle)
         self.size = len(space.entries)
-        self.free = STATE + 4 * (KNOTS if rotor_input else 1 + pushed * KNOTS)
+        self.free = STATE + 4 * (KNOTS if rotor_input else 1)
         """Number F of start numbers of each window, which are fitted, too: 12 of its state, and 4
-        errors of rotor speeds (4 at each knot if measured speeds are the input). With `pushed`
-        these are followed by thrust and torque at each knot."""
+        errors of rotor speeds (4 at each knot if measured speeds are the input)."""
         self.starts = list(range(self.size, self.size + self.free))
         """Places of the start numbers among all directions, after the parameters."""
         self.given = arrays_of(vehicle, space)
@@ -270,7 +261,7 @@ class RolloutModel:
                 jax.tree.map(
                     lambda x, n=own: np.asarray(x)[:n], self._respond(self.given, at.theta, x, w)
                 )
-                for x, w, own in batches(at.free, windows)
+                for x, w, own in batches(at.free, windows._replace(input_error=None))
             ]
         residual, slope, knot = jax.tree.map(lambda *p: np.concatenate(p), *parts)
         return Linearisation(residual, slope, at.free, windows), knot
@@ -283,7 +274,8 @@ class RolloutModel:
         The slopes are along the parameters at `indices`; places in `starts` mean start numbers.
         With None they are along all parameters and then all start numbers.
         """
-        values, slope = linearised(self._linear, self.given, *at, windows, indices, BATCH)
+        known = windows._replace(input_error=None)  # no part of the simulation
+        values, slope = linearised(self._linear, self.given, *at, known, indices, BATCH)
         return Linearisation(-values, slope, at.free, windows)
 
 

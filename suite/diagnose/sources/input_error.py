@@ -1,10 +1,10 @@
 """Errors of rollouts by their inputs: steps, rotor speeds and commands that no log contains.
 
 If the drone received commands between the rows of the log, these are taken as the mean of their
-neighbours. The true ones gave another thrust and torque. It is estimated by a comparison with
-commands that hold until the next row, since the truth lies about as far on the other side. Thrust
-and torque at the knots of a window become nuisance parameters of this size, and what changes faster
-than the knots counts as noise.
+neighbours. The true ones gave another thrust and torque. How large they are is estimated by a
+comparison with commands that hold until the next row, since the truth lies about as far on the
+other side. Thrust and torque at the knots of a window become nuisance parameters of this size, and
+what changes faster than the knots counts as noise.
 """
 
 from __future__ import annotations
@@ -14,12 +14,16 @@ from dataclasses import replace
 import numpy as np
 
 from suite.diagnose.data.noise import Linearisation, Noise, measured_noise
-from suite.diagnose.data.whitening import Whitening, block_of, make_whitening
-from suite.diagnose.data.windows import SLICES, STATE
+from suite.diagnose.data.whitening import Whitening, block_of, make_whitening, project_out
+from suite.diagnose.data.windows import KNOTS, SLICES, FlightWindows
+from suite.diagnose.estimate.block import Estimate
+from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.thresholds import Thresholds
 
 WIDE = 100.0
 """Standard deviation of an unknown thrust [m/s^2] and torque [rad/s^2] that data determine."""
+LEAST_PUSH = 1e-3
+"""Lower limit of the error of thrust [m/s^2] and torque [rad/s^2]."""
 
 
 def with_model_error(
@@ -36,45 +40,73 @@ def with_model_error(
     return _raised(_unexplained_rms(difference, linear, noise, whitening), limits)
 
 
-def lacks_commands(linear: Linearisation, difference: np.ndarray, limits: Thresholds) -> bool:
-    """Return whether the drone received commands between the rows of the log.
+def share_between(
+    linear: Linearisation, difference: np.ndarray, limits: Thresholds
+) -> tuple[float, float]:
+    """Return the interval (three standard errors) of the share of commands between the rows.
 
-    With every second command the residuals change by the `difference` (W, N, 19). Body rates and
-    rotor speeds follow a command at once. If their residuals are only a small share of the
-    difference, the log has every command. For `linear` see `with_model_error`.
+    The share is 0 if each command holds until the next row, and 1 if the mean of two commands acts
+    half-way, as it does on average if the drone received others in between. This changes the
+    residuals by the `difference` (W, N, 19). The share is fitted together with all parameters,
+    since a delay or a shifted clock moves commands in time as well. `linear` has slopes along all
+    parameters and start numbers.
     """
     noise = measured_noise(linear, limits)
+    known = np.isfinite(difference).all(axis=(1, 2), keepdims=True)
+    toward = -np.where(known, difference, 0.0)[..., None]
     whitening = make_whitening(linear, noise, limits)
-    rms = _unexplained_rms(difference, linear, noise, whitening)
-    residual = _unexplained_rms(linear.residual, linear, noise, whitening)
-    shares = residual / np.maximum(rms, 1e-12)
-    fast = [s for n, s in zip(SLICES, shares, strict=True) if n in ("rates", "rotor speed")]
-    return min((share for share in fast if share > 0.0), default=0.0) >= limits.held_share
+    # Along all parameters and the share; slopes along start numbers are not needed any more.
+    slope = np.concatenate([toward, linear.slope[..., : -linear.offset.shape[1]]], axis=-1)
+    rows, _ = project_out(whitening, linear._replace(slope=slope), slope.shape[-1])
+    rows = rows.reshape(-1, rows.shape[-1])
+    rows = rows[:, np.r_[True, True, (rows[:, 2:] ** 2).sum(axis=0) > 0.0]]
+    size = np.linalg.norm(rows[:, 1:], axis=0)
+    gram = rows[:, 1:].T @ rows[:, 1:] / np.outer(size, size)
+    inverse = np.linalg.pinv(gram, rcond=1e-9, hermitian=True)
+    share = inverse[0] @ (rows[:, 1:].T @ rows[:, 0] / size) / size[0]
+    half_width = 3.0 * np.sqrt(inverse[0, 0]) / size[0]
+    return float(share - half_width), float(share + half_width)
+
+
+def push_slopes(model: RolloutModel, linear: Linearisation) -> np.ndarray:
+    """Return slopes (W, N, 19, KNOTS, 4) along a thrust [m/s^2] and torque [rad/s^2] at a knot."""
+    at = Estimate(model.space.array("start"), linear.offset)
+    slope = model.respond(at, linear.windows)[0].slope
+    return slope.reshape(*slope.shape[:3], KNOTS, 6)[..., 2:]
+
+
+def with_input_error(
+    windows: FlightWindows, push: np.ndarray, error: np.ndarray
+) -> FlightWindows:
+    """Return `windows` whose commands have the `error` (W, 4) or (4,); for `push` see above."""
+    columns = push * np.broadcast_to(error, (len(push), 4))[:, None, None, None]
+    return windows._replace(input_error=columns.reshape(*push.shape[:3], -1))
 
 
 def unknown_commands(
-    linear: Linearisation, difference: np.ndarray, limits: Thresholds
+    linear: Linearisation, push: np.ndarray, difference: np.ndarray, limits: Thresholds
 ) -> tuple[np.ndarray, Thresholds]:
-    """Return `FlightWindows.push_error` (W, 4) of unknown commands, and limits with their noise.
+    """Return the error (W, 4) of thrust and torque by unknown commands, and limits with their noise.
 
-    Held commands change the residuals by the `difference` (W, N, 19). `linear` has slopes along
-    unknown thrusts and torques at the knots.
+    Held commands change the residuals by the `difference` (W, N, 19). For `push` see
+    `push_slopes`.
     """
     noise = measured_noise(linear, limits)
     difference = np.where(np.isfinite(difference).all(axis=(1, 2), keepdims=True), difference, 0.0)
+    linear = linear._replace(residual=difference)
 
-    def with_error(error: np.ndarray) -> Linearisation:
-        windows = linear.windows._replace(push_error=error)
-        return linear._replace(residual=difference, windows=windows)
+    def with_error(error: np.ndarray) -> tuple[Linearisation, Whitening]:
+        wide = linear._replace(windows=with_input_error(linear.windows, push, error))
+        return wide, make_whitening(wide, noise, limits)
 
-    wide = with_error(np.full((len(difference), 4), WIDE))
-    push = block_of(make_whitening(wide, noise, limits), wide, ()).free[:, STATE + 4 :]
-    power = (push.reshape(len(push), -1, 4) ** 2).mean(axis=1)
+    wide, whitening = with_error(np.full(4, WIDE))
+    _, change = project_out(whitening, wide)
+    values = WIDE * change[:, -KNOTS * 4 :, 0].reshape(-1, KNOTS, 4)
+    power = (values**2).mean(axis=1)
     # A window's own error counts as much as that of all windows.
-    error = np.sqrt(0.5 * (power + power.mean(axis=0)))
-    known = with_error(error)
-    left = _unexplained_rms(difference, known, noise, make_whitening(known, noise, limits))
-    return error, _raised(left, limits)
+    error = np.maximum(np.sqrt(0.5 * (power + power.mean(axis=0))), LEAST_PUSH)
+    known, whitening = with_error(error)
+    return error, _raised(_unexplained_rms(difference, known, noise, whitening), limits)
 
 
 def _unexplained_rms(

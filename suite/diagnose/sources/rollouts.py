@@ -31,8 +31,10 @@ from suite.diagnose.evidence.rollouts import (
     start_estimate,
 )
 from suite.diagnose.sources.input_error import (
-    lacks_commands,
+    push_slopes,
+    share_between,
     unknown_commands,
+    with_input_error,
     with_model_error,
 )
 from suite.diagnose.sources.rollout_source import RolloutSource
@@ -121,24 +123,26 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     commands = [(log.time_s, log.rate_cmd_b) for log in logs if log.rate_cmd_b is not None]
     are_slow = any(own_spacing_s(*command) > limits.command_spacing_s for command in commands)
     lacking = False
+    push_error = None
     if are_slow and not rotor_input:
-        fewer = take(windows_of(like=windows, held=2)[0], is_finite)
-        lacking = lacks_commands(linear, _difference(model, linear, fewer), limits)
+        between = take(windows_of(between=True)[0], is_finite)
+        low, high = share_between(linear, _difference(model, linear, between), limits)
+        lacking = low > limits.lacking_share
+        if high > limits.held_share:  # unclear, so effects must be larger than what it changes
+            coarser, coarser_share = between, 1.0
     if lacking:
         warnings.append(LACKING)
         # Rotor speeds follow the unknown commands, so they are not compared.
-        inputs = [replace(log, rotor_speed=None) for log in logs]
-        few = replace(limits, most_windows=limits.most_lacking_windows)
-        held_of = partial(cut, inputs, vehicle, False, limits=few, integrator=integrator)
+        logs = [replace(log, rotor_speed=None) for log in logs]
+        held_of = partial(cut, logs, vehicle, False, limits=limits, integrator=integrator)
         windows_of = partial(held_of, between=True)
-        windows, _ = windows_of()
-        assert windows is not None  # the same flights had some before
-        model = RolloutModel(vehicle, False, voltage, integrator, pushed=True)
-        linear, is_finite = _simulated(model, windows, limits)
-        coarser, coarser_share = take(held_of(like=windows)[0], is_finite), 1.0
-        error, limits = unknown_commands(linear, _difference(model, linear, coarser), limits)
-        linear = linear._replace(windows=linear.windows._replace(push_error=error))
-        coarser = coarser._replace(push_error=error)
+        linear, is_finite = _simulated(model, windows_of()[0], limits)
+        coarser, coarser_share = take(held_of(like=linear.windows)[0], is_finite), 1.0
+        push = push_slopes(model, linear)
+        difference = _difference(model, linear, coarser)
+        push_error, limits = unknown_commands(linear, push, difference, limits)
+        linear = linear._replace(windows=with_input_error(linear.windows, push, push_error))
+        coarser = with_input_error(coarser, push, push_error)
     if not given.chosen and is_hopeless(model, linear, limits):
         given.say("no effect brings rollouts of 1 s near these flights: using force and torque")
         return SourceSet((), (), "", (FAR,))
@@ -163,9 +167,11 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
     held_flights = np.unique(not_fitted.flight).tolist()
     held, _ = windows_of(stride_s=limits.gap_stride_s, only=held_flights, since_s=since_s)
     assert held is not None
-    error = np.sqrt((np.asarray(windows.push_error) ** 2).mean(axis=0))
-    held = held._replace(push_error=np.tile(error, (len(held.flight), 1)))
-    flies = _finite(model.linearise(start_estimate(model, held), held, []), limits)
+    held_linear = model.linearise(start_estimate(model, held), held, [])
+    flies = _finite(held_linear, limits)
+    if push_error is not None:
+        error = np.sqrt((push_error**2).mean(axis=0))
+        held = with_input_error(held, push_slopes(model, held_linear), error)
     if not flies.all():
         held = take(held, flies)
         warnings.append(f"{(~flies).sum()} held-out stretches left out: the model diverges there")

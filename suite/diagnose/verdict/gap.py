@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from suite.diagnose.data.noise import Linearisation, Noise
-from suite.diagnose.data.whitening import block_of, input_spread, make_whitening, slow_energy
+from suite.diagnose.data.whitening import block_of, make_whitening, nuisance_of, slow_energy
 from suite.diagnose.data.windows import LENGTH_S, SLICES, STATE, STATE_GROUPS, FlightWindows, take
 from suite.diagnose.estimate.gauss_newton import Z95
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
@@ -166,10 +166,9 @@ def gap_of(linear: Linearisation, noise: Noise, limits: Thresholds = THRESHOLDS)
     windows, whitening = linear.windows, make_whitening(linear, noise, limits)
     slow = slow_energy(whitening, block_of(whitening, linear, ()).residual)
     score = slow[:, :STATE].sum(axis=1) / whitening.slow_freedom[:, :STATE].sum(axis=1)
-    # Noise of the start numbers: the state, and then errors of the inputs.
-    inputs = input_spread(windows, linear.offset.shape[1], limits)
-    state = np.tile(np.nan_to_num(noise.sigma[:STATE]), (len(inputs), 1))
-    free_noise = np.concatenate([state, inputs], axis=1)
+    # Noise of the start state, and errors of the inputs.
+    slope, spread = nuisance_of(linear, limits)
+    free_noise = np.append(np.nan_to_num(noise.sigma[:STATE]), spread)
     channels: dict[str, dict[str, Channel]] = {}
     for horizon_s in (0.1, 0.5, 1.0):
         channels[f"{horizon_s:g} s"] = {}
@@ -181,8 +180,7 @@ def gap_of(linear: Linearisation, noise: Noise, limits: Thresholds = THRESHOLDS)
             nearest = np.where(measured, distance_s, np.inf)[stretch].argmin(axis=1)
             rows = (stretch, nearest)
             error = linear.residual[rows][:, SLICES[name]]
-            floor = noise_floor(linear.slope[rows][:, :STATE], free_noise[stretch])
-            floor = floor[:, SLICES[name]]
+            floor = noise_floor(slope[rows][:, :STATE], free_noise)[:, SLICES[name]]
             parts = (error, np.maximum(floor, 1e-12)) if len(stretch) else (np.zeros((1, 3)),) * 2
             channels[f"{horizon_s:g} s"][name] = Channel(*map(rms_length, parts))
     return Gap(score, slow.sum(axis=1), channels)
@@ -198,9 +196,9 @@ def noise_floor(slope: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Return the RMS errors (..., 12) that a perfect model would still have.
 
     `slope` (..., 12, F) is the derivative of a row's state by the F start numbers, and carries
-    their `noise` (..., F) to this row. The first 12 are also the noise of the row itself.
+    their `noise` (F,) to this row. The first 12 are also the noise of the row itself.
     """
-    return np.sqrt(noise[..., :STATE] ** 2 + ((slope * noise[..., None, :]) ** 2).sum(axis=-1))
+    return np.sqrt(noise[:STATE] ** 2 + ((slope * noise) ** 2).sum(axis=-1))
 
 
 class EffectSize(NamedTuple):
