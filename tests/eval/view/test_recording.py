@@ -68,7 +68,7 @@ def test_a_recording_has_the_depth_images_in_metres_at_the_policys_rate(recorded
     _, flight, _ = rollout()
     entity = "/trial_0/world/drone/camera/depth"
     times, buffers = found[entity, "DepthImage:buffer"]
-    np.testing.assert_array_equal(times, nanoseconds(flight.time_s[flight.policy_step]))
+    np.testing.assert_array_equal(times, nanoseconds(flight.depth_time_s))
     images = np.array(buffers, dtype=np.uint8).reshape(len(times), -1).view(np.float32)
     assert flight.depth_m is not None
     np.testing.assert_array_equal(images.reshape(-1, 24, 32), flight.depth_m)
