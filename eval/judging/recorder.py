@@ -66,10 +66,9 @@ class Recorder:
         *states, gate, action, is_new = columns
         depth: tuple[Any, Any] = None, None
         if self._depth:
-            time_s, images = (
-                zip(*self._images[slot], strict=True) if self._images[slot] else ((), ())
-            )
-            depth = np.array(images or np.zeros((0, 0, 0)), np.float32), np.array(time_s)
+            times_s = np.array([time_s for time_s, _ in self._images[slot]])
+            images = [image for _, image in self._images[slot]]
+            depth = np.stack(images) if images else np.zeros((0, 0, 0), np.float32), times_s
         gate = gate.astype(np.int32)
         values: Any = (*states, action, is_new, gate, *depth, about, self._action_kind)
         return Flight(*values)
