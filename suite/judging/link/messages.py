@@ -326,8 +326,9 @@ class ImageAssembler:
             if (height, width) != self._shape:
                 self.other_size = (width, height)
             return None
-        # A repeated number is from the next image, whose announcement was lost.
-        if packet.number in self._received:
+        # Other bytes under a received number are of the next image, whose announcement was lost; the
+        # same bytes were doubled on the way.
+        if self._received.get(packet.number, packet.data) != packet.data:
             self._received, self._expected = {}, 0
         if packet.number >= self._expected:
             return None
