@@ -93,11 +93,6 @@ def test_an_image_comes_whole_or_not_at_all_also_where_16_bits_do_not_count_its_
     assert seen(sent[:3] + sent[4:]) == []
     assert len(seen(sent[:3] + sent)) == 1
     assert seen(sent, height=20) == []
-    # Doubled packets, at once or with a delay, and packets in another order.
-    doubled = [packet for packet in sent for _ in range(2)]
-    late = [packet for pair in zip(sent[2:], sent[:-2], strict=True) for packet in pair]
-    for datagrams in (doubled, [*sent[:2], *late, *sent[-2:]], [sent[0], *sent[:0:-1]]):
-        np.testing.assert_array_equal(seen(datagrams)[0], image)
     assert seen([companion.encode(Packet(3, 0, b"x"))]) == []
     # The end of one and the announcement of the next are lost: no image is made of two.
     later = [vehicle.encode(packet) for packet in image_packets(depth + 1.0, 20.0)]
