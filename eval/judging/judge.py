@@ -294,7 +294,8 @@ class _Slots:
         flying = flying & ~guarded.late
         self._fresh[:] = False
         if self._recorder:
-            self._recorder.decided(np.flatnonzero(flying), self._action_b, view.depth_m)
+            time_s = np.asarray(self._world.progress.step) * self._world.dt
+            self._recorder.decided(np.flatnonzero(flying), time_s, self._action_b, view.depth_m)
         steps = steps_to_next(self._decision, self._steps_a_decision)
         self._fly_steps(np.where(flying, steps, 0), flying)
         self._decision += 1

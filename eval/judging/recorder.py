@@ -25,11 +25,10 @@ class Recorder:
         """
         self._depth, self._action_kind = depth, action_kind
         self._rows: list[list[tuple[Any, ...]]] = [[] for _ in range(slots)]
-        self._images: list[list[np.ndarray]] = [[] for _ in range(slots)]
+        self._images: list[list[tuple[float, np.ndarray]]] = [[] for _ in range(slots)]
         self._first = first
         self._action = np.tile(self._first, (slots, 1))
         self._is_new = np.zeros(slots, bool)
-        self._last_image = [np.zeros(0, np.float32)] * slots
 
     def start(self, slot: int) -> None:
         """Begin the flight of a new trial in `slot`."""
@@ -37,23 +36,26 @@ class Recorder:
         self._is_new[slot] = False
         self._action[slot] = self._first
 
-    def decided(self, slots: np.ndarray, action_b: np.ndarray, depth_m: np.ndarray) -> None:
-        """Store the policy's new actions and depth images, (N, ...) each, for `slots` (k,)."""
+    def decided(
+        self, slots: np.ndarray, time_s: np.ndarray, action_b: np.ndarray, depth_m: np.ndarray
+    ) -> None:
+        """Store times, actions and depth images of new decisions, (N, ...) each, for `slots` (k,).
+
+        The time (N,) is that of the decision; the next row of a flight is up to 10 ms later.
+        """
         for slot in slots:
             self._action[slot] = action_b[slot]
             self._is_new[slot] = True
             if self._depth:
-                self._last_image[slot] = depth_m[slot].astype(np.float32)
+                image = depth_m[slot].astype(np.float32)
+                self._images[slot].append((float(time_s[slot]), image))
 
     def add(self, rows: Rows) -> None:
         """Add one row to the flight of each slot that is recorded at this step (`rows.due`)."""
         for slot in np.flatnonzero(rows.due):
-            is_new = bool(self._is_new[slot])
-            self._is_new[slot] = False
-            if is_new and self._depth:
-                self._images[slot].append(self._last_image[slot])
             values = (np.copy(field[slot]) for field in rows[1:])
-            self._rows[slot].append((*values, self._action[slot].copy(), is_new))
+            self._rows[slot].append((*values, self._action[slot].copy(), bool(self._is_new[slot])))
+            self._is_new[slot] = False
 
     def finish(self, slot: int, about: dict[str, Any]) -> Flight:
         """Return the flight in `slot`, with `about` as its metadata."""
@@ -62,10 +64,11 @@ class Recorder:
         if not self._rows[slot]:
             columns = [column[:0] for column in columns]
         *states, gate, action, is_new = columns
-        images = None
+        depth: tuple[Any, Any] = None, None
         if self._depth:
-            images = np.stack(self._images[slot]) if self._images[slot] else np.zeros((0, 0, 0))
-            images = images.astype(np.float32)
+            times_s = np.array([time_s for time_s, _ in self._images[slot]])
+            images = [image for _, image in self._images[slot]]
+            depth = np.stack(images) if images else np.zeros((0, 0, 0), np.float32), times_s
         gate = gate.astype(np.int32)
-        values: Any = (*states, action, is_new, gate, images, about, self._action_kind)
+        values: Any = (*states, action, is_new, gate, *depth, about, self._action_kind)
         return Flight(*values)

@@ -41,7 +41,10 @@ class Flight(NamedTuple):
     gate: np.ndarray
     """(T,) int32: the next gate's number from 0, equal to the number of gates passed."""
     depth_m: np.ndarray | None
-    """(P, H, W) float32 depth images, one for each row with `policy_step`, or None."""
+    """(P, H, W) float32 depth images, one for each decision of the policy, or None."""
+    depth_time_s: np.ndarray | None
+    """(P,) time of each of these decisions; the attitude loop flies its action up to a row later
+    [s]."""
     about: dict[str, Any]
     """Where the flight comes from: a row of trials.parquet (track, difficulty, seed, policy,
     vehicle, world, ended_by, ...) and how the world steps (integrator, step_s), as plain Python

@@ -33,10 +33,11 @@ def sensor_problem(sensor: Sensor) -> str | None:
     if not any(getattr(sensor, hook) for hook in HOOKS):
         return f"without a function it does nothing; give one of {', '.join(HOOKS)}"
     for parameter in sensor.parameters:
-        if not parameter.low <= parameter.neutral <= parameter.high > parameter.low:
+        low, high = parameter.low, parameter.high
+        if not -np.inf < low <= parameter.neutral <= high < np.inf or low == high:
             return (
-                f"parameter {parameter.name!r} is from {parameter.low:g} to {parameter.high:g} and "
-                f"neutral at {parameter.neutral:g}; needed is low <= neutral <= high, low < high"
+                f"parameter {parameter.name!r} is from {low:g} to {high:g} and neutral at "
+                f"{parameter.neutral:g}; needed is low <= neutral <= high, low < high, all finite"
             )
     if not (sense := sensor.sense):
         return None

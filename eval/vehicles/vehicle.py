@@ -62,6 +62,10 @@ class Controller:
     settings: Any = None
     """Settings of the firmware's loop, `Settings` of its module; None for `p`."""
 
+    def overshoots(self, step_s: float) -> bool:
+        """Return whether the nominal rate loop overshoots at every physics step of `step_s` [s]."""
+        return self.kind == "p" and max(self.rate_gain) * step_s > 1.0
+
 
 @dataclass(frozen=True)
 class MotorMap:
@@ -110,7 +114,10 @@ class Vehicle:
 
     @property
     def full_thrust(self) -> float:
-        """Nominal collective thrust per mass at full throttle [m/s^2]."""
+        """Thrust per nominal mass of four rotors at `speed_max`, also with `[motors]` [m/s^2].
+
+        A policy or a companion computer can command no larger one.
+        """
         return 4.0 * self.rotors.thrust_max / self.mass
 
 

@@ -97,6 +97,8 @@ def trial_view(tab: Tab) -> rrb.Vertical:
         "thrust": "thrust command [m/s²]",
         "rotors": "rotor speeds [rad/s]",
     }
+    if tab.action_kind == "motors":  # it commands no thrust
+        del plots["thrust"]
     speed, rates, *others = (
         rrb.TimeSeriesView(origin=f"{tab.root}/{name}", name=title) for name, title in plots.items()
     )

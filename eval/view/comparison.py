@@ -181,26 +181,35 @@ def _layout(flights: Sequence[ComparedFlight]) -> rrb.Blueprint:
 
 
 def _flight_view(root: str, flight: ComparedFlight) -> rrb.Vertical:
-    """Return the views of one flight: paths, errors and curves."""
+    """Return the views of one flight: paths, and errors and curves of what was logged."""
     overview = rrb.Spatial3DView(
         origin=f"{root}/world",
         name="measured and simulated",
         background=BACKGROUND,
         line_grid=False,
     )
+    states = [flight.measured, *(part for one in flight.simulations for part in one.rollouts)]
+    curves = {
+        group: rrb.Horizontal(
+            *(
+                rrb.TimeSeriesView(origin=f"{root}/{name}", name=f"{group} {name[-1]} [{unit}]")
+                for name in SERIES
+                if name.startswith(group)
+            )
+        )
+        for group, unit, field in (("velocity", "m/s", "vel_w"), ("rates", "rad/s", "rate_b"))
+        if any(np.isfinite(getattr(each, field)).any() for each in states)
+    }
+    parts = [part for one in flight.simulations for part in one.errors]
     errors = [
         rrb.TimeSeriesView(origin=f"{root}/error_{name}", name=f"{name} error [{unit}]")
-        for name, unit in ERRORS.items()
+        for k, (name, unit) in enumerate(ERRORS.items())
+        if any(np.isfinite(part[:, k]).any() for part in parts)
     ]
-    series = [
-        rrb.TimeSeriesView(origin=f"{root}/{name}", name=f"{group} {axis} [{ERRORS[group]}]")
-        for name in SERIES
-        for group, axis in [name.split("_")]
-    ]
+    top = [overview, rrb.Vertical(*errors)] if errors else [overview]
     return rrb.Vertical(
-        rrb.Horizontal(overview, rrb.Vertical(*errors), column_shares=[1.6, 1.0]),
-        rrb.Horizontal(*series[:3]),
-        rrb.Horizontal(*series[3:]),
-        row_shares=[3.0, 1.0, 1.0],
+        rrb.Horizontal(*top, column_shares=[1.6, 1.0][: len(top)]),
+        *curves.values(),
+        row_shares=[3.0, *(1.0 for _ in curves)],
         name=flight.name,
     )

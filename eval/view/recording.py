@@ -253,7 +253,7 @@ def _log_drone(recording: rr.RecordingStream, entity: str, flight: Flight, drone
 
 
 def _log_depth(recording: rr.RecordingStream, entity: str, flight: Flight, camera: Camera) -> None:
-    """Log the depth images at the policy's steps."""
+    """Log the depth images at the policy's decisions."""
     frames = np.ascontiguousarray(flight.depth_m, dtype=np.float32)
     constant = rr.DepthImage.from_fields(
         format=rr.components.ImageFormat(
@@ -266,7 +266,7 @@ def _log_depth(recording: rr.RecordingStream, entity: str, flight: Flight, camer
         point_fill_ratio=0.2,
     )
     recording.log(entity, constant, static=True)
-    times = time_columns(flight.time_s[np.asarray(flight.policy_step, dtype=bool)])
+    times = time_columns(np.asarray(flight.depth_time_s))
     buffers = frames.view(np.uint8).reshape(len(frames), -1)
     recording.send_columns(entity, times, rr.DepthImage.columns(buffer=buffers))
 

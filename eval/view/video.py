@@ -101,8 +101,8 @@ def video_frames(
     path_colour = colours.speed_colours(speed[:-1], top)
     rot_w = quat_to_rot(flight.quat_wxyz)
     eye_w, target_w = _chase_camera(flight, rot_w)
-    policy_rows = np.flatnonzero(flight.policy_step)
     images = flight.depth_m if flight.depth_m is not None and len(flight.depth_m) else None
+    image_s = np.asarray(flight.depth_time_s)
     side_width = 0 if images is None else round(options.size[0] * SIDE_SHARE)
     size = options.size[0] - side_width, options.size[1]
     for time in times:
@@ -118,7 +118,7 @@ def video_frames(
         frame = Image.new("RGB", options.size, SKY)
         frame.paste(draw_drone(scenery, drone, (eye, target), size, lines))
         if images is not None:
-            number = int(np.searchsorted(policy_rows, row, side="right")) - 1
+            number = int(np.searchsorted(image_s, time, side="right")) - 1
             _draw_depth(frame, side_width, images[min(max(number, 0), len(images) - 1)])
         ended = time >= flight.time_s[-1]
         _draw_text(frame, side_width, track, result, float(time), float(speed[row]), passed, ended)

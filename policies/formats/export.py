@@ -14,7 +14,7 @@ from policies.formats.policy_file import PolicyCheckpoint, load_policy_checkpoin
 from policies.formats.program_inputs import INPUTS
 from policies.formats.spec_json import labels
 from policies.spec import PolicyError, PolicySpec
-from tracks.common.files import replacing_file
+from tracks.common.files import replacing_file, write_files
 from tracks.common.names import unknown_name
 
 if TYPE_CHECKING:
@@ -42,27 +42,23 @@ def export_policy(
     Raises:
         PolicyError: where the checkpoint cannot be used, or int8 has no observations.
         ValueError: for an unknown format or type, or a type that the format does not support.
-        OSError: where a file cannot be written; no partial file is left.
+        OSError: where a file cannot be written; none is written then.
     """
     formats = list(formats)
     check_formats(formats, dtype)
     name, checkpoint = exported_checkpoint(name_or_folder)
     texts = labels(checkpoint.spec, name, checkpoint.seed)
-    written = []
+    files: dict[str, bytes] = {}
     for format_name in formats:
         if format_name == "c":
             from policies.formats.c.project import c_project
 
             project = c_project(checkpoint, name, dtype, observed).files
-            files = {file: text.encode() for file, text in project.items()}
+            files |= {file: text.encode() for file, text in project.items()}
         else:
             _, write = _WRITERS[format_name]
-            files = {file_names(name, format_name)[0]: write(checkpoint, texts)}
-        for file, data in files.items():
-            with replacing_file(out / file) as temporary:
-                temporary.write_bytes(data)
-            written.append(out / file)
-    return written
+            files[file_names(name, format_name)[0]] = write(checkpoint, texts)
+    return write_files(out, files)
 
 
 def export_module(

@@ -40,6 +40,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         read_runs,
         seed_notes,
         version_notes,
+        without_folders,
     )
 
     seen = set[Path]()
@@ -47,8 +48,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         if folder.resolve() in seen:
             raise ValueError(f"{folder} is given twice; give each run once")
         seen.add(folder.resolve())
-    runs = [run for folder in config.runs for run in read_runs(folder)]
-    others = [run for folder in config.against for run in read_runs(folder)]
+    runs, others = (
+        [without_folders(run) for folder in folders for run in read_runs(folder)]
+        for folders in (config.runs, config.against)
+    )
     if len(runs) < 2 and not (runs and others):
         raise ValueError(
             "a comparison needs the results of two policies or more; give the --out folders of "

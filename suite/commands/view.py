@@ -127,6 +127,8 @@ class _Chosen(NamedTuple):
 
 def _choose_trials(config: Config, console: Console) -> _Chosen:
     """Return the trials that the options choose."""
+    from eval.logs.flight_log import logs_in
+    from policies.formats.checkpoint import CONFIG
     from policies.shipped import locate, names
     from suite.judging.flying import default_policy, manners
     from suite.judging.replay import first_trials, read_evaluation
@@ -141,6 +143,13 @@ def _choose_trials(config: Config, console: Console) -> _Chosen:
             )
         reason = f"{folder} is not a finished run of suite eval"
         config.refuse_unused(("pick", "policy"), reason)
+        log = next(iter(logs_in(folder)), folder)
+        if log.suffix in (".parquet", ".csv") and not (folder / CONFIG).exists():
+            raise ValueError(
+                f"{log} is a flight log, and suite view flies trials; give the policy of the "
+                "flights (of a suite collect it is in flights.json, with the --track, "
+                "--difficulty, --vehicle and --seed), or the --out folder of a suite eval"
+            )
         if not locate(config.run).exists():
             raise ValueError(
                 f"{unknown_name('RUN', config.run, names())} The --out folder of a suite eval, a "

@@ -16,7 +16,7 @@ import psutil
 
 from tracks.common.files import write_json
 from tracks.common.names import added_entries
-from tracks.common.provenance import stamp
+from tracks.common.provenance import differences, stamp
 from tracks.common.work import usable_cores
 from tracks.input.reading import read_json
 
@@ -26,8 +26,8 @@ PACKAGES = (
     *("pyarrow", "rerun-sdk"),
 )
 """Names of the packages that can change a result."""
-_KEPT = (("git_commit", "earlier_commits", "unknown"), ("plugins", "earlier_plugins", "none"))
-"""Key of a record -> key under which its earlier values are kept, and the name of a missing one."""
+_TRAINED_WITH = ("numpy", "scipy", "jax", "jaxlib", "optax", "mujoco")
+"""Names of those that can change a training."""
 
 
 @functools.cache
@@ -125,12 +125,15 @@ def refuse_other_run(folder: str | os.PathLike[str], config: Any) -> None:
 
 def write_run_record(
     folder: str | os.PathLike[str], config: Any, seed: int | None, resumed: bool = False
-) -> None:
+) -> list[str]:
     """Write everything that is needed to repeat a run to `folder`/run.json.
 
     The dataclass `config` has all defaults filled in. The seed is None if the run has none. With
-    `resumed`, an interrupted run in this folder continues. The git commits and the plugins in its
-    record are kept as `earlier_commits` and `earlier_plugins`, since their code made a part of it.
+    `resumed`, an interrupted run in this folder continues. Versions in its record that have changed
+    since are kept under `earlier`, as they made a part of the run.
+
+    Returns:
+        These changes of versions, plugins or processor, such as "jax is 0.9.0 there, 0.9.1 here".
 
     Raises:
         ValueError: if the existing record cannot be read.
@@ -146,21 +149,31 @@ def write_run_record(
         "config_type": _type_name(config),
         "config": config,
     }
+    changes = []
     if resumed and path.is_file():
         try:
             old_record = read_json(path)
-            for key, kept, missing in _KEPT:
-                before = {*old_record.get(kept, []), old_record.get(key) or missing}
-                if earlier := sorted(before - {record[key] or missing}):
-                    record[kept] = earlier
+            before, now = _made_with(old_record), _made_with(record)
+            earlier = {
+                name: sorted({*old_record.get("earlier", {}).get(name, []), before[name]} - {value})
+                for name, value in now.items()
+            }
+            if any(earlier.values()):
+                record["earlier"] = {name: values for name, values in earlier.items() if values}
+            changes = differences(before, now)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path}: not the record of a run ({error}); move it away") from error
     write_json(path, record)
+    return changes
 
 
-def has_other_plugins(folder: str | os.PathLike[str]) -> bool:
-    """Return whether the plugins are not those in the record of the run in `folder`."""
-    try:
-        return read_json(Path(folder) / "run.json")["plugins"] != added_digest()
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
+def _made_with(record: dict[str, Any]) -> dict[str, str]:
+    """Return what affects a training, by its name, from the record of a run."""
+    packages = record.get("packages", {})
+    return {
+        "suite_version": record.get("suite_version") or "unknown",
+        "git_commit": record.get("git_commit") or "unknown",
+        "plugins": record.get("plugins") or "none",
+        "processor": record.get("machine", {}).get("processor") or "unknown",
+        **{name: packages.get(name) or "none" for name in _TRAINED_WITH},
+    }

@@ -6,8 +6,10 @@ earlier call, and from a journal, a file with a line for each finished flight.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from eval.effects.log_faults import apply_log_faults
 from eval.judging.judge import Record
@@ -92,9 +94,9 @@ def collect(
         described = _write_vehicle(collection, trial_set.vehicle, out, console)
         as_flown = None if described is trial_set.vehicle else AS_FLOWN
         rows |= {t: row for t, r in journal.done.items() if (row := _row(out, r)) is not None}
-        _fly_missing(
-            collection, trial_set, policy, content, described, out, rows, journal, console, workers
-        )
+        written = _Logs(out, described, rows, journal, console)
+        load = partial(policy_for_workers, policy, content, manner=manner)
+        _fly_missing(collection, trial_set, load, written, workers)
         flights = [rows[trial] for trial in trial_set.trials]
         made = {"as_flown": as_flown, "flights": flights}
         listing = {**stamp(1, collection.seed), **settings, **made}
@@ -139,42 +141,50 @@ Row = dict[str, Any]
 """A flight in the list: its result, and the name of its log as `file`."""
 
 
+class _Logs(NamedTuple):
+    """What is written of the flights that end."""
+
+    out: Path
+    vehicle: Vehicle
+    """The vehicle of the logs."""
+    rows: dict[TrialSpec, Row]
+    """Rows of the list so far."""
+    journal: Journal
+    console: Console
+
+    def add(self, result: TrialResult, flight: Flight | None) -> None:
+        """Write the log of a flight, its line in the journal and its row."""
+        name = None
+        if flight is not None and result.time_s >= DURATION_MIN:
+            name = _write_log(self.out, result, flight, self.vehicle, self.console)
+        if name is None:  # a log of an earlier collection may have this name
+            _log_path(self.out, result.trial).unlink(missing_ok=True)
+        self.rows[result.trial] = {"file": name, **result._asdict()}
+        self.journal.append(result)
+
+
 def _fly_missing(
     collection: Collection,
     trial_set: TrialSet,
-    policy: Policy,
-    content: PolicyContent,
-    described: Vehicle,
-    out: Path,
-    rows: dict[TrialSpec, Row],
-    journal: Journal,
-    console: Console,
+    load: Callable[[Workers], Policy | Callable[[], Policy]],
+    logs: _Logs,
     workers: Workers | None,
 ) -> None:
-    """Fly the trials that are missing in `rows`; the vehicle `described` is that of the logs.
-
-    When a flight ends, write its log, its line in the journal and its row.
-    """
+    """Fly the trials that are missing in the rows; `load` returns the policy for the workers."""
+    rows, console = logs.rows, logs.console
     missing = [trial for trial in trial_set.trials if trial not in rows]
     workers = workers_for(len(missing), workers, collection.simulator)
     title = f"{len(missing)} flights in {collection.simulator}"
     announce(console, title, flying_estimate(len(missing), workers, collection.simulator))
     show_notes(console, collection.simulator, trial_set)
-    flown = policy_for_workers(policy, content, workers, Manner(speed=collection.speed))
     with console.progress("flights", len(trial_set.trials), begun=len(rows)) as update:
 
         def keep(result: TrialResult, flight: Flight | None) -> None:
-            name = None
-            if flight is not None and result.time_s >= DURATION_MIN:
-                name = _write_log(out, result, flight, described, console)
-            if name is None:  # a log of an earlier collection may have this name
-                _log_path(out, result.trial).unlink(missing_ok=True)
-            rows[result.trial] = {"file": name, **result._asdict()}
-            journal.append(result)
+            logs.add(result, flight)
             update(len(rows), result.ended_by)
 
         if missing:
-            fly_trials(flown, collection, trial_set, workers, missing, keep, Record())
+            fly_trials(load(workers), collection, trial_set, workers, missing, keep, Record())
 
 
 def _row(out: Path, result: TrialResult) -> Row | None:

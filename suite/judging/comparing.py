@@ -7,7 +7,7 @@ that differ only in the seed of their training are compared as a group.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +21,8 @@ from tracks.input.reading import read_json
 
 CONDITIONS = ("simulator", "time_limit_s", "deadline_s")
 """Settings that change the result of a trial, besides the trial itself and the input files."""
+TRACK = "track "
+"""Start of the name of an input that is a track file; its path follows."""
 PACKAGES = ("numpy", "mujoco", "jax", "torch", "onnxruntime")
 """Packages of the judge and of policies, whose versions may change a result."""
 OF_SIMULATOR = {"mjx": ("mujoco-mjx",), "rotorpy": ("rotorpy",)}
@@ -96,6 +98,22 @@ def read_runs(folder: Path) -> list[Run]:
         )
         for name, digest in zip(names, digests, strict=False)
     ]
+
+
+def without_folders(run: Run) -> Run:
+    """Return a run whose tracks from files have the files' names, without their folders.
+
+    The same file may have been given by another path. A trial depends on its name and content only.
+    """
+    tracks = [name.removeprefix(TRACK) for name in run.inputs if name.startswith(TRACK)]
+    short = {track: PurePath(track).name for track in tracks}
+    if len(set(short.values())) < len(short):
+        return run  # two files of one name
+    names = {TRACK + track: TRACK + name for track, name in short.items()}
+    return run._replace(
+        rows={t._replace(track=short.get(t.track, t.track)): row for t, row in run.rows.items()},
+        inputs={names.get(name, name): digest for name, digest in run.inputs.items()},
+    )
 
 
 def refuse_other_conditions(first: Run, other: Run) -> None:

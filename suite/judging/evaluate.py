@@ -25,7 +25,7 @@ from policies.policy import Policy
 from suite.common.console import Console
 from suite.common.provenance import engines, refuse_other_run, write_run_record
 from suite.common.stages import announce, refuse_other_options
-from suite.judging.comparing import paired_sentence
+from suite.judging.comparing import TRACK, paired_sentence
 from suite.judging.content import PolicyContent
 from suite.judging.flying import (
     Manner,
@@ -215,7 +215,7 @@ def file_digests(trial_set: TrialSet) -> dict[str, str]:
     contents: dict[str, object] = {"vehicle": vehicle_table(trial_set.vehicle)}
     if trial_set.sensors.models:
         contents["sensors"] = sensors_table(trial_set.sensors)
-    contents |= {f"track {name}": track for name, track in trial_set.tracks.items()}
+    contents |= {f"{TRACK}{name}": track for name, track in trial_set.tracks.items()}
     return {name: digest_of(content) for name, content in contents.items()}
 
 

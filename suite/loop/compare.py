@@ -142,10 +142,13 @@ def cell_grid(results: Sequence[PolicyResult], labels: Mapping[str, str]) -> Gri
 def difference_cell(interval: Interval | PairedDifference) -> Cell:
     """Return a difference of rates with its sign and interval, in percentage points.
 
-    It is coloured if the interval excludes zero.
+    It is coloured if the interval excludes zero. A narrow interval, and one with an end that would
+    be rounded to zero, has a decimal place.
     """
+    ends = 100 * interval.low, 100 * interval.high
+    digits = int(ends[1] - ends[0] < 3.0 or 0.0 in [round(end, 0) for end in ends])
     # Adding zero turns a rounded -0 into +0.
-    value, low, high = (f"{round(100 * x, 0) + 0.0:+.0f}" for x in interval[:3])
+    value, low, high = (f"{round(100 * x, digits) + 0.0:+.{digits}f}" for x in interval[:3])
     tone = "good" if interval.low > 0 else "bad" if interval.high < 0 else ""
     return Cell(f"{value} [{low}, {high}]", tone)
 

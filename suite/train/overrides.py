@@ -11,12 +11,12 @@ from __future__ import annotations
 import ast
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from suite.train.config import Phase, TrainConfig, check
-from tracks.common.names import unknown_name
+from tracks.common.names import closest, unknown_name
 from tracks.input.ranges import check_ranges, is_finite, shown
 
 T = TypeVar("T")
@@ -70,7 +70,7 @@ def _changed(config: T, changes: Iterable[str]) -> T:
                     f"{option}"
                 )
         _check_model(config, keys, shown(change))
-        config = _with_value(config, keys, text.strip(), shown(change))
+        config = _with_value(config, keys, text.strip(), shown(change), config)
         check_ranges(config, f"--set {shown(change)}: ")
     return config
 
@@ -124,8 +124,18 @@ def check_owned(changes: Iterable[str], owned: Mapping[str, str]) -> None:
                 raise ValueError(f"--set {shown(change)}: this command sets {path}; {advice}")
 
 
-def _with_value(config: T, path: list[str], text: str, change: str) -> T:
-    """Return `config` with the value of the setting at `path` read from `text`.
+def _paths(config: Any, prefix: str = "") -> Iterator[str]:
+    """Yield the paths of all settings in `config`, except those from files."""
+    for field in dataclasses.fields(config):
+        value, path = getattr(config, field.name), f"{prefix}{field.name}"
+        if dataclasses.is_dataclass(value) and path not in FROM_FILES:
+            yield from _paths(value, f"{path}.")
+        else:
+            yield path
+
+
+def _with_value(config: T, path: list[str], text: str, change: str, root: object) -> T:
+    """Return `config`, a part of `root`, with the value of the setting at `path` read from `text`.
 
     `change` is the user's text of the change, for messages.
     """
@@ -134,12 +144,20 @@ def _with_value(config: T, path: list[str], text: str, change: str) -> T:
     name, *rest = path
     names = [field.name for field in dataclasses.fields(config)]
     if name not in names:
+        ends = {path: path.rpartition(".")[2] for path in _paths(root)}
+        leaf = closest(name, ends.values())
+        elsewhere = [path for path, end in ends.items() if end == leaf]
+        if elsewhere and (leaf == name or closest(name, names) is None):
+            raise ValueError(
+                f"--set {change}: setting {shown(name)} is unknown. Did you mean "
+                f"{', '.join(elsewhere)}? suite train --list-settings prints all settings"
+            )
         raise unknown_name(f"--set {change}: setting", name, names)
     old = getattr(config, name)
     if rest and old is None and name in ABSENT:
         raise ValueError(f"--set {change}: this run has no {ABSENT[name]}")
     if rest:
-        return dataclasses.replace(config, **{name: _with_value(old, rest, text, change)})
+        return dataclasses.replace(config, **{name: _with_value(old, rest, text, change, root)})
     if dataclasses.is_dataclass(old):
         parts = ", ".join(field.name for field in dataclasses.fields(old))
         raise ValueError(f"--set {change}: {name!r} has parts, set one of {parts}")
@@ -196,7 +214,7 @@ def rate_loop_warnings(config: TrainConfig) -> list[str]:
     """Return a warning if the rate loop overshoots at every physics step of the training."""
     for quadrotor in (phase.quadrotor for phase in phase_configs(config) if phase.quadrotor):
         controller, hz = quadrotor.vehicle.controller, quadrotor.physics_hz
-        if controller.kind == "p" and max(controller.rate_gain) > hz:
+        if controller.overshoots(1.0 / hz):
             return [
                 f"vehicle {quadrotor.vehicle.name!r}: controller.rate_gain has "
                 f"{max(controller.rate_gain):g} 1/s, too fast for the training's {hz:g} physics "

@@ -29,7 +29,7 @@ from policies.spec import PolicyError, PolicySpec
 from suite.common import curve
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
-from suite.common.provenance import has_other_plugins, refuse_other_run, write_run_record
+from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.running import hosts
 from suite.common.stages import Estimate, announce
 from suite.train.worlds import Worlds, WorldsAhead
@@ -126,12 +126,6 @@ def train_in_folder(
     # The state must be on the device of the update; otherwise the second iteration compiles again.
     state = jax.device_put(hosts.broadcast_from_first(fresh), jax.local_devices()[0])
     done, total = int(state.iteration), phases[-1].end
-    if done and has_other_plugins(folder):
-        console.note(
-            f"warning: {folder} was trained until here with other plugins (packages that add "
-            "effects or sensor models) than those installed now; give another --out to train all "
-            "of it with these"
-        )
     if not hosts.is_writer():
         return Outcome(folder / "policy", int(_iterate(phases, run, state, console).iteration), {})
     if done < total or _is_missing(watch, folder, done, total):
@@ -139,7 +133,13 @@ def train_in_folder(
         seconds = run.estimate.seconds * (total - done) / total
         announce(console, title, replace(run.estimate, seconds=seconds))
         if done < total:
-            write_run_record(folder, run.config, run.config.seed, resumed=done > 0)
+            changes = write_run_record(folder, run.config, run.config.seed, resumed=done > 0)
+            if changes:
+                console.note(
+                    f"warning: {folder} was trained until here with other versions "
+                    f"({first_changes(changes)}), so the result may differ from that of one "
+                    "version; run.json names both; give another --out to train all of it with these"
+                )
         state = _iterate(phases, run, state, console, watch)
     else:
         console.note(

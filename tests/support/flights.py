@@ -15,6 +15,8 @@ from tracks.track import Track
 GRAVITY = np.array([0.0, 0.0, 9.81])
 RATE_HZ = 100.0
 POLICY_EVERY = 3
+WAIT_S = 0.004
+"""Time from a decision to the row that flies its action."""
 
 
 def small_track(gate_count=4, seed=5):
@@ -85,6 +87,7 @@ def smooth_flight(track, speed=4.0, duration_s=None, depth=True):
         policy_step=step,
         gate=passed.astype(np.int32),
         depth_m=frames,
+        depth_time_s=np.maximum(time[step] - WAIT_S, 0) if depth else None,
         about={"track": track.family, "difficulty": track.level, "seed": track.seed},
     )
 

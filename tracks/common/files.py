@@ -265,6 +265,16 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
+def write_files(folder: str | os.PathLike[str], files: Mapping[str, bytes]) -> list[Path]:
+    """Write `files` (name to content) to `folder`, or none of them, and return their paths."""
+    with contextlib.ExitStack() as stack:
+        for name, data in files.items():
+            temporary = stack.enter_context(replacing_file(Path(folder, name)))
+            temporary.write_bytes(data)
+            _sync(temporary)  # a full disk is noticed before the first file gets its name
+    return [Path(folder, name) for name in files]
+
+
 def write_json(path: str | os.PathLike[str], value: Any) -> None:
     """Write `value` to `path` as indented JSON (see `to_json`), completely or not at all."""
     write_text(path, to_json(value, indent=2) + "\n")

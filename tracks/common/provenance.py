@@ -54,8 +54,8 @@ def stamp(schema: int, seed: int | None) -> dict[str, Any]:
 
 
 def stamp_text(header: Mapping[str, Any]) -> str:
-    """Return the keys of `stamp` as one line, for a comment in a text file."""
-    return "; ".join(f"{key}: {value}" for key, value in header.items())
+    """Return the keys of `stamp` that have a value as one line, for a comment in a text file."""
+    return "; ".join(f"{key}: {value}" for key, value in header.items() if value is not None)
 
 
 def differences(stored: Any, new: Any, name: str = "") -> list[str]:

@@ -25,9 +25,9 @@ TORQUE_M = (0.002, 0.1)
 """Plausible ratio of a rotor's torque to its thrust [m]; usual are 0.005 to 0.05."""
 GAIN = 1.0
 """Smallest plausible gain of the nominal rate loop [1/s]."""
-GAIN_LAG = (1.0, 5.0)
-"""Largest plausible gain of the nominal rate loop times its period, and times the time constant of
-the rotors: above, the rates overshoot at every step, or oscillate."""
+GAIN_LAG = 5.0
+"""Largest plausible gain of the nominal rate loop times the time constant of the rotors: above, the
+rates oscillate."""
 GAINS = {
     "betaflight": ("p_roll", "p_pitch"),
     "px4": ("MC_ROLLRATE_P", "MC_PITCHRATE_P"),
@@ -100,10 +100,10 @@ def check_vehicle_numbers(vehicle: Vehicle) -> list[Finding]:
             fix = "PX4's KM is this ratio: torque_coefficient = KM * thrust_coefficient"
         about = ("vehicle_torque", ratio_m, 0.95, fix)
         found.append(Finding("doubt", "vehicle", text + "0.005 to 0.05 m", *about))
-    gains = vehicle.controller.rate_gain
-    lags = 1.0 / vehicle.controller.frequency, vehicle.rotors.time_constant
-    too_fast = any(max(gains) * lag > most for lag, most in zip(lags, GAIN_LAG, strict=True))
-    if vehicle.controller.kind == "p" and (too_fast or not min(gains) >= GAIN):
+    controller, gains = vehicle.controller, vehicle.controller.rate_gain
+    too_fast = max(gains) * vehicle.rotors.time_constant > GAIN_LAG
+    too_fast = too_fast or controller.overshoots(1.0 / controller.frequency)
+    if controller.kind == "p" and (too_fast or not min(gains) >= GAIN):
         gain = max(gains) if too_fast else min(gains)
         text = f"controller.rate_gain has {gain:.3g} 1/s; usual are 5 to 40 1/s"
         fix = (

@@ -210,7 +210,10 @@ def training_origin(folder: Path) -> tuple[str, str]:
     """
     try:
         record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-        commits = [*record.get("earlier_commits", []), record["git_commit"] or "unknown"]
+        commits = [
+            *record.get("earlier", {}).get("git_commit", []),
+            record["git_commit"] or "unknown",
+        ]
         cores, processor = record["machine"]["cores"], record["machine"]["processor"]
         return ", ".join(commits), f"{processor}, cores: {cores}"
     except (OSError, ValueError, KeyError):

@@ -56,11 +56,11 @@ def export(
     if dtype == "int8":
         console.note("flying 10 random tracks to measure the activations")
         observed = observed_flights(native_policy(checkpoint.params, checkpoint.spec, name))
-    if "c" in formats:  # if the comparison fails, no card of an earlier export may stay
-        (out / CARD).unlink(missing_ok=True)
     written = export_policy(policy, out, formats, dtype, observed)
     if "c" not in formats:
         return {"written": written}
+    # If the comparison fails, no card of an earlier export may stay.
+    (out / CARD).unlink(missing_ok=True)
     result = parity(out, checkpoint, observed)
     console.say(result.sentence)
     write_text(out / CARD, card_text(policy, name, checkpoint, dtype, result))

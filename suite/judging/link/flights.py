@@ -171,6 +171,7 @@ def write_log(
         policy_step=np.array([row.decided for row in rows]),
         gate=np.array([row.gate for row in rows], np.int32),
         depth_m=None,
+        depth_time_s=None,
         about={**about, "events": companion.events, "handed_over": companion.over},
         action_kind=companion.action_kind,
     )

@@ -326,8 +326,9 @@ class ImageAssembler:
             if (height, width) != self._shape:
                 self.other_size = (width, height)
             return None
-        # A repeated number is from the next image, whose announcement was lost.
-        if packet.number in self._received:
+        # A received number with other bytes is of the next image, whose announcement was lost; with
+        # the same bytes the network has doubled the packet.
+        if self._received.get(packet.number, packet.data) != packet.data:
             self._received, self._expected = {}, 0
         if packet.number >= self._expected:
             return None

@@ -59,11 +59,15 @@ def test_tracks_with_meshes_are_flown_beside_others(root):
 @pytest.mark.parametrize("rate_hz", [7.0, more(30.0), more(100.0), 500.0])
 def test_decisions_come_at_the_policys_rate(rate_hz):
     policy, end_s = Steady(spec=PolicySpec(rate_hz=rate_hz)), 1.0 if rate_hz < 100 else 0.3
-    how = {"record": Record(), "rules": Rules(time_limit_s=end_s)}
+    how = {"record": Record(depth=True), "rules": Rules(time_limit_s=end_s)}
     _, (flight,) = fly_on(policy, straight(), vehicle=VEHICLE, **how)
     # A decision shows in the first row that flies it; rows are 100 a second.
     expected = {round(k * 500 / rate_hz) for k in range(int(rate_hz) + 1)}
-    rows = {-(-step // 5) for step in expected if step < 500 * end_s}
+    expected = {step for step in expected if step < 500 * end_s}
+    # An image has the time of its decision, even between rows or twice in a row.
+    np.testing.assert_allclose(flight.depth_time_s, np.sort(list(expected)) / 500)
+    assert len(flight.depth_m) == len(expected)
+    rows = {-(-step // 5) for step in expected}
     found = {round(t * 100) for t in flight.time_s[flight.policy_step]}
     assert found | {100 * end_s} == rows | {100 * end_s}
 
@@ -174,7 +178,7 @@ def test_slots_and_fields_do_not_mix_and_a_decision_is_flagged_once():
     recorder = Recorder(2, True, np.zeros(3), "acceleration")
     action_b, depth_m = np.arange(6.0).reshape(2, 3), np.arange(8.0).reshape(2, 2, 2)
     recorder.add(rows([True, True], [0.0, 0.5]))
-    recorder.decided(np.array([1]), action_b, depth_m)
+    recorder.decided(np.array([1]), np.array([0.1, 0.58]), action_b, depth_m)
     recorder.add(rows([False, True], [0.1, 0.6]))
     recorder.add(rows([True, True], [0.2, 0.7]))
     first, second = recorder.finish(0, {"seed": 3}), recorder.finish(1, {"seed": 4})
@@ -190,11 +194,12 @@ def test_slots_and_fields_do_not_mix_and_a_decision_is_flagged_once():
     np.testing.assert_array_equal(second.action_b, [0 * action_b[1], action_b[1], action_b[1]])
     assert second.depth_m.dtype == np.float32 and len(first.depth_m) == 0
     np.testing.assert_array_equal(second.depth_m, depth_m[1:])
+    assert (second.depth_time_s, len(first.depth_time_s)) == ([0.58], 0)
 
 
 def test_the_next_trial_of_a_slot_begins_with_nothing():
     recorder = Recorder(2, False, np.zeros(3), "acceleration")
-    recorder.decided(np.array([0]), np.ones((2, 3)), np.zeros((2, 2, 2)))
+    recorder.decided(np.array([0]), np.zeros(2), np.ones((2, 3)), np.zeros((2, 2, 2)))
     recorder.add(rows([True, True], [0.0, 0.0]))
     recorder.start(0)
     empty = recorder.finish(0, {})
@@ -224,7 +229,7 @@ def check_flight(flight, result):
     assert flight.time_s[-1] == pytest.approx(result.time_s)
     assert np.array_equal(flight.pos_w[-1], [result.pos_x, result.pos_y, result.pos_z])
     assert (flight.gate[-1], flight.about["ended_by"]) == (result.gates_passed, result.ended_by)
-    assert {len(part) for part in flight[:-3]} == {rows}
+    assert {len(part) for part in flight[:-4]} == {rows}
     # 30 decisions a second, the first at once; each has its image.
     assert flight.policy_step[0] and flight.policy_step.sum() == len(flight.depth_m)
     assert abs(flight.policy_step.sum() - 30 * result.time_s) <= 1.5

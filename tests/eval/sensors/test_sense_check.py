@@ -76,6 +76,7 @@ def test_a_model_may_be_checked_while_jax_traces_a_function():
         ({"stage": "states"}, "stage is 'states'"),
         ({"sense": None}, "without a function"),
         ({"parameters": (SIZE._replace(low=0.1),)}, "from 0.1 to 1 and neutral at 0"),
+        ({"parameters": (SIZE._replace(high=np.inf),)}, "from 0 to inf .*all finite"),
         ({"sense": changed(pos_w=lambda v, s: s.pos_w[0])}, r"pos_w of shape \(3,\)"),
         ({"sense": changed(depth_m=lambda v, s: s.depth_m * np.nan)}, "depth_m that is not finite"),
         ({"sense": changed(vel_w=lambda v, s: np.abs(s.vel_w))}, "TracerArrayConversion"),

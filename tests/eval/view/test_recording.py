@@ -5,6 +5,7 @@ import pytest
 import rerun.chunk
 
 from eval.view import colours
+from eval.view.blueprint import Tab, trial_view
 from eval.view.comparison import ComparedFlight, Simulation, States, write_comparison
 from eval.view.recording import write_recording
 from tests.support.flights import rollout
@@ -68,7 +69,7 @@ def test_a_recording_has_the_depth_images_in_metres_at_the_policys_rate(recorded
     _, flight, _ = rollout()
     entity = "/trial_0/world/drone/camera/depth"
     times, buffers = found[entity, "DepthImage:buffer"]
-    np.testing.assert_array_equal(times, nanoseconds(flight.time_s[flight.policy_step]))
+    np.testing.assert_array_equal(times, nanoseconds(flight.depth_time_s))
     images = np.array(buffers, dtype=np.uint8).reshape(len(times), -1).view(np.float32)
     assert flight.depth_m is not None
     np.testing.assert_array_equal(images.reshape(-1, 24, 32), flight.depth_m)
@@ -196,6 +197,34 @@ def test_what_is_missing_is_left_out(tmp_path):
     values = np.array(found["/flight_0/error_position/as\\ given", "Scalars:scalars"][1])[:, 0]
     assert len(values) == 201 and np.isnan(values[100])
     np.testing.assert_allclose(values[[0, 99, 101, 200]], [0.1, 0.1, 0.2, 0.2])
+
+
+def test_what_was_not_logged_has_no_panel(tmp_path):
+    def panels(number):
+        """Return the origins of the plots of a flight that lacks the velocity from `number` on."""
+        lost = flight(simulations=1)
+        for states in [lost.measured, *lost.simulations[0].rollouts][number:]:
+            states.vel_w[:] = np.nan
+        for error in lost.simulations[0].errors:
+            error[:, 1] = np.nan
+        path = write_comparison(tmp_path / "lost.rrd", [lost])
+        (blueprint,) = rerun.chunk.RrdReader(path).blueprints()
+        found = columns(path, blueprint).items()
+        origins = [v[0][0] for (_, n), (_, v) in found if n == "ViewBlueprint:space_origin"]
+        return {origin.removeprefix("/flight_0/") for origin in origins} - {"world"}
+
+    of_rates = {"rates_x", "rates_y", "rates_z"}
+    assert panels(0) == {"error_position", "error_attitude", "error_rates", *of_rates}
+    assert panels(1) - panels(0) == {"velocity_x", "velocity_y", "velocity_z"}
+
+
+def test_a_policy_of_motor_commands_has_no_plot_of_thrust_commands():
+    def has_thrust(kind):
+        tab = Tab("/trial_0", "title", False, np.zeros(3), np.ones(3), kind)
+        others = next(part for part in trial_view(tab).contents[1].contents if part.name is None)
+        return "thrust command [m/s²]" in [view.name for view in others.contents]
+
+    assert has_thrust("ctbr") and not has_thrust("motors")
 
 
 def test_the_playback_begins_in_the_recorded_part_of_a_flight(tmp_path):

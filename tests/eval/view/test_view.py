@@ -2,6 +2,7 @@
 
 import subprocess
 from dataclasses import replace
+from itertools import islice
 
 import imageio_ffmpeg
 import numpy as np
@@ -197,6 +198,10 @@ def test_the_video_shows_drone_depth_and_gates():
     assert flight.depth_m is not None
     want = colours.depth_colours(flight.depth_m[0], DEPTH_RANGE_M)
     np.testing.assert_array_equal(seen[2::5, 2::5], want)
+    # A frame between the second decision and the next row shows the second image.
+    _, frame = islice(video_frames(track, flight, result, VideoOptions((480, 270), 36)), 2)
+    want = colours.depth_colours(flight.depth_m[1], DEPTH_RANGE_M)
+    np.testing.assert_array_equal(np.asarray(frame)[77:195:5, 322:480:5], want)
     without = next(video_frames(*rollout("finished", None, False), VideoOptions((480, 270), 5)))
     assert share(without.crop((320, 0, 480, 270)), colours.DRONE, 2) < 0.01  # the scene goes on
 

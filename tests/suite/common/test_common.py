@@ -272,7 +272,8 @@ def test_a_run_that_goes_on_keeps_the_commits_that_made_it(tmp_path, monkeypatch
             "suite.common.provenance.stamp", lambda c=commit, **_: {"git_commit": c}
         )
         write_run_record(tmp_path, Estimate(1.0, 2.0), seed=3, resumed=True)
-    assert json.loads((tmp_path / "run.json").read_text())["earlier_commits"] == ["aaa"]
+    record = json.loads((tmp_path / "run.json").read_text())
+    assert record["earlier"] == {"git_commit": ["aaa"]}
     commits, machine_text = training_origin(tmp_path)
     assert commits == "aaa, bbb" and machine_text.endswith(f", cores: {usable_cores()}")
     write_run_record(tmp_path, Estimate(1.0, 2.0), seed=3)

@@ -78,6 +78,8 @@ def test_a_page_whose_text_would_be_lost_is_refused(lost, words, tmp_path):
 def test_differences_are_coloured_by_what_they_tell():
     assert difference_cell(Interval(0.1, 0.02, 0.2)) == Cell("+10 [+2, +20]", "good")
     assert difference_cell(Interval(-0.1, -0.2, -0.02)).tone == "bad"
+    assert difference_cell(Interval(0.004, 0.001, 0.009)) == Cell("+0.4 [+0.1, +0.9]", "good")
+    assert difference_cell(Interval(0.04, 0.002, 0.08)).text == "+4.0 [+0.2, +8.0]"
     assert difference_cell(Interval(-0.001, -0.1, 0.1)) == Cell("+0 [-10, +10]", "")
 
 

@@ -62,8 +62,18 @@ def test_the_interval_of_a_small_layout_is_that_of_its_mean_squares_and_one_seed
             over_seeds(*values)
 
 
-def run_of(folder, successes, judged=None, policy="ours", weights=None, settings=None, **digests):
+def run_of(
+    folder,
+    successes,
+    judged=None,
+    policy="ours",
+    weights=None,
+    settings=None,
+    track=None,
+    **digests,
+):
     rows = [result(seed, bool(success), policy) for seed, success in enumerate(successes)]
+    rows = [row._replace(track=track or row.track) for row in rows]
     summary = {"judged": judged or Evaluation(), "sha256": {"vehicle": "a", **digests}}
     summary["policies"] = [{"sha256": weights or str(folder), "settings_sha256": settings}]
     write_results(folder, rows, table_markdown="", summary=summary, seed=0)
@@ -100,6 +110,17 @@ def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path, capsys):
     ):
         with pytest.raises(ValueError, match=said):
             compare.run(compare.Config((a, folder) if folder else (a,)), Quiet())
+
+
+def test_a_track_file_is_one_track_by_any_path_to_it(tmp_path):
+    def judged(folder, track, digest="c"):
+        return run_of(tmp_path / folder, [True, False], track=track, **{f"track {track}": digest})
+
+    a, b = judged("a", "tracks/my.toml"), judged("b", "/home/me/my.toml")
+    (found,) = compare.run(compare.Config((a, b)), Quiet())["comparisons"]
+    assert found["trials"] == 2
+    with pytest.raises(ValueError, match="different conditions: track my.toml;"):
+        compare.run(compare.Config((a, judged("c", "my.toml", "d"))), Quiet())
 
 
 def test_a_summary_that_is_none_and_a_trial_that_is_there_twice_are_refused(tmp_path):

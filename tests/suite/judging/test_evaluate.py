@@ -362,6 +362,11 @@ def test_options_that_do_not_fit_and_what_is_no_finished_run_are_refused(tmp_pat
     (tmp_path / "begun").mkdir()
     (tmp_path / "begun" / "journal-0.jsonl").write_text("{}\n")
     assert "not finished; repeat its command" in refused(capsys, "view", tmp_path / "begun")
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "zigzag-0-3.parquet").touch()
+    for given in (tmp_path / "logs", tmp_path / "logs" / "zigzag-0-3.parquet"):
+        said = refused(capsys, "view", given)
+        assert "zigzag-0-3.parquet is a flight log" in said and "give the policy" in said
     (tmp_path / "trials.parquet").write_text("no parquet")
     assert "run.json" in refused(capsys, "view", tmp_path)
 

@@ -95,6 +95,8 @@ def test_settings_that_would_do_nothing_or_that_the_command_sets_itself_are_refu
     ("change", "words"),
     [
         ("loss.progres=1", "Did you mean 'progress'"),
+        ("progress=2", "setting 'progress' is unknown. Did you mean loss.progress"),
+        ("loss.rate_hz=20", "setting 'rate_hz' is unknown. Did you mean spec.rate_hz"),
         ("loss=1", "has parts, set one of clearance"),
         ("loss.progress.more=1", "'more' is below a setting that has no parts"),
         ("quadrotor.mass_std=0.1", "this run has no quadrotor; take a recipe"),

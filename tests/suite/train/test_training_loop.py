@@ -1,6 +1,7 @@
 """A method that only counts, iterated in a folder: what is measured, resumed and refused."""
 
 import json
+import re
 import shutil
 from contextlib import nullcontext
 from dataclasses import replace
@@ -163,18 +164,25 @@ def test_a_run_that_goes_on_says_from_where_and_how_long(tmp_path, capsys):
     assert "from step 6 of 8 on" in capsys.readouterr().err
 
 
-def test_other_plugins_than_at_the_start_give_a_warning_and_a_record(tmp_path, monkeypatch, capfd):
-    def with_plugins(digest, stop=None):
+def test_other_versions_than_at_the_start_give_a_warning_and_a_record(tmp_path, monkeypatch, capfd):
+    def with_versions(digest, jax_version, stop=None):
+        versions = {**provenance.package_versions(), "jax": jax_version}
         monkeypatch.setattr(provenance, "added_digest", lambda: digest)
+        monkeypatch.setattr(provenance, "package_versions", lambda: versions)
         with pytest.raises(KeyboardInterrupt) if stop else nullcontext():
             train(tmp_path, counting(stop=stop))
         record = json.loads((tmp_path / "run.json").read_text())
-        return "with other plugins (" in capfd.readouterr().err, record.get("earlier_plugins")
+        found = re.search(r"with other versions \((.*?)\), so", capfd.readouterr().err)
+        return found and found[1], record.get("earlier")
 
-    assert with_plugins("a", stop=3) == with_plugins("a", stop=6) == (False, None)
-    assert with_plugins("b", stop=8) == (True, ["a"])
-    assert with_plugins("b") == (False, ["a"])
-    assert with_plugins(None) == (True, ["a"]), "nothing is trained, with other plugins"
+    assert with_versions("a", "1", stop=2) == with_versions("a", "1", stop=4) == (None, None)
+    assert with_versions("b", "1", stop=6) == (
+        "plugins is 'a' there, 'b' here",
+        {"plugins": ["a"]},
+    )
+    both = {"plugins": ["a"], "jax": ["1"]}
+    assert with_versions("b", "2", stop=8) == ("jax is '1' there, '2' here", both)
+    assert with_versions("b", "2") == (None, both)
 
 
 def test_a_folder_of_another_run_is_refused_by_what_differs(tmp_path):

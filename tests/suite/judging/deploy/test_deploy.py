@@ -1,9 +1,12 @@
 """Exports in C with their cards: what is written, how near it is, and how it is timed."""
 
+import errno
 import json
+import os
 import re
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -55,6 +58,28 @@ def test_a_card_of_an_earlier_export_does_not_stay(folder, tmp_path, monkeypatch
     assert run(command, folder) == 0 and (tmp_path / exporting.CARD).exists()
     monkeypatch.setenv("CC", "gcc '")
     assert run(command, folder) == 2 and not (tmp_path / exporting.CARD).exists()
+
+
+def test_of_an_export_to_a_full_disk_nothing_stays(folder, tmp_path, monkeypatch, capsys):
+    command = f"export --format onnx c --out {tmp_path} --policy {folder}"
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert run(command) == 0
+    for path in tmp_path.iterdir():
+        if path.name != exporting.NOTE:
+            path.write_text("earlier")
+    write, written = Path.write_bytes, []
+
+    def fill(path, data):
+        written.append(path.name)
+        if path.name == "vectors.h":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", fill)
+    assert run(command) == 1 and len(written) > 2
+    assert f"the disk is full: {tmp_path}/vectors.h" in capsys.readouterr().err
+    files = [path for path in tmp_path.iterdir() if path.name != exporting.NOTE]
+    assert len(files) == 7 and {path.read_text() for path in files} == {"earlier"}
 
 
 @needs_cc

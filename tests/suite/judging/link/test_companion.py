@@ -262,6 +262,30 @@ def test_another_system_and_an_old_state_are_not_listened_to(bench):
     assert one.tell(one.state(time_s=one.now - 0.04)) == [] and one.companion.flying
 
 
+@pytest.mark.parametrize("late", [0, 2])
+def test_a_network_that_doubles_or_reorders_packets_changes_nothing(bench, late):
+    def doubled(datagrams):
+        """Each datagram comes twice, the second time after `late` others."""
+        first, second = ([(k + by, data) for k, data in enumerate(datagrams)] for by in (0, late))
+        return [data for _, data in sorted([*first, *second], key=lambda entry: entry[0])]
+
+    def flown(change):
+        one = bench()
+        receive = one.companion.receive
+        one.companion.receive = lambda datagrams: receive(change(datagrams))
+        one.image[:] = np.random.default_rng(0).uniform(1.0, 9.0, one.image.shape)
+        one.show()
+        for _ in range(3):
+            old, new = one.state(time_s=one.now - 0.01), one.state()
+            one.companion.receive([one.wire.encode(new), one.wire.encode(old)])
+            one.now += 0.02
+        return [(row.state.time_s, *row.rate_b, row.thrust) for row in one.companion.rows]
+
+    rows = flown(lambda datagrams: datagrams)
+    assert len(rows) == 3 and flown(doubled) == rows
+    assert flown(lambda datagrams: [*datagrams[:1], *datagrams[:0:-1]]) == rows
+
+
 def test_a_state_that_is_sent_again_and_again_hands_over_as_silence_does(bench):
     """The clock check alone would take 0.2 s, or as long as its limit allows."""
     one = bench(limits=Limits(clock_jump_s=100.0)).fly()
