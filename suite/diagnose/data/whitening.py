@@ -28,8 +28,8 @@ class Whitening(NamedTuple):
     weight: np.ndarray
     """(W, N, 19) 1 / noise; 0 where nothing was measured."""
     prior: np.ndarray
-    """(F + E - 12,) 1 / standard deviation of each error of a rotor speed or the input; as many last
-    rows hold it."""
+    """(F + E - 12,) 1 / standard deviation of the errors of rotor speeds and input, which the last
+    rows hold."""
     start: np.ndarray
     """(W, M, F + E) orthonormal basis of the changes of the rows by start numbers and errors."""
     upper: np.ndarray

@@ -192,7 +192,11 @@ def relevant_part(
             name
             for name, (_, upper) in ranges.items()
             if not source.names_small
-            and ((all_are_small and not EFFECTS[name].of_log) or not upper.relevant(source.limits))
+            and (
+                (all_are_small and not EFFECTS[name].of_log)
+                or not upper.relevant(source.limits)
+                or not any(upper)  # also where every size counts as relevant
+            )
         ]
         if not too_small:
             return found, after, sizes, left_out

@@ -75,9 +75,7 @@ def push_slopes(model: RolloutModel, linear: Linearisation) -> np.ndarray:
     return slope.reshape(*slope.shape[:3], KNOTS, 6)[..., 2:]
 
 
-def with_input_error(
-    windows: FlightWindows, push: np.ndarray, error: np.ndarray
-) -> FlightWindows:
+def with_input_error(windows: FlightWindows, push: np.ndarray, error: np.ndarray) -> FlightWindows:
     """Return `windows` whose commands have the `error` (W, 4) or (4,); for `push` see above."""
     columns = push * np.broadcast_to(error, (len(push), 4))[:, None, None, None]
     return windows._replace(input_error=columns.reshape(*push.shape[:3], -1))
@@ -86,7 +84,7 @@ def with_input_error(
 def unknown_commands(
     linear: Linearisation, push: np.ndarray, difference: np.ndarray, limits: Thresholds
 ) -> tuple[np.ndarray, Thresholds]:
-    """Return the error (W, 4) of thrust and torque by unknown commands, and limits with their noise.
+    """Return the error (W, 4) of thrust and torque by unknown commands, and limits with its noise.
 
     Held commands change the residuals by the `difference` (W, N, 19). For `push` see
     `push_slopes`.

@@ -107,8 +107,9 @@ class RolloutSource(Source):
     between: bool = False
     """Whether the mean of two commands acts between them, since the log lacks commands."""
     coarser: FlightWindows | None = None
-    """The fitted windows, but with every second rotor speed only, or with held commands if the log
-    lacks commands; None if neither matters. The difference in the result shows how much."""
+    """The fitted windows, but with every second rotor speed only, or with the other course of
+    commands (held, or means half-way) if the log may lack commands; None if neither matters. The
+    difference in the result shows how much."""
     coarser_share: float = 0.5
     """Share of an effect's change under `coarser` that counts as the model's numerical error."""
 
@@ -157,7 +158,7 @@ class RolloutSource(Source):
         rotor speed only. Half of the change counts as the error; for an error of second order it
         would be a third (step doubling; Hairer, Norsett & Wanner 1993, Sec. II.4). Rows further
         apart than the rotors' lag show the torque only to a factor of two, so twice the change
-        counts (`coarser_share`). If the log lacks commands, the whole change counts.
+        counts (`coarser_share`). If the log may lack commands, the whole change counts.
         """
         model, estimate, indices = self.model, found.estimate, found.indices
         windows = of_rollouts(found.last).trusted

@@ -212,10 +212,9 @@ class EffectSize(NamedTuple):
     """Change of the position after a second [m]; None where no rollout was simulated."""
 
     def relevant(self, limits: Thresholds) -> bool:
-        """Return whether the size is more than nothing, and reaches a threshold of relevance."""
-        sizes = (size or 0.0 for size in self)
-        pairs = zip(sizes, limits.relevance, strict=True)
-        return any(size >= limit and size > 0.0 for size, limit in pairs)
+        """Return whether the size reaches one of the thresholds of relevance."""
+        force, torque, drift = limits.relevance
+        return self.force >= force or self.torque >= torque or (self.drift or 0.0) >= drift
 
     def words(self) -> str:
         """Return the size as text for people."""

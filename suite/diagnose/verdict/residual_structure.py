@@ -100,8 +100,8 @@ def beyond_model_error(
 ) -> ResidualStructure:
     """Return `structure` without the shapes that the model's own error may explain.
 
-    `coarse` has fewer rotor speeds or commands as input, and thus more of the error. The `share` of
-    the change of a shape's coefficients counts as the error.
+    `coarse` has coarser inputs, see `RolloutSource.coarser`. The `share` of the change of a shape's
+    coefficients counts as the error.
     """
 
     def error_of(columns: Sequence[int], value: np.ndarray) -> np.ndarray:

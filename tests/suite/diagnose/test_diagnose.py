@@ -24,7 +24,7 @@ from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.rollouts import is_hopeless, rollouts_along
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.page import page
-from suite.diagnose.sources import rollout_source, rollouts
+from suite.diagnose.sources import rollout_source, rollouts, stretches
 from suite.diagnose.sources.source import DiagnosisInput
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tests.support import diagnosis_flights
@@ -283,11 +283,12 @@ def test_without_noise_the_models_own_error_is_no_finding(vehicle, drive):
     assert (found["verdict"], found["effects"]) == ("no_gap", [])
 
 
-def slow_and_complete(monkeypatch, **options):
+def slow_and_complete(monkeypatch, vehicle=LAGGED, **options):
     """Return flights with every second of their commands, and flights as slow with all."""
-    sparse = [rows(log, slice(0, None, 2)) for log in flights(LAGGED, noise=0.1, **options)]
-    monkeypatch.setattr(diagnosis_flights, "ROW_HZ", 50.0)
-    return sparse, flights(LAGGED, noise=0.1, **options)
+    sparse = [rows(log, slice(0, None, 2)) for log in flights(vehicle, noise=0.1, **options)]
+    with monkeypatch.context() as patch:
+        patch.setattr(diagnosis_flights, "ROW_HZ", 50.0)
+        return sparse, flights(vehicle, noise=0.1, **options)
 
 
 @pytest.mark.slow
@@ -300,7 +301,7 @@ def test_commands_between_the_rows_of_a_log_are_no_effect(monkeypatch):
     for logs, lacks in pairs:
         found = diagnose(logs, LAGGED, drive="commands")
         assert (found.verdict.label, found.named) == ("no_gap", [])
-        assert (rollouts.LACKING in found.warnings) == lacks
+        assert (stretches.LACKING in found.warnings) == lacks
     assert uncertain == [True, False], "the noise counts as certain only if no command is lacking"
 
 
@@ -312,15 +313,18 @@ def test_the_noise_counts_as_certain_only_if_no_command_is_lacking(monkeypatch):
     def source_of(logs):
         given = DiagnosisInput(logs, LAGGED, (), "commands", "auto", say, limits, True)
         made = rollouts.by_rollouts(given)
-        return made.sources[0], rollouts.LACKING in made.warnings
+        return made.sources[0], stretches.LACKING in made.warnings
 
-    sparse, complete = slow_and_complete(monkeypatch, count=2, duration_s=3.0)
+    sparse, complete = slow_and_complete(monkeypatch, count=2, duration_s=6.0)
     source, lacks = source_of(sparse)
     assert lacks and source.coarser is not None and source.coarser_share == 1.0
     assert sum(source.limits.least_noise) > sum(limits.least_noise)
-    assert (source.held.push_error > 0.0).all() and source.between
+    assert source.held.input_error.any(axis=(1, 2)).all() and source.between
     source, lacks = source_of(complete)
     assert not lacks and source.coarser is None and source.limits == limits
+    shifted = with_effects(LAGGED, clock_offset=(-0.004,))
+    sparse, complete = slow_and_complete(monkeypatch, shifted, count=2, duration_s=6.0)
+    assert source_of(sparse)[1] and not source_of(complete)[1]
 
 
 @pytest.mark.extended
@@ -328,7 +332,7 @@ def test_an_effect_at_the_threshold_of_relevance_is_named_without_half_of_the_co
     true = with_effects(LAGGED, linear_drag=((0.02, 0.02, 0.02),))
     logs = flights(true, count=3, duration_s=6.0, noise=0.1)
     found = diagnose([rows(log, slice(0, None, 2)) for log in logs], LAGGED, drive="commands")
-    assert rollouts.LACKING in found.warnings
+    assert stretches.LACKING in found.warnings
     assert [one.candidate.name for _, one in found.named] == ["linear_drag"]
     ((effect, size),) = found.main.sizes.items()
     assert effect == "linear_drag" and size.force < 2.0 * THRESHOLDS.relevance[0]

@@ -66,7 +66,7 @@ def test_an_error_is_read_where_its_signal_was_measured():
     windows = SimpleNamespace(
         row_s=np.tile(time_s, (count, 1)), valid=valid, flight=np.zeros(count, int),
         start_s=0.25 * np.arange(count), start_rotor_error=np.full(count, 1e-3),
-        rotor_valid=np.zeros((count, rows, 4), bool),
+        rotor_valid=np.zeros((count, rows, 4), bool), input_error=None,
     )  # fmt: skip
     sigma = np.where(np.arange(CHANNELS) < STATE, 0.01, np.nan)
     slope = np.zeros((*valid.shape, 16))

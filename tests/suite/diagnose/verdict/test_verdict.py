@@ -330,6 +330,23 @@ def test_effects_that_cancel_each_other_are_no_names(found_drag):
     assert found.named and kept is after and sizes == {"linear_drag": large} and out == []
 
 
+def test_an_effect_that_the_models_error_may_explain_is_no_name_even_if_every_size_counts(
+    found_drag,
+):
+    size, nothing = gaps.EffectSize(1.0, 0.0, 0.0), gaps.EffectSize(0.0, 0.0, 0.0)
+    every = Thresholds(relevance=(0.0, 0.0, 0.0))
+
+    def named(upper):
+        source: Any = SimpleNamespace(
+            sizes=lambda _: {"linear_drag": (size, upper)}, names_small=False, limits=every
+        )
+        return relevant_part(source, found_drag.search, (found_drag.before, found_drag.after))[
+            0
+        ].named
+
+    assert named(size) and not named(nothing)
+
+
 @pytest.mark.extended
 def test_an_error_that_is_small_enough_is_not_structure(found_drag):
     bare, both = found_drag.search.refitted(()), (found_drag.before, found_drag.before)
