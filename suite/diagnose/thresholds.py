@@ -71,7 +71,7 @@ class Thresholds:
     command_spacing_s: float = 0.012
     """Rows of commands further apart than this may lack commands in between [s]. Controllers give
     commands at 100 Hz or more."""
-    lacking_share: float = 0.1
+    lacking_share: float = 0.05
     """Share above which commands are lacking (lower end of its interval): 0 if each logged command
     acts until the next, 1 if others act half-way."""
     held_share: float = 0.4

@@ -43,7 +43,7 @@ def with_model_error(
 def share_between(
     linear: Linearisation, difference: np.ndarray, limits: Thresholds
 ) -> tuple[float, float]:
-    """Return the interval (three standard errors) of the share of commands between the rows.
+    """Return the ends (three standard errors) of the share of commands between the rows.
 
     The share is 0 if each command holds until the next row, and 1 if the mean of two commands acts
     half-way, as it does on average if the drone received others in between. This changes the
@@ -61,10 +61,14 @@ def share_between(
     rows = rows.reshape(-1, rows.shape[-1])
     rows = rows[:, np.r_[True, True, (rows[:, 2:] ** 2).sum(axis=0) > 0.0]]
     size = np.linalg.norm(rows[:, 1:], axis=0)
-    gram = rows[:, 1:].T @ rows[:, 1:] / np.outer(size, size)
-    inverse = np.linalg.pinv(gram, rcond=1e-9, hermitian=True)
-    share = inverse[0] @ (rows[:, 1:].T @ rows[:, 0] / size) / size[0]
-    half_width = 3.0 * np.sqrt(inverse[0, 0]) / size[0]
+    slope, residual = rows[:, 1:] / size, rows[:, 0]
+    inverse = np.linalg.pinv(slope.T @ slope, rcond=1e-9, hermitian=True)
+    best = inverse @ (slope.T @ residual)
+    # What remains may be more than noise.
+    freedom = int(np.asarray(linear.windows.valid).sum()) - linear.offset.size - len(best)
+    chi2 = float(((residual - slope @ best) ** 2).sum())
+    scale = np.sqrt(max(chi2 / max(freedom, 1), 1.0))
+    share, half_width = best[0] / size[0], 3.0 * scale * np.sqrt(inverse[0, 0]) / size[0]
     return float(share - half_width), float(share + half_width)
 
 
