@@ -1,0 +1,85 @@
+"""Errors of rollouts by commands that a log lacks, on made linearisations."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from suite.diagnose.data.noise import Linearisation
+from suite.diagnose.data.windows import CHANNELS, KNOTS, STATE
+from suite.diagnose.sources.input_error import (
+    WIDE,
+    share_between,
+    unknown_commands,
+    with_input_error,
+)
+from suite.diagnose.thresholds import THRESHOLDS
+
+WINDOWS, ROWS, STARTS = 12, 40, STATE + 4
+NOISE = 0.1
+
+
+class Windows(SimpleNamespace):
+    def _replace(self, **fields):
+        return Windows(**{**vars(self), **fields})
+
+
+def linearisation(rng, parameters):
+    """Return a linearisation whose residual is noise, with random slopes."""
+    shape = (WINDOWS, ROWS, CHANNELS)
+    windows = Windows(
+        row_s=np.tile(np.linspace(0.0, 1.0, ROWS), (WINDOWS, 1)), valid=np.ones(shape, bool),
+        flight=np.zeros(WINDOWS, int), start_s=np.arange(WINDOWS, dtype=float),
+        start_rotor_error=np.ones(WINDOWS), rotor_valid=np.ones((*shape[:2], 4), bool),
+        input_error=None,
+    )  # fmt: skip
+    slope = rng.standard_normal((*shape, parameters + STARTS))
+    residual = NOISE * rng.standard_normal(shape)
+    return Linearisation(residual, slope, np.zeros((WINDOWS, STARTS)), windows)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_the_share_of_commands_between_rows_is_fitted_next_to_effects_that_resemble_it(share):
+    covered = []
+    for seed in range(20):
+        rng = np.random.default_rng([4, seed])
+        linear = linearisation(rng, parameters=3)
+        # The first parameter acts like the commands in between, apart from 0.3 of it.
+        difference = -0.1 * (
+            linear.slope[..., 0] + 0.3 * rng.standard_normal(linear.residual.shape)
+        )
+        effect = 0.05 * linear.slope[..., 0]
+        residual = linear.residual - share * difference + effect
+        low, high = share_between(linear._replace(residual=residual), difference, THRESHOLDS)
+        assert 0.0 < high - low < 1.0
+        covered.append(low < share < high)
+    assert sum(covered) >= 19
+
+
+def test_a_misfit_widens_the_interval_of_the_share():
+    rng = np.random.default_rng(5)
+    linear = linearisation(rng, parameters=2)
+    linear.slope[..., -STARTS:] = 0.0  # start numbers explain nothing
+    difference = 0.1 * rng.standard_normal(linear.residual.shape)
+    time_s = linear.windows.row_s[..., None]
+    drift = linear._replace(residual=linear.residual + 5.0 * time_s**2)
+    widths = [np.diff(share_between(one, difference, THRESHOLDS)).item() for one in (linear, drift)]
+    assert widths[1] > 3.0 * widths[0]
+
+
+def test_the_error_of_unknown_commands_is_that_of_the_thrust_and_torque_which_they_gave():
+    rng = np.random.default_rng(6)
+    linear = linearisation(rng, parameters=0)
+    push = rng.standard_normal((*linear.residual.shape, KNOTS, 4))
+    sizes = np.array([0.5, 5.0, 5.0, 2.0])
+    values = sizes * rng.standard_normal((WINDOWS, KNOTS, 4))
+    difference = np.einsum("wnckj,wkj->wnc", push, values)
+    fast = 0.3 * rng.standard_normal(difference.shape)
+    fast[0] = np.nan  # a window that diverges
+    error, limits = unknown_commands(linear, push, difference + fast, THRESHOLDS)
+    np.testing.assert_allclose(np.sqrt((error[1:] ** 2).mean(axis=0)), sizes, rtol=0.2)
+    # What is faster than the knots is noise.
+    np.testing.assert_allclose(limits.least_noise, 0.3, rtol=0.3)
+    columns = with_input_error(linear.windows, push, sizes).input_error
+    np.testing.assert_allclose(columns[..., 5], 5.0 * push[..., 1, 1])
+    assert (error < WIDE).all()
