@@ -96,9 +96,9 @@ def _text_stream(raw: io.FileIO, old: TextIO | None) -> TextIO:
 def suppress_warnings() -> None:
     """Suppress warnings that do not help the user, here and in worker processes.
 
-    The suite's own warnings are printed as a line each, without the place in the code.
     They are the runtime warnings of numpy, and the warnings of JAX about its cache of compiled
-    programs. If the user has chosen which warnings are shown, nothing changes.
+    programs. If the user has chosen which warnings are shown, all are shown as chosen. A warning of
+    the suite is printed as one line, without the place in the code.
     """
     warnings.formatwarning = format_warning
     if not sys.warnoptions and "PYTHONWARNINGS" not in os.environ:
@@ -111,12 +111,16 @@ def suppress_warnings() -> None:
 
 
 def format_warning(
-    message: Warning | str, category: type[Warning], file: str, number: int, line: str | None = None
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    line: str | None = None,
 ) -> str:
     """Return a warning of the suite as a line for the user, without the place in the code."""
-    if category is UserWarning and any(map(Path(file).is_relative_to, PACKAGES)):
+    if category is UserWarning and any(map(Path(filename).is_relative_to, PACKAGES)):
         return f"warning: {printable(str(message))}\n"
-    return _FORMAT(message, category, file, number, line)
+    return _FORMAT(message, category, filename, lineno, line)
 
 
 def check_names(args: Iterable[str]) -> None:
