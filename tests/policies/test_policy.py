@@ -9,12 +9,14 @@ import sys
 from dataclasses import replace
 from typing import Any, cast
 
+import gymnasium
 import jax
 import numpy as np
 import onnx
 import pytest
 import torch
 
+from eval.envs.gymnasium_env import ID
 from policies import shipped
 from policies.block_policy import BlockPolicy
 from policies.contract import KEY, contract_of, read_contract, refuse_differences, spec_of
@@ -270,6 +272,22 @@ def test_an_export_that_does_not_fit_its_contract_is_refused(tmp_path):
     onnx.save(proto, tmp_path / "it.onnx")
     with pytest.raises(PolicyError, match=r"'state' has shape .*expected \(batch, 13\)"):
         load_policy(tmp_path / "it.onnx")
+
+
+def test_an_export_names_an_argument_of_another_type(tmp_path):
+    for args, said in (
+        ((3, PolicySpec()), "module is 3, allowed is a torch.nn.Module"),
+        ((Module(), gymnasium_spec()), "trained_under is EnvSpec.*allowed is env.unwrapped.contra"),
+        ((Module(), PolicySpec(), 3), "memory is 3, allowed is a shape such as"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            export_module(args[0], tmp_path / "it.onnx", *args[1:])
+    assert not list(tmp_path.iterdir())
+
+
+def gymnasium_spec():
+    """Return what `env.spec` is in gymnasium, which is no `PolicySpec`."""
+    return gymnasium.spec(ID)
 
 
 def test_weights_without_a_program_are_named(tmp_path):
