@@ -51,9 +51,9 @@ def make_track(family: str, level: int, seed: int) -> Track:
     The level is 0 (easy) to 9 (hard); the difficulty is (level + U(0, 1)) / 10.
 
     Raises:
-        ValueError: where the family is unknown, does not return a Layout, or draws random numbers
-            without the generator, or fails, if it is not of the suite; the level is out of range or the seed negative; the track has
-            more solids than `MAX_COUNTS`, or is not possible (`tracks.track_check`).
+        ValueError: where the family is unknown, fails, does not return a Layout, or draws random
+            numbers without the generator; the level is out of range or the seed negative; the track
+            has more solids than `MAX_COUNTS`, or is not possible (`tracks.track_check`).
     """
     check_family(family)
     levels, seeds = "a whole number from 0 to 9", "a whole number, 0 or more"
