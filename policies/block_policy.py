@@ -15,7 +15,7 @@ from typing import final
 
 import numpy as np
 
-from policies.spec import NoAnswer, Note, PolicyError, PolicySpec
+from policies.spec import ACTIONS, NoAnswer, Note, PolicyError, PolicySpec
 
 Model = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Maps (state, image, hidden) to (action, hidden) for exactly one block of rows, all float32."""
@@ -98,9 +98,11 @@ def verify_rows(policy: BlockPolicy, where: str) -> BlockPolicy:
     expected = ((n, policy.spec.action.size), (n, *policy.hidden_shape))
     for name, value, shape in zip(("action", "hidden"), first, expected, strict=True):
         if value.shape != shape or value.dtype != np.float32:
+            sizes = ", ".join(f"{len(names)} with {kind}" for kind, names in ACTIONS.items())
+            fix = f"the numbers of an action depend on action.kind: {sizes}; "
             raise PolicyError(
                 f"{where}: output {name!r} is {value.dtype} {value.shape} for {n} rows, expected "
-                f"float32 {shape}; see docs/policies.md"
+                f"float32 {shape}; {fix if name == 'action' else ''}see docs/policies.md"
             )
     if not _same(first, policy.model(state, image, hidden)):
         raise PolicyError(

@@ -6,6 +6,7 @@ policies in simulation and scores them, uses policies through this protocol only
 
 from __future__ import annotations
 
+import inspect
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -87,6 +88,9 @@ def check_is_policy(policy: Any) -> None:
         "a policy object has name, spec, start(n) and act(hidden, state, image, fresh): "
         "docs/policies.md"
     )
+    if isinstance(policy, type):
+        raise PolicyError(f"policy {policy.__name__} is a class; give an object, such as "
+                          f"{policy.__name__}(); {about}")  # fmt: skip
     if missing := [name for name in MEMBERS if not hasattr(policy, name)]:
         raise ValueError(f"policy {shown(policy)} has no {', '.join(missing)}; {about}")
     for name, (kind, text) in MEMBERS.items():
@@ -95,6 +99,18 @@ def check_is_policy(policy: Any) -> None:
             raise ValueError(
                 f"policy {shown(policy)}: its {name} is {shown(value)}, not {text}; {about}"
             )
+    for name, arguments in (("start", 1), ("act", 4)):
+        try:
+            signature = inspect.signature(getattr(policy, name))
+        except ValueError:  # as of a function in C
+            continue
+        try:
+            signature.bind(*range(arguments))
+        except TypeError as error:
+            raise PolicyError(
+                f"policy {policy.name!r}: its {name}{signature} takes other arguments ({error}); "
+                f"{about}"
+            ) from None
     check_spec(policy.spec, f"policy {policy.name!r}: spec.")
 
 

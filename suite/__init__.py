@@ -7,12 +7,14 @@ Other packages are imported at the first use of a name, so that `import suite` t
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tracks.input.ranges import PATH, as_path, check_type
+from tracks.input.ranges import PATH, Range, as_path, check_number, check_type
 
 if TYPE_CHECKING:
     import gymnasium
@@ -104,6 +106,7 @@ def evaluate_policy(
     from suite.judging.flying import fly_trials, policy_for_workers
     from suite.judging.requests import Evaluation
     from suite.judging.trials import read_trial_set
+    from tracks.common.work import MOST
     from tracks.track import Track
 
     check_type("track", track, (*PATH, Track), "a text, a path or a Track; several in one text "
@@ -111,7 +114,8 @@ def evaluate_policy(
     check_type("difficulty", difficulty, (str, Integral), "a level, or several as a text: '0,3'")
     check_type("vehicle", vehicle, (*PATH, Vehicle), "a name, a path or a Vehicle")
     check_type("sensors", sensors, PATH, "a name or a path")
-    check_type("workers", workers, (int, type(None)), "a whole number or None")
+    if workers is not None:
+        check_number("workers", workers, Range(1, MOST, whole=True))
     if isinstance(vehicle, Vehicle):
         checked_vehicle(vehicle)
     loaded = load_policy(policy) if isinstance(policy, PATH) else policy
@@ -124,9 +128,10 @@ def evaluate_policy(
         "sensors": os.fspath(sensors),
         **sources,
     }
-    evaluation = Evaluation(trials=trials, seed=seed, simulator=simulator, **request)
     is_source = isinstance(policy, PATH)
-    trial_set = read_trial_set(evaluation, repeated=not is_source, **objects)
+    with _options_as_arguments("trials", "seed", "simulator", *request):
+        evaluation = Evaluation(trials=trials, seed=seed, simulator=simulator, **request)
+        trial_set = read_trial_set(evaluation, repeated=not is_source, **objects)
     before = notes_of(loaded)
     notes = dict.fromkeys([*before, *trial_set.notes])
     warn_of([*vehicle_doubts(trial_set.vehicle), *trial_set.differences, *notes])
@@ -167,10 +172,10 @@ def train_policy(
     from suite.commands.train import Config, resolve
     from suite.train.run import train
 
-    options = Config(
-        recipe=recipe, iterations=iterations, set=_all("settings", settings), seed=seed
-    )
-    outcome = train(resolve(options), as_path("out", out), _console(progress))
+    with _options_as_arguments("seed", set="settings"):
+        changes = _all("settings", settings)
+        resolved = resolve(Config(recipe=recipe, iterations=iterations, set=changes, seed=seed))
+    outcome = train(resolved, as_path("out", out), _console(progress))
     return Path(outcome.policy)
 
 
@@ -281,6 +286,20 @@ def register_simulator(name: str, simulator: Any) -> None:
     from eval.worlds import WORLDS
 
     WORLDS.register(name, simulator)
+
+
+@contextmanager
+def _options_as_arguments(*same: str, **others: str) -> Iterator[None]:
+    """Name arguments of Python, not options of a command, in the message of a ValueError."""
+    try:
+        yield
+    except ValueError as error:
+        text = str(error)
+        for option, argument in {**dict(zip(same, same, strict=True)), **others}.items():
+            text = re.sub(rf"--{option}\b(?!-)", argument, text)
+        if text != str(error):
+            error.args = (text,)
+        raise
 
 
 def _console(progress: bool) -> Console:

@@ -6,12 +6,15 @@ tests/suite/test_cli.py; models that hang or abort, in tests/policies/formats/te
 
 import errno
 import os
+import re
 import shutil
+from functools import partial
 from itertools import product
 from pathlib import Path
 
 import pytest
 
+import suite
 from policies import shipped
 from suite import cli
 from suite.diagnose import example
@@ -182,3 +185,20 @@ def test_a_place_that_cannot_be_written_is_refused(command, place, tmp_path, mon
     refused(capsys, WRITERS[command], "--out", PLACES[place])
     assert Path("file").read_text() == "kept"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["circle", "file", "read-only"]
+
+
+def test_python_names_its_own_arguments_and_not_options_of_commands(tmp_path):
+    fly, train = suite.evaluate_policy, partial(suite.train_policy, tmp_path / "out", "quick")
+    for call, said in (
+        (partial(fly, trials=0), "trials is 0, allowed is 1 to"),
+        (partial(fly, seed=-1), "seed is -1, allowed is 0 to"),
+        (partial(fly, difficulty="easy"), "difficulty 'easy': 'easy' is no level"),
+        (partial(fly, workers=0), "workers is 0, allowed is 1 to 256"),
+        (partial(fly, workers="2"), "workers is '2', allowed is a whole number, 1 to 256"),
+        (partial(train, settings=["los.progress=1"]), "unknown settings 'los.progress=1'"),
+        (partial(train, seed=-1), "seed is -1, allowed is 0 to"),
+        (partial(suite.diagnose_flights, [], "racer5", tmp_path / "out"), "flights is empty, allo"),
+    ):
+        with pytest.raises(ValueError, match=f"^{re.escape(said)}"):
+            call()
+    assert not (tmp_path / "out").exists()

@@ -17,6 +17,7 @@ from eval.worlds.slots import GustDraws
 from eval.worlds.trial import ENDINGS, FLYING, Rules, TrialSpec, next_centre, next_gate
 from policies.observation import observe, view_of
 from policies.spec import PolicySpec, check_spec
+from tracks.input.ranges import shown
 from tracks.track import Track
 
 ACTION_LIMIT = 20.0
@@ -129,6 +130,24 @@ class Race(OneTrial):
             "state": np.clip(state, -STATE_LIMIT, STATE_LIMIT).astype(np.float32),
             "image": image.astype(np.float32),
         }
+
+
+def as_actions(actions: object, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the actions of all environments as floats, one row for each.
+
+    Raises:
+        ValueError: for something else than numbers of this shape.
+    """
+    try:
+        array = np.asarray(actions, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"action is {shown(actions)}, allowed are numbers") from None
+    if array.shape != shape:
+        raise ValueError(
+            f"action has shape {array.shape}, expected {shape}: a row for each environment, with "
+            f"{shape[1]} numbers; see env.action_space"
+        )
+    return array
 
 
 def unscaled(sizes: np.ndarray) -> list[str]:

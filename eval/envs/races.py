@@ -22,6 +22,7 @@ from eval.envs.race import (
     CRASH_REWARD,
     GATE_REWARD,
     STATE_LIMIT,
+    as_actions,
     remaining_path,
     unscaled,
 )
@@ -326,11 +327,10 @@ class Races:
     def step(self, output: np.ndarray) -> np.ndarray:
         """Fly one action in each slot for a period of the policy's rate; return rewards (N,).
 
-        `output` (N, size) are actions with components from -1 to 1.
+        `output` (N, size) are actions with components from -1 to 1; other shapes are refused.
         """
-        output = np.asarray(output, float)
-        flying = self.ended == FLYING
-        guarded = guard_action(self._limits, output, self._action, 0.0, "of the environment's user")
+        output, flying = as_actions(output, self._action.shape), self.ended == FLYING
+        guarded = guard_action(self._limits, output, self._action, 0.0, "")
         warn_of(unscaled(guarded.largest))
         self._bad |= flying & guarded.bad
         flying &= ~guarded.bad

@@ -78,6 +78,8 @@ class Guarded(NamedTuple):
     """(N,) bool, whether the action was late or missing and is replaced by the last flown one."""
     largest: np.ndarray
     """(N,) largest absolute component of the policy's raw output; NaN if bad."""
+    missing: str = ""
+    """Why the policy gave no output, if it gave none."""
 
 
 def call_policy(
@@ -109,9 +111,12 @@ def call_policy(
     start_s = time.perf_counter()
     try:
         output, next_hidden = checked_act(policy, hidden, state, image, fresh)
-    except NoAnswer:
+    except NoAnswer as error:
         none = np.zeros(len(last_b), bool)
-        return Guarded(last_b, none, none, ~none, np.full(len(last_b), np.nan)), hidden
+        # A worker process loads a copy of the file, whose path does not help the user.
+        text = str(error).partition(f"{policy.name}: ")[2] or str(error)
+        text = f"policy {policy.name!r} gave no action: {text}"
+        return Guarded(last_b, none, none, ~none, np.full(len(last_b), np.nan), text), hidden
     took_s = time.perf_counter() - start_s
     return guard_action(limits, output, last_b, took_s, policy.name), next_hidden
 

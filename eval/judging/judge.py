@@ -8,6 +8,7 @@ no random numbers. A slot of the simulator takes the next trial when its trial h
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -48,8 +49,8 @@ OnResult = Callable[[TrialResult, Flight | None], None]
 """A function that is called at the end of each trial, in any order, with the flight if recorded."""
 Numbered = tuple[int, TrialSpec]
 """Index of a trial in the argument `trials` of `fly`, and the trial."""
-Ended = tuple[int, TrialResult, Flight | None]
-"""The index of a trial, its result, and its flight if recorded."""
+Ended = tuple[int, TrialResult, Flight | None, str]
+"""The index of a trial, its result, its flight if recorded, and why an action was missing."""
 
 
 @dataclass(frozen=True)
@@ -128,9 +129,13 @@ def fly(
             check_family(trial.track)
     task = Task(policy, vehicle, world, options, record, tracks)
     results: dict[int, TrialResult] = {}
+    reasons: set[str] = set()
 
     def keep(piece: int, ended: Ended) -> None:
-        index, result, flight = ended
+        index, result, flight, missing = ended
+        if missing and missing not in reasons:
+            reasons.add(missing)
+            warnings.warn(f"{missing}; the trials that waited for it end as timeout", stacklevel=2)
         # A piece that was repeated, because its process died, returns some results again.
         is_repeated, results[index] = index in results, result
         if on_result and not is_repeated:
@@ -207,7 +212,7 @@ class _Slots:
         self._decision = np.zeros(slots)
         self._action_b = np.tile(self._first, (slots, 1))
         self._outputs = Outputs(slots, action)
-        self._late = np.zeros(slots, bool)
+        self._late, self._missing = np.zeros(slots, bool), ""
         self._fresh = np.ones(slots, bool)
         self._hidden = policy.start(slots)
         self._recorder = None
@@ -241,7 +246,7 @@ class _Slots:
                 if self._recorder:
                     flight = self._recorder.finish(int(slot), result._asdict() | stepping)
                 self._index[slot] = -1
-                yield index, result, flight
+                yield index, result, flight, self._missing if self._late[slot] else ""
 
     def _ended(self) -> np.ndarray:
         """Return (N,) bool: slots whose trial has ended."""
@@ -290,7 +295,7 @@ class _Slots:
         )  # fmt: skip
         self._action_b = guarded.action_b
         self._outputs.add(guarded, state)
-        self._late = guarded.late
+        self._late, self._missing = guarded.late, guarded.missing
         flying = flying & ~guarded.late
         self._fresh[:] = False
         if self._recorder:

@@ -191,7 +191,7 @@ def _cell_grid(cells: Sequence[Tally]) -> Grid:
 
 def _other_endings(cell: Tally) -> str:
     ended = [f"{how} {n}" for how, n in cell.ended_by.items() if how != "finished"]
-    ended += [f"of these {cell.late} by a late answer"] if cell.late else []
+    ended += [f"of these {cell.late} by a late or missing answer"] if cell.late else []
     return ", ".join(ended) or "-"
 
 

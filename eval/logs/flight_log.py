@@ -326,10 +326,12 @@ def flight_files(paths: Sequence[Path]) -> list[Path]:
         ValueError: if there is none.
     """
     files = []
+    if not paths:
+        raise ValueError("flights is empty, allowed are flight logs and folders of them")
     for path in paths:
         files += logs_in(path) if path.is_dir() else [path]
     if not files:
-        folders = ", ".join(map(str, paths)) or "nowhere"
+        folders = ", ".join(map(str, paths))
         raise ValueError(f"no flight logs in {folders}; record some with suite collect")
     return list({path.resolve(): path for path in reversed(files)}.values())[::-1]
 

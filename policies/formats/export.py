@@ -16,6 +16,7 @@ from policies.formats.spec_json import labels
 from policies.spec import PolicyError, PolicySpec
 from tracks.common.files import replacing_file, write_files
 from tracks.common.names import unknown_name
+from tracks.input.ranges import check_type
 
 if TYPE_CHECKING:
     import torch
@@ -85,6 +86,7 @@ def export_module(
         `path`.
 
     Raises:
+        ValueError: for an argument of another type.
         PolicyError: for a path with another ending, and where torch cannot export the module, the
             judge refuses the file, or no action is finite.
     """
@@ -98,6 +100,10 @@ def export_module(
     from policies.formats.onnx_file import load_onnx
     from policies.formats.onnx_graph import OPSET
 
+    check_type("module", module, (torch.nn.Module,), "a torch.nn.Module")
+    kinds = (PolicySpec, contract.Contract)
+    check_type("trained_under", trained_under, kinds, "env.unwrapped.contract or a PolicySpec")
+    check_type("memory", memory, (tuple, list, type(None)), "a shape such as (64,), or None")
     spec = trained_under
     if not isinstance(spec, PolicySpec):
         spec = contract.spec_of(spec, str(path))

@@ -130,7 +130,8 @@ class ModelProcess:
         answer, buffer = self._request(header, data, ANSWER_S, "answered")
         if "error" in answer:
             raise NoAnswer(
-                f"{self._where}: fails while it runs ({answer['error']}); export it again"
+                f"{self._where}: fails while it runs ({answer['error']}); correct it and export "
+                "it again"
             )
         outputs, offset = [], 0
         for _, shape in answer["arrays"]:

@@ -143,8 +143,10 @@ def program_policy(
 
 def inputs_message(where: str, names: tuple[str, ...]) -> str:
     """Return the error message for a program whose inputs have other names."""
+    fix = "name forward()'s arguments so, or give input_names to torch.onnx.export"
+    if len(names) > len(INPUTS):
+        fix = "join several memories, such as the two of an LSTM, to one input and output"
     return (
         f"{where}: inputs are {', '.join(names) or 'none'}; expected {', '.join(INPUTS)} in this "
-        "order (hidden may be left out); name forward()'s arguments so, or give input_names to "
-        "torch.onnx.export"
+        f"order (hidden may be left out); {fix}"
     )

@@ -116,8 +116,13 @@ def _object(text: str | bytes | None, where: str) -> dict[str, Any]:
         data: Any = parse_json(text, where)
     except InputError as error:
         raise PolicyError(f"{error}; write it again") from None
-    if not isinstance(data, dict) or data.get("schema", SCHEMA) != SCHEMA:
-        raise PolicyError(f"{where}: expected an object with schema {SCHEMA}; update the suite")
+    if not isinstance(data, dict):
+        raise PolicyError(f"{where}: is {shown(data)}, expected an object such as {{'spec': {{}}}}")
+    if data.get("schema", SCHEMA) != SCHEMA:
+        raise PolicyError(
+            f"{where}: schema is {shown(data['schema'])}, this suite reads {SCHEMA}; "
+            "update the suite"
+        )
     for key in data:
         if key not in KEYS:
             raise PolicyError(f"{where}: {unknown_name('key', key, KEYS)}")

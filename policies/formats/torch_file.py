@@ -24,7 +24,7 @@ from policies.formats.program_inputs import (
     read_model,
 )
 from policies.formats.spec_json import KEY, extract
-from policies.spec import NeedsTrust, PolicyError
+from policies.spec import NeedsTrust, NoAnswer, PolicyError
 
 
 def load_program(path: Path, trust: bool = False) -> BlockPolicy:
@@ -52,8 +52,16 @@ def load_script(path: Path, trust: bool = False) -> BlockPolicy:
     names = _check_names(path, loaded)
     # A script does not store the shape of its hidden state.
     memory = metadata.contract.memory if metadata.contract else None
-    hidden_shape = memory or (metadata.spec.hidden_size,)
-    return program_policy(loaded, path, metadata, hidden_shape if names == INPUTS else (0,))
+    hidden_shape = (memory or (metadata.spec.hidden_size,)) if names == INPUTS else (0,)
+    try:
+        return program_policy(loaded, path, metadata, hidden_shape)
+    except NoAnswer as error:
+        if names != INPUTS or memory:
+            raise
+        raise PolicyError(
+            f"{error}. It was given a hidden of {hidden_shape[0]} numbers; set hidden_size in the "
+            f"spec of {KEY} if it has another size"
+        ) from None
 
 
 def _loaded(path: Path, kind: str, words: str, trust: bool) -> ModelProcess:
@@ -61,8 +69,8 @@ def _loaded(path: Path, kind: str, words: str, trust: bool) -> ModelProcess:
     if not trust:
         raise NeedsTrust(
             f"{path}: {words} can run any code of its author while torch loads it; if you trust "
-            "the author, pass --trust; as .onnx, a policy can be shared without trust "
-            "(torch.onnx.export; suite export for a policy of the suite)"
+            "the author, pass --trust (in Python trust=True); as .onnx, a policy can be shared "
+            "without trust (torch.onnx.export; suite export for a policy of the suite)"
         )
     data = read_model(path)
     if kind == "script" and _is_weights(data):

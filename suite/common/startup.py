@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from tracks.common.files import user_cache
+from tracks.common.names import printable
 
 KEPT_PREFIXES = (
     *("JAX_PLATFORM", "JAX_CUDA_", "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_"),
@@ -37,6 +38,11 @@ CACHE_WARNINGS = tuple(
     f"Error {action} persistent compilation cache" for action in ("reading", "writing")
 )
 """Beginnings of JAX's warnings if its cache of compiled programs cannot be used."""
+PACKAGES = tuple(
+    Path(__file__).parents[2] / name for name in ("tracks", "policies", "eval", "suite")
+)
+"""Folders of the suite's code."""
+_FORMAT = warnings.formatwarning
 
 
 class _UnfailingStderr(io.FileIO):
@@ -91,8 +97,10 @@ def suppress_warnings() -> None:
     """Suppress warnings that do not help the user, here and in worker processes.
 
     They are the runtime warnings of numpy, and the warnings of JAX about its cache of compiled
-    programs. If the user has chosen which warnings are shown, nothing changes.
+    programs. If the user has chosen which warnings are shown, all are shown as chosen. A warning of
+    the suite is printed as one line, without the place in the code.
     """
+    warnings.formatwarning = format_warning
     if not sys.warnoptions and "PYTHONWARNINGS" not in os.environ:
         warnings.simplefilter("ignore", RuntimeWarning)
         filters = ["ignore::RuntimeWarning"]
@@ -100,6 +108,19 @@ def suppress_warnings() -> None:
             warnings.filterwarnings("ignore", message, UserWarning)
             filters.append(f"ignore:{message}:UserWarning")
         os.environ["PYTHONWARNINGS"] = ",".join(filters)
+
+
+def format_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    line: str | None = None,
+) -> str:
+    """Return a warning of the suite as a line for the user, without the place in the code."""
+    if category is UserWarning and any(map(Path(filename).is_relative_to, PACKAGES)):
+        return f"warning: {printable(str(message))}\n"
+    return _FORMAT(message, category, filename, lineno, line)
 
 
 def check_names(args: Iterable[str]) -> None:

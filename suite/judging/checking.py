@@ -173,6 +173,10 @@ def _warnings_in_flight(
     share, count = actions["limited"], actions["decisions"]
     console.say(f"{share:.1%} of {count} actions were limited in {trials} flights")
     warnings = [*actions["warnings"], *watched.doubts()]
+    if missing := sum(row.late_actions for row in results):
+        text = f"in {missing} of {trials} flights it gave no action"
+        fix = "correct the error in the warning, and export it again"
+        warnings.append(Note("action_missing", text, fix))
     gates = sum(row.gates_passed for row in results)
     ended = Counter("in flight" if row.ended_by == "timeout" else row.ended_by for row in results)
     endings = ", ".join(f"{number} {ending}" for ending, number in ended.items())

@@ -3,6 +3,8 @@
 Eight programs are shown in docs/start.md; a file that is not in the table here fails.
 """
 
+import importlib
+import inspect
 import json
 import re
 import runpy
@@ -64,6 +66,21 @@ def test_every_example_is_run_here_and_shown_to_newcomers():
     for name in EXAMPLES:
         assert f"(../examples/{name}.py)" in start
         assert 25 <= len(source(name).splitlines()) <= 80
+
+
+def test_the_helpers_of_a_track_family_are_where_the_docs_say_with_these_arguments():
+    text = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
+    section = text.partition("## A track family")[2].partition("\n## ")[0]
+    places = dict(re.findall(r"`(\w+)`(?: is)? in\s`([\w.]+)`", section))
+    rows = re.findall(r"^\| `(\w+)(\(.*?\))`", section, re.MULTILINE)
+    assert len(rows) == 5 and len(places) == 2
+    for name, arguments in rows:
+        module = importlib.import_module(places.get(name, "tracks.families.layout"))
+        every = [*inspect.signature(getattr(module, name)).parameters.values()]
+        count = arguments.count(",") + 1
+        shown, left_out = every[:count], every[count:]
+        assert arguments == f"({', '.join(str(p.replace(annotation=p.empty)) for p in shown)})"
+        assert all(p.default is not p.empty for p in left_out)
 
 
 @pytest.fixture(autouse=True)

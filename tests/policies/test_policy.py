@@ -9,12 +9,14 @@ import sys
 from dataclasses import replace
 from typing import Any, cast
 
+import gymnasium
 import jax
 import numpy as np
 import onnx
 import pytest
 import torch
 
+from eval.envs.gymnasium_env import ID
 from policies import shipped
 from policies.block_policy import BlockPolicy
 from policies.contract import KEY, contract_of, read_contract, refuse_differences, spec_of
@@ -23,7 +25,7 @@ from policies.formats.onnx_graph import IR_VERSION, OPSET, onnx_model
 from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.formats.spec_json import KEY as SPEC_KEY
 from policies.networks import network
-from policies.policy import load_policy
+from policies.policy import check_is_policy, load_policy
 from policies.spec import ActionSpec, DepthEncoding, PolicyError, PolicySpec
 from suite.cli import main
 from tests.support.marks import more
@@ -272,6 +274,22 @@ def test_an_export_that_does_not_fit_its_contract_is_refused(tmp_path):
         load_policy(tmp_path / "it.onnx")
 
 
+def test_an_export_names_an_argument_of_another_type(tmp_path):
+    for args, said in (
+        ((3, PolicySpec()), "module is 3, allowed is a torch.nn.Module"),
+        ((Module(), gymnasium_spec()), "trained_under is EnvSpec.*allowed is env.unwrapped.contra"),
+        ((Module(), PolicySpec(), 3), "memory is 3, allowed is a shape such as"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            export_module(args[0], tmp_path / "it.onnx", *args[1:])
+    assert not list(tmp_path.iterdir())
+
+
+def gymnasium_spec():
+    """Return what `env.spec` is in gymnasium, which is no `PolicySpec`."""
+    return gymnasium.spec(ID)
+
+
 def test_weights_without_a_program_are_named(tmp_path):
     torch.save(Module().state_dict(), tmp_path / "it.pt")
     with pytest.raises(PolicyError, match="weights without a program"):
@@ -346,3 +364,37 @@ def test_it_asks_for_old_standard_operators_only_and_carries_its_texts(params):
     assert [(o.domain, o.version) for o in model.opset_import] == [("", OPSET)] and OPSET <= 17
     assert {node.domain for node in model.graph.node} == {""}
     assert [(p.key, p.value) for p in model.metadata_props] == [("key", "text")]
+
+
+class _Aim:
+    """Flies towards the gate."""
+
+    name, spec = "aim", PolicySpec()
+
+    def start(self, n):
+        return None
+
+    def act(self, hidden, state, image, fresh):
+        return state[:, 6:9], hidden
+
+
+def test_a_class_and_methods_with_other_arguments_are_refused_before_a_flight():
+    class NoFresh(_Aim):
+        def act(self, hidden, state, image):
+            return state[:, 6:9], hidden
+
+    class NoCount(_Aim):
+        def start(self):
+            return None
+
+    check_is_policy(_Aim())
+    for wrong, said in (
+        (_Aim, r"policy _Aim is a class; give an object, such as _Aim\(\); a policy object has"),
+        (
+            NoFresh(),
+            r"its act\(hidden, state, image\) takes other arguments .*act\(hidden, .*fresh\)",
+        ),
+        (NoCount(), r"its start\(\) takes other arguments .* start\(n\)"),
+    ):
+        with pytest.raises(PolicyError, match=said):
+            check_is_policy(wrong)

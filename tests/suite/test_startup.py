@@ -242,3 +242,13 @@ def test_output_is_unbuffered_where_that_is_asked():
         environment = {**os.environ, "PYTHONUNBUFFERED": asked}
         found = python(f"{code}; os._exit(0)", env=environment, check=True)
         assert found.stdout == printed
+
+
+def test_warnings_of_the_suite_are_lines_without_a_place_in_the_code():
+    where = str(Path(startup.__file__).parents[2] / "eval" / "judging" / "judge.py")
+    assert startup.format_warning("no action\x07", UserWarning, where, 1) == (
+        "warning: no action\\x07\n"
+    )
+    others = (UserWarning, "/usr/lib/judge.py"), (DeprecationWarning, where)
+    for category, file in others:
+        assert file in startup.format_warning("no action", category, file, 1, "")

@@ -139,7 +139,7 @@ def fly_trial(
                 limits, policy, policy_memory, padded_state, padded_image, is_first, last_b
             )
             action_b = guarded.action_b[:1]
-            outputs.add(Guarded(*(part[:1] for part in guarded)), state.astype(np.float32))
+            outputs.add(Guarded._make(part[:1] for part in guarded), state.astype(np.float32))
             decisions += 1
             if guarded.late[0]:
                 ended_by = "timeout"

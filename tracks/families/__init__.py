@@ -51,9 +51,9 @@ def make_track(family: str, level: int, seed: int) -> Track:
     The level is 0 (easy) to 9 (hard); the difficulty is (level + U(0, 1)) / 10.
 
     Raises:
-        ValueError: where the family is unknown, does not return a Layout, or draws random numbers
-            without the generator; the level is out of range or the seed negative; the track has
-            more solids than `MAX_COUNTS`, or is not possible (`tracks.track_check`).
+        ValueError: where the family is unknown, fails, does not return a Layout, or draws random
+            numbers without the generator; the level is out of range or the seed negative; the track
+            has more solids than `MAX_COUNTS`, or is not possible (`tracks.track_check`).
     """
     check_family(family)
     levels, seeds = "a whole number from 0 to 9", "a whole number, 0 or more"
@@ -66,7 +66,7 @@ def make_track(family: str, level: int, seed: int) -> Track:
     level, seed = int(level), int(seed)
     rng = np.random.default_rng(np.random.SeedSequence([seed, level, *family.encode()]))
     d = (level + rng.random()) / 10
-    layout = FAMILIES[family](d, rng)
+    layout = _layout(family, d, rng)
     if not isinstance(layout, Layout):
         raise ValueError(
             f"track family {family!r} returns {type(layout).__name__}, must return a Layout; "
@@ -101,10 +101,24 @@ def check_family(family: str) -> None:
     FAMILIES.find(family)
 
 
+def _layout(family: str, d: float, rng: np.random.Generator) -> Layout:
+    """Return what a family draws; an error in code of another program names the family."""
+    try:
+        return FAMILIES[family](d, rng)
+    except Exception as error:  # such code may raise anything
+        if family in FAMILIES.own:
+            raise
+        text = (str(error) or "?").splitlines()[0]
+        raise ValueError(
+            f"track family {family!r} fails with {type(error).__name__}: {text}; correct its "
+            f"function make(d, rng), here for d = {d:.3f}"
+        ) from error
+
+
 @cache
 def _check_repeats(family: str) -> None:
     """Refuse a family that draws two different tracks from equal random generators."""
-    one, other = (FAMILIES[family](0.5, np.random.default_rng(0)).scene for _ in range(2))
+    one, other = (_layout(family, 0.5, np.random.default_rng(0)).scene for _ in range(2))
     pairs = zip(one[:5], other[:5], strict=True)
     if not all(np.array_equal(a, b) for parts in pairs for a, b in zip(*parts, strict=True)):
         raise ValueError(

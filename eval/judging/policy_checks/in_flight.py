@@ -124,7 +124,7 @@ class Watched(Wrapper):
     ) -> tuple[np.ndarray, Hidden]:
         """Return what the policy's `act` returns."""
         output, new_hidden = super().act(hidden, state, image, fresh)
-        self._outputs.append(np.array(output, float))
+        self._outputs.append(np.asarray(output).astype(float))
         if isinstance(hidden, np.ndarray) and hidden[~fresh].size:
             self._has_memory = True
             self._remembers |= not np.array_equal(new_hidden[~fresh], hidden[~fresh])

@@ -116,7 +116,7 @@ def run(policy: Policy, state: np.ndarray, image: np.ndarray) -> tuple[np.ndarra
     for step in range(STEPS):
         fresh = np.full(len(state), step == 0)
         output, hidden = checked_act(policy, hidden, state, image, fresh)
-        outputs.append(np.array(output))  # it may write the next one into the same array
+        outputs.append(np.asarray(output).copy())  # it may write the next one into the same array
         action = np.asarray(spec.action.to_si(output), np.float32)
         norm = np.linalg.norm(action, axis=-1, keepdims=True)
         flown[:] = action * np.minimum(1.0, ActionLimits().size / np.maximum(norm, 1e-6))

@@ -80,5 +80,5 @@ def _answers(
         image = np.stack([rng.uniform(0.0, most, spec.image_shape) for rng in rows])
         fresh = np.full(count, decision == 0)
         action, hidden = checked_act(policy, hidden, state, image.astype(np.float32), fresh)
-        actions.append(np.array(action))
+        actions.append(np.asarray(action).copy())  # a tensor too
     return np.stack(actions), hidden

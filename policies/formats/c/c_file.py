@@ -72,7 +72,8 @@ def load_c(path: Path, trust: bool = False) -> CPolicy:
     if not trust:
         raise NeedsTrust(
             f"{file}: C is compiled and run on this machine and can do anything; if you trust its "
-            "author, pass --trust; as .onnx, a policy can be shared without trust"
+            "author, pass --trust (in Python trust=True); as .onnx, a policy can be shared "
+            "without trust"
         )
     library = compiled_library(file)
     loaded = ModelProcess(str(library).encode(), str(file), "library", (KEY,))

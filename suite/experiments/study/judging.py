@@ -198,5 +198,5 @@ def _fly_piece(
             loaded[request.policy] = loaders[request.policy]()
         options = JudgeOptions(workers=1, sensors=request.sensors)
         task = Task(loaded[request.policy], request.vehicle, request.simulator, options)
-        for _, result, _ in fly_share(task, list(enumerate(request.trials))):
+        for _, result, *_ in fly_share(task, list(enumerate(request.trials))):
             yield number, result

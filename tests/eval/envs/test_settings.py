@@ -210,3 +210,11 @@ def test_any_sequence_of_seeds_is_taken(seed):
 def test_seeds_options_and_render_modes_are_checked(call, said):
     with pytest.raises(ValueError, match=said):
         call(RaceVectorEnv(2))
+
+
+@pytest.mark.parametrize("action", [np.zeros(4), 0.0, None, "abc", [[0.0, 0.0]]])
+def test_gymnasium_refuses_an_action_of_another_shape(action):
+    for env in (RaceEnv(), RaceVectorEnv(2)):
+        env.reset()
+        with pytest.raises(ValueError, match=r"^action (has shape .*see env.action|is .*numbers)"):
+            env.step(action)

@@ -16,7 +16,7 @@ from eval.judging.policy_checks.in_flight import Watched, action_report
 from eval.logs.flight_log import log_from_flight, read_flight, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules
-from policies.spec import ActionSpec, PolicySpec
+from policies.spec import ActionSpec, NoAnswer, PolicySpec
 from suite.common.console import Console
 from suite.judging import checking
 from suite.judging.checking import policy_findings
@@ -232,6 +232,23 @@ def test_short_flights_show_negated_axes_saturation_and_a_constant_memory(
     assert found == [(fault, "doubt")] * bool(fault) + notes
     assert f"3 flights of {seconds:g} s at level 0 it passed" in capsys.readouterr().out
     assert ("race passes" in findings[0].evidence) == fault.endswith(("_gate", "_gates"))
+
+
+@pytest.mark.filterwarnings("ignore:policy .* gave no action")
+def test_an_error_in_a_short_flight_is_named_as_such(monkeypatch):
+    monkeypatch.setattr(checking, "TIME_LIMIT_S", 0.2)
+    monkeypatch.setattr(checking, "unused_inputs", lambda policy: [])
+
+    class Failing(Pursuit):
+        def act(self, hidden, state, image, fresh):
+            if abs(state[:, 0]).max() > 0.01:
+                raise NoAnswer("division by zero")
+            return super().act(hidden, state, image, fresh)
+
+    findings = policy_findings(Failing(), 3, Console())
+    found = [finding for finding in findings if finding.status == "doubt"]
+    assert [finding.fault for finding in found] == ["action_missing"]
+    assert "in 3 of 3 flights it gave no action" in found[0].evidence
 
 
 def test_without_a_decision_there_is_no_hint():

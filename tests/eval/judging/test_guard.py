@@ -1,6 +1,7 @@
 """A policy's output checked and limited; the monitor around a policy and its way out."""
 
 import time
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -113,7 +114,12 @@ def test_a_late_answer_ends_its_trials_and_the_run_goes_on(slow, deadline_s, wor
     """An answer is for two trials; in the reference world, which has one slot, for one."""
     limits, slow.asked = ActionLimits(deadline_s=deadline_s), 0
     how = {"seeds": range(4), "slots": 2, "rules": Rules(time_limit_s=0.3), "limits": limits}
-    found, _ = fly_on(slow, straight(), vehicle=VEHICLE, world=world, **how)
+    warned = slow.error and world == "mujoco"  # the reference prints nothing
+    why = (
+        "policy 'pursuit' gave no action: it.onnx: does not come to an end; the trials that waited"
+    )
+    with pytest.warns(UserWarning, match=why) if warned else nullcontext():
+        found, _ = fly_on(slow, straight(), vehicle=VEHICLE, world=world, **how)
     assert [r.seed for r in found] == [0, 1, 2, 3]
     assert {(r.ended_by, r.success) for r in found} == {("timeout", False)}
     assert [r.late_actions for r in found] == [1] * concerned + [0] * (4 - concerned)

@@ -304,7 +304,8 @@ def test_a_file_that_says_nothing_has_the_default_spec(text):
     ("text", "said"),
     [
         ("{", "not JSON"),
-        ("[]", "expected an object with schema 1"),
+        ("[1]", r"is \[1\], expected an object such as"),
+        ("null", "is None, expected an object"),
         ('{"schema": 2}', "update the suite"),
         ('{"spec": {"rate_hz": -1}}', "spec: rate_hz is -1"),
         ('{"spec": {"rate": 1}}', "key 'rate' at the top is unknown"),

@@ -186,6 +186,7 @@ def test_rows_and_memory_are_told_by_the_shapes(shapes, found):
     [
         ({}, "inputs are none; expected state, image, hidden in this order"),
         ({"state": STATE, "picture": IMAGE}, "inputs are state, picture; expected state, image"),
+        (dict.fromkeys(("state", "image", "h", "c"), STATE), "h, c; .*; join several memories"),
         ({"state": (2, 12), "image": (3, 24, 32)}, "the first axis of each must be the batch"),
         ({"state": STATE, "image": IMAGE, "hidden": ("batch", "n")}, "must have fixed sizes"),
         ({"state": ("batch", 15), "image": IMAGE}, r"'state' .* expected \(batch, 12\)"),
@@ -307,6 +308,11 @@ def test_a_program_without_memory_and_of_any_batch_flies(tmp_path, rows, free, i
         (lambda self, obs, image: obs[:, :3], zeros(2), "inputs are obs, image; expected state"),
         (lambda self, state, image: (state[:, :3], state), zeros(2), "gives 2 outputs"),
         (
+            lambda self, state, image: state[:, :4],
+            zeros(2),
+            "an action depend on action.kind: 3 with acceleration, 4 with ctbr",
+        ),
+        (
             lambda self, state, image, hidden: state[:, :3] + hidden[:, :3],
             zeros(2, torch.zeros(2, 4)),
             "gives 1 outputs",
@@ -354,16 +360,24 @@ class Counting(torch.nn.Module):
 @pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
 def test_the_memory_of_a_script_is_that_of_its_contract(tmp_path, in_process):
     path = tmp_path / "it.pt"
-    for module, memory in ((Counting(), (2, 4)), (Failing(), (5,))):
-        text = contract_of(PolicySpec(), memory).text
-        torch.jit.save(torch.jit.script(module), str(path), _extra_files={contract.KEY: text})
-        if memory == (2, 4):
-            policy = load_policy(path, trust=True)
-            hidden = policy.start(2)
-            for step in range(2):
-                inputs = np.ones((2, 12)), np.ones((2, 24, 32)), np.zeros(2, bool)
-                action, hidden = policy.act(hidden, *inputs)
-                assert hidden.shape == (2, 2, 4) and (action == step).all()
+    text = contract_of(PolicySpec(), (2, 4)).text
+    torch.jit.save(torch.jit.script(Counting()), str(path), _extra_files={contract.KEY: text})
+    policy = load_policy(path, trust=True)
+    hidden = policy.start(2)
+    for step in range(2):
+        inputs = np.ones((2, 12)), np.ones((2, 24, 32)), np.zeros(2, bool)
+        action, hidden = policy.act(hidden, *inputs)
+        assert hidden.shape == (2, 2, 4) and (action == step).all()
+    torch.jit.save(torch.jit.script(Counting()), str(path))  # its memory has no size
+    with pytest.raises(PolicyError, match=r"given a hidden of 192 numbers; set hidden_size in the"):
+        load_policy(path, trust=True)
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
+def test_a_script_without_the_memory_of_its_contract_is_refused(tmp_path, in_process):
+    path = tmp_path / "it.pt"
+    text = contract_of(PolicySpec(), (5,)).text
+    torch.jit.save(torch.jit.script(Failing()), str(path), _extra_files={contract.KEY: text})
     with pytest.raises(PolicyError, match=r"a memory of shape \[5\], its input 'hidden' has \[0\]"):
         load_policy(path, trust=True)
 

@@ -230,7 +230,7 @@ def test_a_rate_loop_faster_than_the_physics_of_the_training_gives_a_warning(tmp
         ("vehicle", {}, "a name, a path or a Vehicle"),
         ("trials", 1.5, "a whole number, 1 to"),
         ("seed", "1", "a whole number, 0 to"),
-        ("workers", "2", "a whole number or None"),
+        ("workers", "2", "a whole number, 1 to 256"),
         ("difficulty", [0, 3], "a level, or several as a text"),
         ("sensors", None, "a name or a path"),
     ],

@@ -44,9 +44,9 @@ class Sky:
 
     def fly(self, task, share):
         options = replace(task.options, slots=8, rules=Rules(time_limit_s=0.04))
-        for index, result, flight in self._fly(replace(task, options=options), share):
+        for index, result, *others in self._fly(replace(task, options=options), share):
             self.flown.append((task.policy.name, task.vehicle, options.sensors, result.trial))
-            yield index, result, flight
+            yield index, result, *others
             if self.stop_after == len(self.flown):
                 self.stop_after = None
                 raise KeyboardInterrupt

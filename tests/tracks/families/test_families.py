@@ -255,10 +255,13 @@ def test_the_first_gates_of_a_track(count):
             first_gates(track, none_or_more)
 
 
-def test_a_family_that_returns_no_layout_is_refused_by_name(monkeypatch):
-    monkeypatch.setitem(FAMILIES._entries, "hole", lambda d, rng: None)
-    with pytest.raises(ValueError, match="'hole' returns NoneType, must return a Layout"):
-        make_track("hole", 0, 0)
+def test_a_family_that_returns_no_layout_or_fails_is_refused_by_name(monkeypatch):
+    cases = (("hole", lambda d, rng: None, "returns NoneType, must return a Layout"),
+             ("one", lambda d: 1 // 0, "fails with TypeError: .*d = 0.0"))  # fmt: skip
+    for name, make, said in cases:
+        monkeypatch.setitem(FAMILIES._entries, name, make)
+        with pytest.raises(ValueError, match=f"track family '{name}' {said}"):
+            make_track(name, 0, 0)
     with pytest.raises(ValueError, match="Did you mean .zigzag.*comes with its package"):
         make_track("zigzak", 0, 0)
 

@@ -229,3 +229,18 @@ def test_a_tensor_with_a_gradient_is_refused_by_name():
     policy.act = lambda *inputs: (torch.zeros((1, 3), requires_grad=True), None)
     with pytest.raises(ValueError, match=r"'steady'.*torch.no_grad"):
         checked_act(policy, None, np.zeros((1, 12)), np.zeros((1, 24, 32)), np.ones(1, bool))
+
+
+def test_a_policy_that_returns_tensors_is_tested_without_a_warning():
+    import torch
+
+    class Tensors(Pursuit):
+        calls = 0
+
+        def act(self, hidden, state, image, fresh):
+            action, hidden = super().act(hidden, state, image, fresh)
+            self.calls += 1
+            return torch.as_tensor(action + self.calls), hidden
+
+    (note,) = check_rows(Tensors(3.0))
+    assert note.fault == "memory_outside"
