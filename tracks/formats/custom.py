@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tracks.common.toml_table import REQUIRED, Table, read_toml
+from tracks.families import FAMILIES
 from tracks.formats.convex_parts import thickness
 from tracks.formats.mesh_reader import load_convex_parts
 from tracks.geometry.gates import rectangle, regular_polygon, with_frames
@@ -68,7 +69,13 @@ def load_track(path: str | os.PathLike[str]) -> Track:
             missing, unknown, of the wrong shape or impossible (a gate below the ground, an
             opening or a mesh that is not convex, a start inside a solid).
     """
-    top = read_toml(as_path("path", path))
+    file = as_path("path", path)
+    if str(file) in FAMILIES and not file.exists():
+        raise ValueError(
+            f"{file}: is a track family, not a file; make_track({str(file)!r}, level, seed) draws "
+            "one of its tracks"
+        )
+    top = read_toml(file)
     top.expect(_TOP_KEYS)
     top.whole("schema", 1, least=1, most=1)
     name = top.text("name", top.path.stem)

@@ -82,9 +82,11 @@ def as_path(name: str, value: object, allowed: str = "a text or a path") -> Path
     """Return the argument `name` as a path.
 
     Raises:
-        ValueError: for an argument that is neither a text nor a path.
+        ValueError: for an argument that is neither a text nor a path, or is empty.
     """
     check_type(name, value, PATH, allowed)
+    if value == "":
+        raise ValueError(f"{name} is '', allowed is {allowed}")
     return Path(value)  # pyrefly: ignore[bad-argument-type]
 
 

@@ -131,6 +131,14 @@ def test_a_bad_file_is_refused_by_name(tmp_path):
         assert str(tmp_path) in str(caught.value), said
 
 
+def test_the_name_of_a_family_is_no_file_unless_there_is_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"zigzag: is a track family.*make_track\('zigzag'"):
+        load_track("zigzag")
+    write(tmp_path, GATE).rename("zigzag")
+    assert load_track("zigzag").family == "zigzag"
+
+
 def test_a_start_inside_a_mesh_is_refused_however_it_is_wound(tmp_path):
     place = "[start]\nposition = [0.4, 0, 1]\n"
     path = write(tmp_path, place + GATE + '[[meshes]]\nfile = "part.obj"\nposition=[0,0,1]\n')

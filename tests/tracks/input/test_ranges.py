@@ -17,7 +17,7 @@ from suite.delta.fit import FitConfig
 from suite.experiments import EXPERIMENTS
 from suite.train.config import QuadrotorConfig, TrainConfig
 from suite.train.ppo.config import PpoConfig
-from tracks.input.ranges import Range, check_ranges, is_finite, shown
+from tracks.input.ranges import Range, as_path, check_ranges, is_finite, shown
 from tracks.input.reading import InputError, read_bytes, read_json, read_toml
 
 
@@ -53,6 +53,12 @@ def test_what_is_outside_of_its_range_is_refused_by_name(config, words):
         check_ranges(config)
     with pytest.raises(ValueError, match="^--late-s is -1.0"):
         check_ranges(Outer(late_s=-1.0), options=True)
+
+
+def test_an_empty_text_is_no_path():
+    with pytest.raises(ValueError, match="policy is '', allowed is a text or a path"):
+        as_path("policy", "")
+    assert str(as_path("policy", ".")) == "."
 
 
 def test_numbers_that_no_float_can_hold_are_shown_short():
