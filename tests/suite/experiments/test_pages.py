@@ -227,7 +227,7 @@ def test_the_counts_of_blind_cases_are_the_sums_of_their_sets():
     rows = [[cell.strip() for cell in line] for line in lines]
     sets = [row for row in rows if len(row) == 9 and " of " in row[3]]
     totals = [row[1:5] for row in rows if len(row) == 6 and " of " in row[1]]
-    assert len(sets) == 15 and len(totals) == 6
+    assert sets and len(totals) == 6
     for column, cells in enumerate(totals, 3):
         pairs = {name: np.zeros(2, int) for name in ("continuous", "MuJoCo", "RotorPy")}
         for row in sets:
