@@ -158,7 +158,8 @@ class RolloutSource(Source):
         rotor speed only. Half of the change counts as the error; for an error of second order it
         would be a third (step doubling; Hairer, Norsett & Wanner 1993, Sec. II.4). Rows further
         apart than the rotors' lag show the torque only to a factor of two, so twice the change
-        counts (`coarser_share`). If the log may lack commands, the whole change counts.
+        counts (`coarser_share`). If the log may lack commands, the whole
+        change counts, and twice the change if it does.
         """
         model, estimate, indices = self.model, found.estimate, found.indices
         windows = of_rollouts(found.last).trusted

@@ -147,7 +147,7 @@ def _with_unknown_commands(made: Stretches) -> Stretches:
         linear._replace(windows=with_input_error(linear.windows, push, error)),
         limits,
         coarser=with_input_error(held, push, error),
-        coarser_share=1.0,
+        coarser_share=2.0,
         push_error=error,
     )
 

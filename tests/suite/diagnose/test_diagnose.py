@@ -317,7 +317,7 @@ def test_the_noise_counts_as_certain_only_if_no_command_is_lacking(monkeypatch):
 
     sparse, complete = slow_and_complete(monkeypatch, count=2, duration_s=6.0)
     source, lacks = source_of(sparse)
-    assert lacks and source.coarser is not None and source.coarser_share == 1.0
+    assert lacks and source.coarser is not None and source.coarser_share == 2.0
     assert sum(source.limits.least_noise) > sum(limits.least_noise)
     assert source.held.input_error.any(axis=(1, 2)).all() and source.between
     source, lacks = source_of(complete)
