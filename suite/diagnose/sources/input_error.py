@@ -52,8 +52,7 @@ def share_between(
     parameters and start numbers.
     """
     noise = measured_noise(linear, limits)
-    known = np.isfinite(difference).all(axis=(1, 2), keepdims=True)
-    toward = -np.where(known, difference, 0.0)[..., None]
+    toward = -_zeroed(difference)[0][..., None]
     whitening = make_whitening(linear, noise, limits)
     # Along all parameters and the share; slopes along start numbers are not needed any more.
     slope = np.concatenate([toward, linear.slope[..., : -linear.offset.shape[1]]], axis=-1)
@@ -94,7 +93,7 @@ def unknown_commands(
     `push_slopes`.
     """
     noise = measured_noise(linear, limits)
-    difference = np.where(np.isfinite(difference).all(axis=(1, 2), keepdims=True), difference, 0.0)
+    difference, _ = _zeroed(difference)
     linear = linear._replace(residual=difference)
 
     def with_error(error: np.ndarray) -> tuple[Linearisation, Whitening]:
@@ -118,8 +117,7 @@ def _unexplained_rms(
 
     `errors` are (W, N, 19); windows that diverge are left out. It is 0 where nothing was measured.
     """
-    known = np.isfinite(errors).all(axis=(1, 2), keepdims=True)
-    errors = np.where(known, errors, 0.0)
+    errors, known = _zeroed(errors)
     unexplained = block_of(whitening, linear._replace(residual=errors), ()).residual
     _, rows, channels = errors.shape
     over_noise = unexplained[:, : rows * channels].reshape(errors.shape)
@@ -129,6 +127,12 @@ def _unexplained_rms(
     # Mean of each channel, and then of each group of channels (three or four of one sensor).
     power = energy / np.maximum(valid.sum(axis=(0, 1)), 1)
     return np.array([np.sqrt(power[channel].mean()) for channel in SLICES.values()])
+
+
+def _zeroed(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return `errors` (W, N, 19), 0 in windows that diverge, and which (W, 1, 1) do not."""
+    known = np.asarray(np.isfinite(errors).all(axis=(1, 2), keepdims=True))
+    return np.where(known, errors, 0.0), known
 
 
 def _raised(error: np.ndarray, limits: Thresholds) -> Thresholds:
