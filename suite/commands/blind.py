@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from suite.common.console import Console
+from suite.common.console import Console, counted
 from suite.common.options import Command
 from suite.common.work import WorkersOption, read_workers_option
 from tracks.common.files import plain
@@ -84,7 +84,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         seed = SETS[config.set] if config.seed is None else config.seed
         manifest = make_set(config.out, seed, config.count, console, config.simulator, workers)
         count, out = len(manifest.cases), config.out
-        console.say(f"{count} cases in {out / 'cases'}, answers in {out / 'answers'}")
+        console.say(f"{counted(count, 'case')} in {out / 'cases'}, answers in {out / 'answers'}")
         for name in manifest.failed:
             console.note(f"warning: {name} could not be made; answers/failed.json has the reason")
         return {"out": str(out), "made": count, "failed": plain(manifest.failed)}
@@ -92,7 +92,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         from suite.blind.run import diagnose_by_command, run_set
 
         done = run_set(config.out, diagnose_by_command, console, workers=workers)
-        console.say(f"{done} cases diagnosed; score them with `suite blind score`")
+        console.say(f"diagnosed: {counted(done, 'case')}; score them with `suite blind score`")
         return {"diagnosed": done, "out": str(config.out)}
     from suite.blind.score import not_run, report, score_set, shares
 

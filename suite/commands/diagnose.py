@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from suite.common.console import Console
+from suite.common.console import Console, counted
 from suite.diagnose.config import Config
 
 
@@ -32,6 +32,6 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         console.say(f"next: {step}")
     if "plan" in result:
         count, folder = len(result["plan"]["flights"]), config.out / "plan"
-        console.say(f"plan: {count} flights{f': {folder}' if count else ''}")
+        console.say(f"plan: {counted(count, 'flight')}{f': {folder}' if count else ''}")
     console.say(f"report: {config.out / 'report.html'}")
     return result

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from suite.common.console import Console
+from suite.common.console import Console, counted
 from suite.common.options import Advanced, Command
 from tracks.common.files import check_no_input, check_place
 from tracks.input.ranges import Range
@@ -100,7 +100,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         console.say(f"note      file: {warning}")
     rows, has_speed = len(log.time_s), np.isfinite(log.speed).any()
     speed_text = f"up to {np.nanmax(log.speed):.1f} m/s" if has_speed else "no speed"
-    console.say(f"{rows} rows, {log.duration_s:.1f} s, {speed_text}: {config.out}")
+    console.say(f"{counted(rows, 'row')}, {log.duration_s:.1f} s, {speed_text}: {config.out}")
     return {
         "flight": str(config.out),
         "rows": rows,

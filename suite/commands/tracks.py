@@ -9,7 +9,7 @@ from typing import Any
 
 import tyro
 
-from suite.common.console import Console
+from suite.common.console import Console, counted
 from suite.common.options import Command
 from suite.common.usage import first_paragraph
 from suite.judging.trials import NO_LEVELS, is_track_file, parse_levels
@@ -70,7 +70,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         write_picture(picture, track)
         # `names` has the gate or obstacle that each solid belongs to.
         gates, solids = len(track.scene.gates.center_w), len(set(track.names))
-        console.say(f"{picture}: {gates} gates, {solids - gates} obstacles")
+        console.say(f"{picture}: {counted(gates, 'gate')}, {counted(solids - gates, 'obstacle')}")
         pictures.append({"picture": picture, "gates": gates, "obstacles": solids - gates})
     answer: dict[str, Any] = {"tracks": pictures}
     if len(tracks) > 1:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from suite.commands.list import list_settings
-from suite.common.console import Console, Silent
+from suite.common.console import Console, Silent, counted
 from suite.common.curve import tensorboard
 from suite.common.options import Advanced, Command
 from suite.common.running.hosts import ProcessOptions, connect, read_member
@@ -182,8 +182,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         }
     last = outcome.last
     console.say(
-        f"{outcome.iterations} iterations; at the end {last['gates']:.2f} gates a rollout, "
-        f"{last['collided']:.0%} collided, {last['speed']:.1f} m/s"
+        f"{counted(outcome.iterations, 'iteration')}; at the end {last['gates']:.2f} gates a "
+        f"rollout, {last['collided']:.0%} collided, {last['speed']:.1f} m/s"
     )
     console.say(f"policy: {outcome.policy}")
     given = {"--vehicle": config.vehicle, "--sensors": config.sensors}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import tyro
 
-from suite.common.console import Console
+from suite.common.console import Console, counted
 from suite.common.options import Advanced, Command
 from tracks.common.files import check_place
 from tracks.common.names import unknown_name
@@ -76,7 +76,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         written.append(write_picture(config.out / f"{_name(rollout)}.png", *rollout))
         result = rollout[2]
         console.say(
-            f"{_name(rollout)}: {result.gates_passed} gates, {result.ending} after "
+            f"{_name(rollout)}: {counted(result.gates_passed, 'gate')}, {result.ending} after "
             f"{result.time_s:.1f} s"
         )
         before = chosen.judged.get(result.trial, result)

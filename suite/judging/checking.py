@@ -25,7 +25,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from policies.contract import contract_of, summary
 from policies.policy import Policy, load_policy
 from policies.spec import Note
-from suite.common.console import Console
+from suite.common.console import Console, counted
 from suite.judging.flying import fly_trials
 from suite.judging.requests import SimulatedFlights
 from suite.judging.trials import read_trial_set
@@ -171,16 +171,17 @@ def _warnings_in_flight(
     if not actions["decisions"]:
         return [], []
     share, count = actions["limited"], actions["decisions"]
-    console.say(f"{share:.1%} of {count} actions were limited in {trials} flights")
+    console.say(f"{share:.1%} of {count} actions were limited in {counted(trials, 'flight')}")
     warnings = [*actions["warnings"], *watched.doubts()]
     if missing := sum(row.late_actions for row in results):
-        text = f"in {missing} of {trials} flights it gave no action"
+        text = f"in {missing} of {counted(trials, 'flight')} it gave no action"
         fix = "correct the error in the warning, and export it again"
         warnings.append(Note("action_missing", text, fix))
     gates = sum(row.gates_passed for row in results)
     ended = Counter("in flight" if row.ended_by == "timeout" else row.ended_by for row in results)
     endings = ", ".join(f"{number} {ending}" for ending, number in ended.items())
-    text = f"in {trials} flights of {TIME_LIMIT_S:g} s at level 0 it passed {gates} gates"
+    flown = f"{counted(trials, 'flight')} of {TIME_LIMIT_S:g} s at level 0"
+    text = f"in {flown} it passed {counted(gates, 'gate')}"
     console.say(f"{text}; at the end: {endings}")
     others = known | {warning.fault for warning in warnings} - UNCLEAR
     unharmed = ended["in flight"] + ended["finished"]

@@ -22,7 +22,7 @@ from eval.vehicles.vehicle import Vehicle
 from eval.worlds import nearest
 from eval.worlds.trial import TrialResult, TrialSpec
 from policies.policy import Policy
-from suite.common.console import Console
+from suite.common.console import Console, counted
 from suite.common.provenance import engines, refuse_other_run, write_run_record
 from suite.common.stages import announce
 from suite.judging.content import PolicyContent
@@ -105,7 +105,7 @@ def collect(
     write_run_record(out, collection, collection.seed)
     logs = [row for row in rows.values() if row["file"]]
     seconds = sum(row["time_s"] for row in logs)
-    console.say(f"{len(logs)} flights, {seconds:.0f} s, in {out}")
+    console.say(f"{counted(len(logs), 'flight')}, {seconds:.0f} s, in {out}")
     if len(logs) < len(rows):
         short = sum(row["time_s"] < DURATION_MIN for row in rows.values())
         console.say(
@@ -174,7 +174,7 @@ def _fly_missing(
     rows, console = logs.rows, logs.console
     missing = [trial for trial in trial_set.trials if trial not in rows]
     workers = workers_for(len(missing), workers, collection.simulator)
-    title = f"{len(missing)} flights in {collection.simulator}"
+    title = f"{counted(len(missing), 'flight')} in {collection.simulator}"
     announce(console, title, flying_estimate(len(missing), workers, collection.simulator))
     show_notes(console, collection.simulator, trial_set)
     with console.progress("flights", len(trial_set.trials), begun=len(rows)) as update:

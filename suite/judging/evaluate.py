@@ -22,7 +22,7 @@ from eval.quadrotor.vehicle_file import load_vehicle, vehicle_table
 from eval.sensors.sensors_file import sensors_table
 from eval.worlds.trial import TrialResult
 from policies.policy import Policy
-from suite.common.console import Console
+from suite.common.console import Console, counted
 from suite.common.provenance import engines, refuse_other_run, write_run_record
 from suite.common.stages import announce, refuse_other_options
 from suite.judging.comparing import TRACK, paired_sentence
@@ -262,7 +262,7 @@ def _fly_entry(
         missing = journal.missing(trials)
         before = len(trials) - len(missing)
         if before:
-            console.note(f"{label}: {before} trials were flown before")
+            console.note(f"{label}: flown before: {counted(before, 'trial')}")
         if others := journal.others(trials):
             console.note(
                 f"{label}: {others} further trials were flown before, which this command does not "

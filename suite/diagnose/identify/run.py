@@ -9,7 +9,7 @@ from typing import Any
 from eval.logs.faults.check import CheckContext
 from eval.logs.faults.checked import COMPENSATED, read_checked
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
-from suite.common.console import Console
+from suite.common.console import Console, counted
 from suite.common.provenance import stamp
 from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.estimate.parameters import refuse_own_motion
@@ -52,8 +52,9 @@ def identify_files(
     checked = read_checked(flights, CheckContext(start), accepted, partial=True)
     logs, slow = without_slow_rotors(checked.logs)
     warnings = [*checked.warnings, *slow]
-    counted = "1 flight" if len(logs) == 1 else f"{len(logs)} flights"
-    console.say(f"{counted}, {sum(log.duration_s for log in logs):.0f} s in all")
+    console.say(
+        f"{counted(len(logs), 'flight')}, {sum(log.duration_s for log in logs):.0f} s in all"
+    )
     if unmodelled := unmodelled_effects(start):
         warnings.append(
             f"{start.name} has {', '.join(unmodelled)}: the fits do not model them, so the "

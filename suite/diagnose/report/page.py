@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from eval.effects import EFFECTS
+from suite.common.console import counted
 from suite.common.report import Details, Links, Part, Picture, Report, Section, Steps
 from suite.diagnose.data.windows import UNITS
 from suite.diagnose.diagnose import Diagnosis
@@ -82,7 +83,7 @@ def page(
     if result["not_examined"]:
         facts["not examined"] = ", ".join(result["not_examined"])
     if result["reference"]:
-        facts["reference"] = f"{len(result['reference'])} flights"
+        facts["reference"] = counted(len(result["reference"]), "flight")
     units = {one.source.name: one.source.unit for one in diagnosis.findings}
     details = [
         Section("Errors on held-out flights", [channels_grid(gap["channels"], units)]),

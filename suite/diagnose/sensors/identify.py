@@ -21,7 +21,7 @@ from eval.logs.flight_log import FlightLog
 from eval.sensors import SENSORS
 from eval.sensors.measured_state import AXES, GROUPS
 from eval.sensors.sensors_file import save_sensors, sensor_set
-from suite.common.console import Console
+from suite.common.console import Console, counted
 from suite.common.provenance import stamp
 from suite.diagnose.identify.numbers import Number, number_lines, numbers_json
 from suite.diagnose.sensors.clock import clock_of, on_gyro_clock
@@ -187,7 +187,8 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
     if not used:
         raise ValueError("no flight can be used:\n" + "\n".join(refused))
     warnings = [*checked.warnings, *(f"not used: {text}" for text in refused)]
-    console.say(f"{len(used)} flights with an estimate and a reference, {seconds:.0f} s in all")
+    flown = counted(len(used), "flight")
+    console.say(f"{flown} with an estimate and a reference, {seconds:.0f} s in all")
     # Move each reference to the gyro's clock, fit, and check on held-out flights.
     clocks = [clock_of(log) for log in used]
     clocks_s = {
@@ -203,7 +204,7 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
             "the estimate and the reference in the same rows"
         )
     parameters = parameters_of(fitted)
-    header = [f"An on-board estimate against a reference in {len(used)} flights; 95 % intervals:"]
+    header = [f"An on-board estimate against a reference in {flown}; 95 % intervals:"]
     if clocks_s:
         low = 1e3 * min(least for least, _ in clocks_s.values())
         high = 1e3 * max(largest for _, largest in clocks_s.values())

@@ -23,7 +23,7 @@ from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import TrialResult, TrialSpec
 from policies.policy import Policy, load_policy
 from policies.spec import NeedsTrust, PolicyError
-from suite.common.console import Console
+from suite.common.console import Console, counted
 from suite.common.provenance import engines
 from suite.common.stages import announce
 from suite.experiments.study.cache import FLIES, Workspace, code_digest, digest
@@ -106,7 +106,9 @@ def fly_trials(
         if remaining:
             workers = workers_for(remaining, workspace.workers, "mujoco")
             cost = sum(relative_cost(one.simulator) * len(one.trials) for one in missing)
-            announce(console, f"{title}: {remaining} trials", flying_estimate(cost, workers))
+            announce(
+                console, f"{title}: {counted(remaining, 'trial')}", flying_estimate(cost, workers)
+            )
             trial_numbers, all_journals = count(total - remaining + 1), list(journals.values())
             with console.progress(title, total, begun=total - remaining) as update:
 

@@ -114,7 +114,7 @@ def test_an_interrupted_eval_goes_on_to_the_same_result(pilots, tmp_path, monkey
         assert evaluate(again, *asked) == 2 and len(flown) == 1
     assert evaluate(again, *asked) == 0
     assert len(flown) == len(set(flown)) == 2, "no trial is flown twice"
-    assert "1 trials were flown before" in printed(capfd)
+    assert "flown before: 1 trial" in printed(capfd)
     assert read_trials(again / "trials.parquet") == read_trials(whole / "trials.parquet")
 
 
@@ -209,7 +209,7 @@ def test_trials_that_are_not_asked_for_again_are_kept_and_said(pilots, tmp_path,
     assert shown == [(1, 2, 2, "0% success")]
     assert [row.seed for row in read_trials(tmp_path / "trials.parquet")] == [2, 3]
     assert evaluate(tmp_path, *asked, 4) == 0
-    assert "4 trials were flown before" in printed(capsys)
+    assert "flown before: 4 trials" in printed(capsys)
     seeds = [row.seed for row in read_trials(tmp_path / "trials.parquet")]
     assert seeds == [0, 1, 2, 3] and not list(tmp_path.glob("journal*"))
 
