@@ -244,7 +244,6 @@ class RolloutModel:
         self.given = arrays_of(vehicle, space)
         self.dt = step_s(vehicle)
         """About the length of a step [s]."""
-        self.integrator = integrator
         _, self._linear, self._respond = compiled(space.layout, rotor_input, voltage, integrator)
 
     def residual(self, at: Estimate, windows: FlightWindows) -> np.ndarray:

@@ -6,7 +6,7 @@ rates, accelerometer, rotor speeds).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -20,12 +20,10 @@ from suite.diagnose.data.flights import ready
 from suite.diagnose.data.view import FORCE
 from suite.diagnose.data.whitening import block_of, make_whitening, slow_energy
 from suite.diagnose.data.windows import (
-    LENGTH_S,
     SLICES,
     STATE_GROUPS,
     UNITS,
     FlightWindows,
-    cut,
     take,
 )
 from suite.diagnose.estimate.gauss_newton import TINY, Z95, solve
@@ -100,12 +98,12 @@ class RolloutSource(Source):
     """The nominal vehicle, which the simulation uses."""
     rotor_input: bool
     """Whether measured rotor speeds are the model's input, not the commands."""
+    cut: Callable[..., tuple[FlightWindows | None, list[str]]]
+    """Cuts windows of the logs, see `Stretches.cut`."""
     held: FlightWindows
     """Overlapping 1 s windows of the held-out part."""
     since_s: float
     """Time in a flight at which its held-out part begins [s]; above 0 only for a single flight."""
-    between: bool = False
-    """Whether the mean of two commands acts between them, since the log lacks commands."""
     coarser: FlightWindows | None = None
     """The fitted windows, but with every second rotor speed only, or with the other course of
     commands (held, or means half-way) if the log may lack commands; None if neither matters. The
@@ -265,9 +263,7 @@ class RolloutSource(Source):
         The errors are measured - simulated (W, N, 19) by the vehicle file and, if something is
         named, by the fitted model. Both start from the state that fits the better model.
         """
-        settings = (self.rotor_input, LENGTH_S, self.limits, self.model.integrator)
-        shown = np.unique(self.held.flight)[:SHOWN].tolist()
-        windows, _ = cut(self.logs, self.vehicle, *settings, only=shown, between=self.between)
+        windows, _ = self.cut(only=np.unique(self.held.flight)[:SHOWN].tolist())
         assert windows is not None  # the diagnosis has cut them before
         windows = take(windows, np.asarray(windows.start_s) >= self.since_s - ROUNDING_S)
         noise, best = of_rollouts(found.last).noise, found.estimate.theta

@@ -118,10 +118,10 @@ def by_rollouts(given: DiagnosisInput) -> SourceSet | None:
         logs=logs,
         vehicle=vehicle,
         rotor_input=rotor_input,
+        cut=made.cut,
         held=held,
         # Of a lone flight the end is held out.
         since_s=since_s if np.isin(not_fitted.flight, fitted.flight).any() else 0.0,
-        between=made.push_error is not None,
         coarser=None if made.coarser is None else take(made.coarser, is_fitted),
         coarser_share=made.coarser_share,
     )

@@ -319,7 +319,7 @@ def test_the_noise_counts_as_certain_only_if_no_command_is_lacking(monkeypatch):
     source, lacks = source_of(sparse)
     assert lacks and source.coarser is not None and source.coarser_share == 2.0
     assert sum(source.limits.least_noise) > sum(limits.least_noise)
-    assert source.held.input_error.any(axis=(1, 2)).all() and source.between
+    assert source.held.input_error.any(axis=(1, 2)).all() and source.cut.keywords["between"]
     source, lacks = source_of(complete)
     assert not lacks and source.coarser is None and source.limits == limits
     shifted = with_effects(LAGGED, clock_offset=(-0.004,))
