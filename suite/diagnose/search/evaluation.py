@@ -172,7 +172,11 @@ class SearchResult:
         theta = self.start.theta.copy()
         theta[indices] = self.estimate.theta[indices]
         begin = Estimate(theta, self.estimate.free) if named else self.start
-        last = judged = self.judged.evidence.fitted(begin, indices)
-        if self.judged is not self.last:
-            last = self.last.evidence.fitted(judged.at, indices, 0)  # no step: evaluated only
+        return self.with_fit(named, self.judged.evidence.fitted(begin, indices))
+
+    def with_fit(self, named: Sequence[NamedEffect], judged: Evaluation) -> SearchResult:
+        """Return this result with the effects `named`, of which `judged` is the fit."""
+        last = judged
+        if self.judged is not self.last:  # no step: evaluated only
+            last = self.last.evidence.fitted(judged.at, fitted_by(named), 0)
         return replace(self, named=tuple(named), last=last, judged=judged)

@@ -90,6 +90,18 @@ def search(
     return SearchResult(tuple(named), start, last, judged, first)
 
 
+def settled(
+    found: SearchResult, among: Sequence[Candidate], say: Callable[[str], None], seed: int
+) -> SearchResult:
+    """Return `found` with each name tested again, against all candidates of `among`.
+
+    A name that was withdrawn may have hidden a better candidate, or alternatives, of the others.
+    """
+    evidence = found.judged.evidence
+    named, at = _settle(SearchTask(among, say, seed), evidence, found.estimate, list(found.named))
+    return found.with_fit(named, _final_fit(evidence, at, named))
+
+
 def _one_name_per_effect(name: NamedEffect) -> list[NamedEffect]:
     """Return a name for each effect of a composite, or the given name of a single effect."""
     return [replace(name, candidate=single) for single in name.candidate.singles]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,8 +51,68 @@ def examine(
     if not found.named and source.fallback:
         by_fallback = source.fallback.search(say, seed)
         source, found = (source.fallback, by_fallback) if by_fallback.named else (source, found)
-    # Test on held-out flights: first all named effects together, then (in rollouts) each alone.
-    before = after = source.gap(found, found.start.theta)
+    before = source.gap(found, found.start.theta)
+    tested = _tested(source, found, before)
+    left_out = {c.name for c in found.candidates} - {c.name for c in tested.found.candidates}
+    if left_out and tested.found.named and not source.names_small:
+        # Without them, another candidate may explain the flights better than one of the names.
+        again = source.settled(tested.found, left_out, say, seed)
+        tested = tested.followed_by(_tested(source, again, before), source.small_explains)
+    found, after, sizes = tested.found, tested.after, tested.sizes
+    warnings += tested.warnings
+    remaining = source.remaining(*tested.explained, seed)
+    if tested.too_small and source.small_explains and not remaining.wind:
+        remaining = remaining._replace(reason=TOO_SMALL)
+    if remaining.wind and found.named and not source.is_worse(after, before):
+        # Several constant effects together can imitate a wind that is correlated over seconds. If
+        # held-out flights are no worse without these effects, the wind is the simpler cause.
+        found, after, sizes = found.refitted(()), before, {}
+        remaining = source.remaining(found, (before, before), seed)
+    labels = ", ".join(one.label for one in found.candidates) or "nothing"
+    gaps = [rounded(gap.rms, 3) for gap in (before, after)]
+    say(f"{source.name}: {labels}; gap {gaps[0]} as given, {gaps[1]} with it")
+    return Finding(
+        source=source,
+        search=found,
+        names=found.named,
+        before=before,
+        after=after,
+        without={one.label: tested.without[one.label] for one in found.candidates},
+        half_width=dict(zip(found.indices, map(float, found.half_widths()), strict=True)),
+        sizes=sizes,
+        negligible=tuple(tested.too_small),
+        remaining=remaining,
+        control=control(source, found) if found.named else None,
+    ), warnings
+
+
+class _Tested(NamedTuple):
+    """The names of a search that passed all tests."""
+
+    found: SearchResult
+    after: Gap
+    """Gap with them."""
+    without: dict[str, Gap]
+    """Gap without each of them, by its label."""
+    sizes: dict[str, EffectSize]
+    """Their sizes by name."""
+    too_small: list[tuple[str, EffectSize]]
+    """Names and sizes of the effects that were left out as too small."""
+    explained: tuple[SearchResult, tuple[Gap, Gap]]
+    """The search result for which the remaining error counts, and the gaps before and after it."""
+    warnings: list[str]
+
+    def followed_by(self, later: _Tested, small_explains: bool) -> _Tested:
+        """Return the result of a second test, `later`, with what the first one left out."""
+        explained = self.explained if self.too_small and small_explains else later.explained
+        too_small, warnings = self.too_small + later.too_small, self.warnings + later.warnings
+        return later._replace(explained=explained, too_small=too_small, warnings=warnings)
+
+
+def _tested(source: Source, found: SearchResult, before: Gap) -> _Tested:
+    """Test the names of `found` on held-out flights, and for relevance; `before` is the gap."""
+    # On held-out flights: first all named effects together, then (in rollouts) each alone.
+    after, warnings = before, list[str]()
     if found.named:
         after = source.gap(found, found.estimate.theta)
     if found.named and source.is_worse(before, after):
@@ -84,30 +145,7 @@ def examine(
         warnings.append(f"{name}: left out, {reason}: {size.words()}")
     if not source.small_explains:
         explained = found, (before, after)
-    remaining = source.remaining(*explained, seed)
-    if too_small and source.small_explains and not remaining.wind:
-        remaining = remaining._replace(reason=TOO_SMALL)
-    if remaining.wind and found.named and not source.is_worse(after, before):
-        # Several constant effects together can imitate a wind that is correlated over seconds. If
-        # held-out flights are no worse without these effects, the wind is the simpler cause.
-        found, after, sizes = found.refitted(()), before, {}
-        remaining = source.remaining(found, (before, before), seed)
-    labels = ", ".join(one.label for one in found.candidates) or "nothing"
-    gaps = [rounded(gap.rms, 3) for gap in (before, after)]
-    say(f"{source.name}: {labels}; gap {gaps[0]} as given, {gaps[1]} with it")
-    return Finding(
-        source=source,
-        search=found,
-        names=found.named,
-        before=before,
-        after=after,
-        without={one.label: without[one.label] for one in found.candidates},
-        half_width=dict(zip(found.indices, map(float, found.half_widths()), strict=True)),
-        sizes=sizes,
-        negligible=tuple(too_small),
-        remaining=remaining,
-        control=control(source, found) if found.named else None,
-    ), warnings
+    return _Tested(found, after, without, sizes, too_small, explained, warnings)
 
 
 def without_names(finding: Finding, seed: int) -> Finding:

@@ -11,7 +11,7 @@ Arrays of parameters have P entries: all parameters of all effects in the catalo
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
 from suite.diagnose.evidence.evidence import Evaluation
 from suite.diagnose.search.evaluation import NamedEffect, SearchResult
-from suite.diagnose.search.search import search
+from suite.diagnose.search.search import search, settled
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.actuators import TestedEffect
 from suite.diagnose.verdict.disturbances import Swing
@@ -145,6 +145,13 @@ class Source(ABC):
     def search(self, say: Callable[[str], None], seed: int) -> SearchResult:
         """Search for the effects that explain the fitted flights."""
         return search(self.begin, self.candidates, say, seed)
+
+    def settled(
+        self, found: SearchResult, left_out: Collection[str], say: Callable[[str], None], seed: int
+    ) -> SearchResult:
+        """Test the names of `found` again, without the candidates of the `left_out` effects."""
+        among = [c for c in self.candidates if not {one.name for one in c.singles} & {*left_out}]
+        return settled(found, among, say, seed)
 
     def is_worse(self, before: Gap, after: Gap) -> bool:
         """Return whether held-out flights contradict effects that change the gap to `after`.

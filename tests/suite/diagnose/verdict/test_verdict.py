@@ -14,7 +14,7 @@ from suite.diagnose.estimate.gauss_newton import Intervals
 from suite.diagnose.estimate.parameters import Candidate
 from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.search.evaluation import NamedEffect
-from suite.diagnose.sources.examine import confirmed, relevant_part
+from suite.diagnose.sources.examine import confirmed, examine, relevant_part
 from suite.diagnose.sources.rollout_source import of_rollouts, structure_where
 from suite.diagnose.sources.source import TOGETHER, TOO_SMALL, Remaining, sizes_by_effect
 from suite.diagnose.sources.view_source import ViewSource
@@ -148,9 +148,9 @@ def test_a_random_disturbance_has_its_size_or_none_at_the_end_of_the_tried_value
     assert _range_of(sizes, sizes > 1.0) is None
 
 
-def spoilt(found_drag, steps):
+def spoilt(found_drag, steps, found=None):
     """Return what was found, and a torque of so many steps that is not there."""
-    found, space = found_drag.search, found_drag.source.space
+    found, space = found or found_drag.search, found_drag.source.space
     other = next(s.candidate for s in found.first if s.candidate.name == "torque_trim")
     theta, at = found.estimate.theta.copy(), list(other.indices)
     theta[at] += steps * space.array("step")[at]
@@ -175,6 +175,17 @@ def test_a_name_that_held_out_flights_contradict_is_withdrawn_and_no_other(found
     assert [one.label for one in kept.candidates] == labels and set(without) == set(labels)
     theta = found.estimate.theta
     np.testing.assert_allclose(kept.estimate.theta[kept.indices], theta[kept.indices], rtol=0.05)
+
+
+def test_after_a_withdrawal_another_effect_may_explain_more_than_a_name(found_drag, monkeypatch):
+    wrong = next(s.candidate for s in found_drag.search.first if s.candidate.label == "rotor_drag")
+    found = found_drag.search.refitted([NamedEffect(wrong, 0.001, 20.0)])
+    found = spoilt(found_drag, 0.03, found)
+    monkeypatch.setattr(type(found_drag.source), "search", lambda *_: found)
+    again, warnings = examine(found_drag.source, [], lambda _: None, 0)
+    assert warnings == ["torque_trim: withdrawn, held-out flights are no better for it"]
+    assert [one.candidate.name for one in again.names] == ["linear_drag"]
+    np.testing.assert_allclose(again.theta, found_drag.theta, rtol=0.01, atol=1e-6)
 
 
 def test_where_the_model_lacks_something_a_name_must_explain_a_share_of_the_rest(found_drag):
