@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -152,6 +153,11 @@ def stdout_kept_clean() -> Iterator[None]:
         sys.stdout.flush()
         os.dup2(stdout_copy, 1)
         os.close(stdout_copy)
+
+
+def command_line(*words: object) -> str:
+    """Return a command to copy into a shell: a path with spaces is quoted."""
+    return shlex.join(map(str, words))
 
 
 def duration(seconds: float) -> str:

@@ -22,7 +22,7 @@ from eval.quadrotor.vehicle_file import load_vehicle, vehicle_table
 from eval.sensors.sensors_file import sensors_table
 from eval.worlds.trial import TrialResult
 from policies.policy import Policy
-from suite.common.console import Console
+from suite.common.console import Console, command_line
 from suite.common.provenance import engines, refuse_other_run, write_run_record
 from suite.common.stages import announce, refuse_other_options
 from suite.judging.comparing import TRACK, paired_sentence
@@ -152,8 +152,9 @@ def evaluate(
         )
     console.say(f"written: {out / 'trials.parquet'}, table.md, summary.json")
     if not all(row.success for row in results if not row.policy.endswith("+monitor")):
-        trust = " --trust" * evaluation.trust
-        console.say(f"next: suite view {out} --pick failed{trust} shows what went wrong")
+        trust = ["--trust"] * evaluation.trust
+        line = command_line("suite", "view", out, "--pick", "failed", *trust)
+        console.say(f"next, to see what went wrong: {line}")
     return {**stamp(1, evaluation.seed), **summary, "out": str(out)}
 
 
