@@ -159,6 +159,8 @@ def test_what_the_system_refuses_is_one_line_with_the_file_and_a_mistake_of_ours
         assert code == (UNUSABLE if name in usage else FAILED) and "runs/x" in said, name
         assert name == "ENOSPC" or os.strerror(number).lower() in said
     assert explain(OSError(errno.EBADF, "Bad file descriptor")) is None
+    _, said = explain(OSError(errno.EACCES, "Permission denied", "runs")) or (None, "")
+    assert said == "permission denied: runs; change its permissions, or give another path"
     code, said = explain(FileExistsError(errno.EEXIST, "File exists", "runs/x")) or (None, "")
     assert code == UNUSABLE and "a file exists: runs/x; give another --out" in said
 
