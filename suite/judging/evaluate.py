@@ -195,13 +195,13 @@ def _sentences(results: Sequence[TrialResult]) -> list[str]:
 
 
 def _actions(entry: Entry, results: Sequence[TrialResult], console: Console) -> dict[str, Any]:
-    """Print and return how many actions of an entry exceeded the limits, with warnings."""
+    """Return the counts of an entry's actions; print how many exceeded the limits, and warnings."""
     rows = [result for result in results if result.policy == entry.label]
     actions = action_report(rows, entry.policy.spec.action)
-    if actions["decisions"]:
+    if limited := sum(row.limited_actions for row in rows):
         console.say(
-            f"{entry.label}: {actions['limited']:.1%} of {actions['decisions']} actions exceeded "
-            "the limits and were reduced"
+            f"{entry.label}: {limited} of {actions['decisions']} actions exceeded the limits and "
+            "were reduced"
         )
     for warning in actions["warnings"]:
         console.note(f"warning: {entry.label}: {warning}")

@@ -272,6 +272,7 @@ def test_what_other_commands_take_by_name_is_listed(capfd):
         assert cli.main(["list", kind, "--json"]) == 0
         abouts = json.loads(capfd.readouterr().out)[kind]
         assert sorted(abouts) == found[kind] and all(abouts.values())
+        assert not any(text.startswith("Return") for text in abouts.values())
     assert cli.main(["list", "trakcs"]) == 2
     assert "Did you mean 'tracks'" in capfd.readouterr().err
 
