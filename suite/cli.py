@@ -95,11 +95,19 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
     """Return the module of the command `name` and its configuration from `args`.
 
     Raises:
-        ValueError: for an option that is given twice, and for a word that belongs to no option.
+        ValueError: for an option that is given twice, a word that is empty, and one that belongs to
+            no option.
         SystemExit: after --help (code 0), and for options that cannot be read (code 2).
     """
     from suite.common.options import options, read_options
 
+    for before, word in zip([name, *args], args, strict=False):
+        # An empty path would be the current folder.
+        if word == "" or (word.startswith("--") and word.endswith("=")):
+            where = word or f"{before} ''"
+            raise ValueError(
+                f"{where}: the value is empty; perhaps a variable of the shell is not set"
+            )
     command = importlib.import_module(f"suite.commands.{name}")
     kind, prog = command.Config, f"suite {name}"
     if hasattr(command, "config_of"):

@@ -2,6 +2,7 @@
 
 import gc
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,9 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 ROOT = Path(__file__).resolve().parent.parent
+# dm_control is not installed there (docs/install.md).
+NO_DM_CONTROL = ["eval/envs/test_envs.py", "eval/envs/test_settings.py"]
+collect_ignore = NO_DM_CONTROL if sys.version_info >= (3, 13) else []
 TOGETHER = (
     "suite/diagnose",
     "suite/blind",

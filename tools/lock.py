@@ -53,14 +53,25 @@ def closure(requirements: list[str]) -> dict[str, str]:
     return versions
 
 
+def lines(requirements: list[str]) -> list[str]:
+    """Return the lock's lines. A package of marked requirements only has their marker."""
+    markers: dict[str, str] = {}
+    for text in sorted(requirements, key=lambda text: Requirement(text).marker is not None):
+        marker = Requirement(text).marker
+        for name in closure([text]):
+            markers.setdefault(name, f"; {marker}" if marker else "")
+    versions = closure(requirements)
+    return [f"{name}=={version}{markers[name]}" for name, version in sorted(versions.items())]
+
+
 def main() -> None:
     """Print the lock of the checkout that this script is in."""
     root = Path(__file__).resolve().parent.parent
     project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     requirements = project["dependencies"] + project["optional-dependencies"]["dev"]
     print(HEADER, end="")
-    for name, version in sorted(closure(requirements).items()):
-        print(f"{name}=={version}")
+    for line in lines(requirements):
+        print(line)
 
 
 if __name__ == "__main__":

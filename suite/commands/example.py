@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from suite.common.console import Console
+from suite.common.console import Console, command_line
 from suite.common.options import Command
 
 
@@ -32,7 +32,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     contents = _real_files() if config.real else _simulated_files()
     for name, content in contents.items():
         # The commands of the README read the files of this folder.
-        content = content.replace(b"FOLDER", str(config.out).encode()) if ".md" in name else content
+        folder = command_line(config.out).encode()
+        content = content.replace(b"FOLDER", folder) if ".md" in name else content
         with replacing_file(config.out / name) as new:
             new.write_bytes(content)
     names = sorted(contents)
@@ -42,13 +43,14 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     else:
         from eval.logs.flight_log import logs_in
 
-        vehicle, flights = config.out / "vehicle.toml", str(config.out)
+        vehicle, flights = config.out / "vehicle.toml", [config.out]
         logs = [path for path in logs_in(config.out) if path.name in contents]
         if others := len(logs_in(config.out)) - len(logs):
             text = f"{config.out} holds {others} flight(s) that are not the example's"
             console.note(f"warning: {text}")
-            flights = " ".join(map(str, logs))
-        console.say(f"next: suite diagnose {flights} --vehicle {vehicle} --out runs/example")
+            flights = logs
+        options = ["--vehicle", vehicle, "--out", "runs/example"]
+        console.say(f"next: {command_line('suite', 'diagnose', *flights, *options)}")
     return {"folder": str(config.out), "files": names}
 
 

@@ -94,7 +94,8 @@ def _line(kind: str, name: str) -> str:
     entry = _entries(kind)[name]
     if isinstance(entry, str):
         return entry
-    return getattr(entry, "summary", "") or first_paragraph(entry.__doc__)
+    text = getattr(entry, "summary", "") or first_paragraph(entry.__doc__).removeprefix("Return ")
+    return f"{text[:1].upper()}{text[1:]}"
 
 
 def _vehicle(name: str) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from suite.commands.list import list_settings
-from suite.common.console import Console, Silent, counted
+from suite.common.console import Console, Silent, command_line, counted
 from suite.common.curve import tensorboard
 from suite.common.options import Advanced, Command
 from suite.common.running.hosts import ProcessOptions, connect, read_member
@@ -187,6 +187,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     )
     console.say(f"policy: {outcome.policy}")
     given = {"--vehicle": config.vehicle, "--sensors": config.sensors}
-    options = "".join(f" {name} {value}" for name, value in given.items() if value is not None)
-    console.say(f"next: suite eval --policy {outcome.policy} --difficulty 0{options}")
+    options = [word for item in given.items() if item[1] is not None for word in item]
+    line = command_line("suite", "eval", "--policy", outcome.policy, "--difficulty", 0, *options)
+    console.say(f"next: {line}")
     return plain(outcome)

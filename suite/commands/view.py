@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import tyro
 
-from suite.common.console import Console, counted
+from suite.common.console import Console, command_line, counted
 from suite.common.options import Advanced, Command
 from tracks.common.files import check_place
 from tracks.common.names import unknown_name
@@ -91,7 +91,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             written.append(_write_video(config.out / name, rollouts[0], console))
     for path in written:
         console.say(f"written: {path}")
-    console.say(f"open the recording with: rerun {recording}")
+    console.say(f"open the recording with: {command_line('rerun', recording)}")
     return {"written": written, "trials": [result for _, _, result in rollouts]}
 
 

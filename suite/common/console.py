@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -13,8 +14,9 @@ from tracks.common.names import printable
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
-    from rich.console import ConsoleOptions, RenderableType
+    from rich.console import ConsoleOptions
     from rich.segment import Segment
+    from rich.table import Table
 
 PLAIN_PERIOD_S = 10.0
 """Time between two lines about the progress if standard error is no terminal [s]."""
@@ -37,12 +39,14 @@ class Console:
         """Print a line of the command's result (on standard error under --json)."""
         print(printable(text), flush=True)
 
-    def show(self, table: RenderableType) -> None:
+    def show(self, table: Table) -> None:
         """Print a rich table; its width is not limited if standard output is no terminal."""
         from rich.console import Console as RichConsole
 
         width = None if sys.stdout.isatty() else 200
-        RichConsole(file=sys.stdout, width=width).print(_Printable(table))
+        console = RichConsole(file=sys.stdout, width=width)
+        _fit(table, console)
+        console.print(_Printable(table))
 
     def note(self, text: str) -> None:
         """Print a line about the progress, or a warning, on standard error."""
@@ -81,10 +85,30 @@ class Console:
         yield update
 
 
+def _fit(table: Table, console: RichConsole) -> None:
+    """Set the widths of a table's columns so that a narrow terminal cuts no text.
+
+    Lines break between words. If even the longest words do not fit, they break too.
+    """
+    from rich.measure import Measurement
+
+    texts = [(column.header, *column.cells) for column in table.columns]
+    sizes = [[Measurement.get(console, console.options, text) for text in cells] for cells in texts]
+    words = [max(size.minimum for size in column) for column in sizes]
+    # A column has a border and, if there is room, a space on either side.
+    padding = int(sum(words) + 3 * len(words) < console.width)
+    table.padding = (0, padding)
+    spare = console.width - 1 - sum(words) - (1 + 2 * padding) * len(words)
+    for column, word, column_sizes in zip(table.columns, words, sizes, strict=True):
+        more = min(max(spare, 0), max(size.maximum for size in column_sizes) - word)
+        column.width, column.overflow = word + more, "fold"
+        spare -= more
+
+
 class _Printable:
     """A table without unprintable characters; rich's own control codes are kept."""
 
-    def __init__(self, table: RenderableType) -> None:
+    def __init__(self, table: Table) -> None:
         self._table = table
 
     def __rich_console__(self, console: RichConsole, options: ConsoleOptions) -> Iterator[Segment]:
@@ -98,7 +122,7 @@ class Quiet(Console):
     def say(self, text: str = "") -> None:
         """Print nothing."""
 
-    def show(self, table: RenderableType) -> None:
+    def show(self, table: Table) -> None:
         """Print nothing."""
 
 
@@ -157,6 +181,11 @@ def stdout_kept_clean() -> Iterator[None]:
         sys.stdout.flush()
         os.dup2(stdout_copy, 1)
         os.close(stdout_copy)
+
+
+def command_line(*words: object) -> str:
+    """Return a command to copy into a shell: a path with spaces is quoted."""
+    return shlex.join(map(str, words))
 
 
 def duration(seconds: float) -> str:

@@ -84,7 +84,9 @@ def _explain_os(error: OSError) -> tuple[int, str] | None:
         return FAILED, f"the disk is full{file}; {hint}"
     if isinstance(error, FileExistsError) and error.filename:
         return UNUSABLE, f"a folder is needed, but a file exists{file}; give another --out"
-    if isinstance(error, (*_NO_SUCH_INPUT, PermissionError)) or error.errno in _BAD_PATH:
+    if isinstance(error, PermissionError):
+        return UNUSABLE, f"permission denied{file}; change its permissions, or give another path"
+    if isinstance(error, _NO_SUCH_INPUT) or error.errno in _BAD_PATH:
         return UNUSABLE, f"{(error.strerror or 'cannot be used').lower()}{file}"
     if error.errno and error.errno not in _BUGS:
         return FAILED, f"{(error.strerror or 'the system refuses').lower()}{file}"

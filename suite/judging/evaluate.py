@@ -22,7 +22,7 @@ from eval.quadrotor.vehicle_file import load_vehicle, vehicle_table
 from eval.sensors.sensors_file import sensors_table
 from eval.worlds.trial import TrialResult
 from policies.policy import Policy
-from suite.common.console import Console, counted
+from suite.common.console import Console, command_line, counted
 from suite.common.provenance import engines, refuse_other_run, write_run_record
 from suite.common.stages import announce, refuse_other_options
 from suite.judging.comparing import TRACK, paired_sentence
@@ -152,8 +152,9 @@ def evaluate(
         )
     console.say(f"written: {out / 'trials.parquet'}, table.md, summary.json")
     if not all(row.success for row in results if not row.policy.endswith("+monitor")):
-        trust = " --trust" * evaluation.trust
-        console.say(f"next: suite view {out} --pick failed{trust} shows what went wrong")
+        trust = ["--trust"] * evaluation.trust
+        line = command_line("suite", "view", out, "--pick", "failed", *trust)
+        console.say(f"next, to see what went wrong: {line}")
     return {**stamp(1, evaluation.seed), **summary, "out": str(out)}
 
 
@@ -194,13 +195,13 @@ def _sentences(results: Sequence[TrialResult]) -> list[str]:
 
 
 def _actions(entry: Entry, results: Sequence[TrialResult], console: Console) -> dict[str, Any]:
-    """Print and return how many actions of an entry exceeded the limits, with warnings."""
+    """Return the counts of an entry's actions; print how many exceeded the limits, and warnings."""
     rows = [result for result in results if result.policy == entry.label]
     actions = action_report(rows, entry.policy.spec.action)
-    if actions["decisions"]:
+    if limited := sum(row.limited_actions for row in rows):
         console.say(
-            f"{entry.label}: {actions['limited']:.1%} of {actions['decisions']} actions exceeded "
-            "the limits and were reduced"
+            f"{entry.label}: {limited} of {actions['decisions']} actions exceeded the limits and "
+            "were reduced"
         )
     for warning in actions["warnings"]:
         console.note(f"warning: {entry.label}: {warning}")

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from eval.judging.results import read_trials
 from suite.common.charts import dots, legend, percent_axis, png, titled
-from suite.common.console import Console, duration
+from suite.common.console import Console, command_line, duration
 from suite.common.report import Details, Links, Part, Picture, Report, Section, html
 from suite.common.stages import claim, run_stages, stage_commits
 from suite.judging.flying import checkpoint_folder
@@ -135,7 +135,7 @@ def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any
     if loop.hidden:
         console.say(f"diagnosis: {out / 'diagnosis' / 'report.html'}")
     recording = out / "recording.rrd"
-    console.say(f"recording: {recording} (open it with: rerun {recording})")
+    console.say(f"recording: {recording} (open it with: {command_line('rerun', recording)})")
     return {**plain(answer), "out": str(out)}
 
 

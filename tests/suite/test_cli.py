@@ -108,6 +108,12 @@ def test_a_wrong_command_or_option_is_code_2(command, capsys, line, words):
     assert said.out == "" and words in said.err and "Traceback" not in said.err
 
 
+@pytest.mark.parametrize("words", [("--out", ""), ("--out=",), ("", "--vehicle", "racer5")])
+def test_an_empty_word_is_not_the_current_folder(words, capsys):
+    said = refused(capsys, "eval" if words[0] else "diagnose", *words)
+    assert words[0] in said and "a variable of the shell" in said
+
+
 def test_a_list_may_have_commas_or_spaces_and_some_options_may_be_given_again():
     for line, track, levels in (
         ("--track zigzag circular", "zigzag,circular", "0,3"),
@@ -266,6 +272,7 @@ def test_what_other_commands_take_by_name_is_listed(capfd):
         assert cli.main(["list", kind, "--json"]) == 0
         abouts = json.loads(capfd.readouterr().out)[kind]
         assert sorted(abouts) == found[kind] and all(abouts.values())
+        assert not any(text.startswith("Return") for text in abouts.values())
     assert cli.main(["list", "trakcs"]) == 2
     assert "Did you mean 'tracks'" in capfd.readouterr().err
 

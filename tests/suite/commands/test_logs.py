@@ -1,5 +1,6 @@
 """Commands on logs: check, import, identify and example."""
 
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -215,6 +216,17 @@ def test_the_command_copies_all_a_diagnosis_needs(tmp_path, capsys):
     said = capsys.readouterr()
     assert "1 flight(s) that are not the example's" in said.err
     assert "flight_3.parquet --vehicle" in said.out and "mine" not in said.out
+
+
+def test_the_next_command_can_be_pasted_if_the_folder_has_a_space(tmp_path, capsys):
+    folder = tmp_path / "my flights"
+    for option in ((), ("--real",)):
+        assert run("example --out", folder, *option) == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if "next: suite" in line)
+    assert shlex.split(line)[3] == str(folder)
+    text = (folder / "README.md").read_text()
+    (line,) = [line for line in text.splitlines() if "import" in line and "eight" in line]
+    assert shlex.split(line)[2] == f"{folder}/B3_figure8_fast_rep1.csv"
 
 
 def test_the_real_flights_come_as_published(tmp_path, capsys):

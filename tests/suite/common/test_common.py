@@ -5,6 +5,7 @@ import errno
 import json
 import multiprocessing
 import os
+import re
 import struct
 import sys
 import traceback
@@ -38,7 +39,7 @@ from suite.experiments.study.training import training_origin
 from suite.judging.requests import Collection, Evaluation
 from suite.judging.trials import parse_levels, parse_tracks
 from tests.support.jobs import die, diverge, double, pad_one_box
-from tracks.common.grid import Cell, Grid
+from tracks.common.grid import Cell, Grid, rich_table, table
 from tracks.common.provenance import stamp, stamp_text
 from tracks.common.work import core_shares, usable_cores
 
@@ -158,6 +159,8 @@ def test_what_the_system_refuses_is_one_line_with_the_file_and_a_mistake_of_ours
         assert code == (UNUSABLE if name in usage else FAILED) and "runs/x" in said, name
         assert name == "ENOSPC" or os.strerror(number).lower() in said
     assert explain(OSError(errno.EBADF, "Bad file descriptor")) is None
+    _, said = explain(OSError(errno.EACCES, "Permission denied", "runs")) or (None, "")
+    assert said == "permission denied: runs; change its permissions, or give another path"
     code, said = explain(FileExistsError(errno.EEXIST, "File exists", "runs/x")) or (None, "")
     assert code == UNUSABLE and "a file exists: runs/x; give another --out" in said
 
@@ -349,3 +352,18 @@ def test_jobs_come_back_in_order_from_processes_that_share_no_core_or_say_what_f
         do_jobs(die, jobs(1), 2, Console(), "dying")
     with pytest.raises(WorkFailed, match=r"^training 1 diverged$"):
         do_jobs(diverge, jobs(1), 2, Console(), "training")
+
+
+@pytest.mark.parametrize("width", [40, 80, 120, 200])
+def test_a_table_in_a_narrow_terminal_keeps_every_text(width, monkeypatch, capsys):
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", str(width))
+    headers = "policy,track,level,trials,success,gates,v_max [m/s],v_mean [m/s],lap [s],ended"
+    row = "race;circular;0;9;99 % [72, 100];8.0;6.97 [6.71, 7.11];5.43;7.57 [6.66, 8.7];collision 1"
+    Console().show(rich_table(table(headers.split(","), [row.split(";")])))
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out).splitlines()
+    assert max(map(len, lines)) <= width
+    parts = zip(*(line.split("│")[1:-1] for line in lines if "│" in line), strict=True)
+    assert ";".join("".join(part) for part in parts).replace(" ", "") == row.replace(" ", "")
+    whole = [text for line in lines for text in line.replace("│", " ").split()]
+    assert width == 40 or {"circular", "[6.71,", "collision"} <= {*whole}
