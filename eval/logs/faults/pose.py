@@ -316,9 +316,9 @@ def _force_misfits(
         # Of each reading: (components, readings, N).
         force, vel_b = _in_body(changes, body, acc), _in_body(changes, body[:, :2], vel)
         force = force + GRAVITY * body[2][:, None]
-        speed = vel_b - vel_b.mean(axis=-1, keepdims=True)
-        slope = (speed * force[:2]).sum(-1) / np.maximum((speed**2).sum(-1), 1e-9)
-        side = force[:2] - np.clip(slope, -DRAG, 0.0)[..., None] * speed
+        change = vel_b - vel_b.mean(axis=-1, keepdims=True)
+        slope = (change * force[:2]).sum(-1) / np.maximum((change**2).sum(-1), 1e-9)
+        side = force[:2] - np.clip(slope, -DRAG, 0.0)[..., None] * vel_b
         side = side - np.clip(side.mean(axis=-1, keepdims=True), -BIAS, BIAS)
         wrong = (side**2).sum(axis=0) + np.minimum(force[2], 0.0) ** 2  # thrust only pushes
         tilt = GRAVITY * body[:2, 2]

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from eval.effects.interface import GRAVITY
 from eval.logs.faults.check import CheckContext, check_log
+from eval.logs.faults.clocks import path
+from eval.logs.faults.clocks.path import check_position_delay
 from eval.logs.faults.heading import check_heading
+from eval.logs.faults.pose import axes_of
 from tests.support.diagnosis_flights import fly, without_fault
 from tests.support.marks import more
 from tests.support.vehicles import PLAIN, with_effects
@@ -87,6 +91,37 @@ def test_a_position_in_time_and_wrong_axes_are_no_delay(log):
     assert findings(shifted(log, 0.03))[0] == []
     swapped = replace(log, pos_w=log.pos_w[:, [1, 0, 2]], vel_w=log.vel_w[:, [1, 0, 2]])
     assert "position_delay" not in {finding.fault for finding in findings(swapped)[0]}
+
+
+def circling(speed, radius_m, spacing_s, drag=0.4):
+    """Return rows of a circle, the nose along the path and the speed changing by a third."""
+    time_s = np.arange(0.0, 10.0, spacing_s)
+    turn = speed / radius_m
+    angle = turn * time_s + np.sin(turn * time_s) / 3.0
+    pos = radius_m * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    vel = np.gradient(pos, time_s, axis=0)
+    up = np.gradient(vel, time_s, axis=0) + drag * vel + [0.0, 0.0, GRAVITY]
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    left = np.cross(up, vel)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    axes = np.stack([np.cross(left, up), left, up], axis=-1)
+    quat = Rotation.from_matrix(axes).as_quat(scalar_first=True)
+    return {"time": time_s, "pos": pos, "quat": quat}
+
+
+def test_the_drag_of_a_fast_flight_forwards_is_no_delay():
+    (found,) = check_position_delay(circling(7.0, 5.0, 0.0025))
+    assert found.status == "ok"
+
+
+def test_noise_is_as_large_at_every_delay_that_is_tried(monkeypatch):
+    """Between two rows an interpolated path would have less of it, and fit better."""
+    rows, costs = circling(1.2, 0.8, 0.0178), []
+    noise = np.random.default_rng(0).standard_normal((2, *rows["pos"].shape))
+    monkeypatch.setattr(path, "GOOD", np.inf)
+    monkeypatch.setattr(path, "best_delay", lambda _, cost: costs.append(cost.sum(axis=0)))
+    path.delay_of_path(rows["time"], axes_of(rows["time"], rows["quat"]), *(10.0 * noise))
+    assert costs[0].max() < 1.2 * costs[0].min()
 
 
 def test_without_acceleration_the_delay_is_not_identifiable(log):
