@@ -120,7 +120,7 @@ def fly_over_link(
         raise ValueError(
             f"--out {out} holds earlier flights, which are not continued; give another --out"
         )
-    show_notes(console, evaluation.simulator, trial_set)
+    show_notes(console, evaluation.simulator, trial_set, [loaded.spec])
     for note in policy_notes:
         console.note(str(note))
     rules = Rules(time_limit_s=evaluation.time_limit_s)
