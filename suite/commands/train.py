@@ -156,7 +156,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         vehicle = resolved.quadrotor.vehicle
         pitch, (wide, high) = vehicle.camera.pitch_deg, vehicle.camera.fov_deg
         advice = f"--set spec.camera.pitch_deg={pitch:g} spec.camera.fov_deg={wide:g},{high:g}"
-        advice = f"to train with the vehicle's, give {advice}"
+        anew = "" if config.init_from is None else " and leave --init-from out"
+        advice = f"to train with the vehicle's, give {advice}{anew}"
         for warning in camera_warnings(resolved.spec.camera, vehicle, advice):
             console.note(f"warning: {warning}")
     params, delta = None, None

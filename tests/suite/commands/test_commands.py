@@ -77,7 +77,8 @@ def test_a_policy_with_another_camera_than_the_vehicle_file_gives_a_warning(tmp_
     assert "deg, pitched up by 35 deg; simulated images are" in capfd.readouterr().err
     training = "train --init-from nosuch --vehicle"
     told = refused(capfd, training, tilted, "--out", tmp_path / "run")
-    assert "give --set spec.camera.pitch_deg=35 spec.camera.fov_deg=78.4,63.8" in told
+    advice = "give --set spec.camera.pitch_deg=35 spec.camera.fov_deg=78.4,63.8"
+    assert f"{advice} and leave --init-from out" in told, "a start has one camera"
     same = "--set", "spec.camera.pitch_deg=35", "--out", tmp_path / "run"
     assert "spec.camera.fov_deg" not in refused(capfd, training, tilted, *same)
     # A vehicle file without a camera says nothing about it.
