@@ -102,6 +102,7 @@ def evaluate_policy(
     from eval.vehicles.vehicle import Vehicle
     from eval.worlds.engine import warn_of
     from policies.policy import check_is_policy, load_policy
+    from suite.common.vehicles import camera_warnings
     from suite.judging.content import PolicyContent
     from suite.judging.flying import fly_trials, policy_for_workers
     from suite.judging.requests import Evaluation
@@ -134,7 +135,9 @@ def evaluate_policy(
         trial_set = read_trial_set(evaluation, repeated=not is_source, **objects)
     before = notes_of(loaded)
     notes = dict.fromkeys([*before, *trial_set.notes])
-    warn_of([*vehicle_doubts(trial_set.vehicle), *trial_set.differences, *notes])
+    cameras = camera_warnings(loaded.spec.camera, trial_set.vehicle)
+    doubts_of_files = [*vehicle_doubts(trial_set.vehicle), *cameras]
+    warn_of([*doubts_of_files, *trial_set.differences, *notes])
     flown, processes = loaded, 1 if workers is None else workers
     if is_source:
         flown = policy_for_workers(loaded, PolicyContent.of(policy), processes)

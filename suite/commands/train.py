@@ -13,6 +13,7 @@ from suite.common.options import Advanced, Command
 from suite.common.running.hosts import ProcessOptions, connect, read_member
 from suite.common.stages import differences, first_changes
 from suite.common.startup import use_device
+from suite.common.vehicles import camera_warnings
 from suite.train.config import TrainConfig
 from suite.train.overrides import (
     PREFIX,
@@ -151,6 +152,14 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         console.note(f"warning: the policy: {text}; spec.camera.fov_deg is in degrees, not radians")
     for warning in (*warmup_warnings(resolved), *rate_loop_warnings(resolved)):
         console.note(f"warning: {warning}")
+    if resolved.quadrotor is not None:
+        vehicle = resolved.quadrotor.vehicle
+        pitch, (wide, high) = vehicle.camera.pitch_deg, vehicle.camera.fov_deg
+        advice = f"--set spec.camera.pitch_deg={pitch:g} spec.camera.fov_deg={wide:g},{high:g}"
+        anew = "" if config.init_from is None else " and leave --init-from out"
+        advice = f"to train with the vehicle's, give {advice}{anew}"
+        for warning in camera_warnings(resolved.spec.camera, vehicle, advice):
+            console.note(f"warning: {warning}")
     params, delta = None, None
     if config.init_from is not None:
         # The trained policy goes to out/policy, which must not be the one to start from.

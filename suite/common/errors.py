@@ -10,6 +10,7 @@ import dis
 import errno
 import os
 from pathlib import Path
+from traceback import walk_tb
 from types import TracebackType
 
 SHOWN = 300
@@ -54,6 +55,11 @@ def explain(error: BaseException) -> tuple[int, str] | None:
 
     if isinstance(error, (WorkFailed, WorkerDied)):
         return FAILED, str(error)
+    if _is_of_cluster(error):
+        return FAILED, (
+            f"the cluster of --workers does not answer any more ({str(error)[:SHOWN]}); finished "
+            "work is kept: start scheduler and workers again, and repeat the command to continue"
+        )
     if isinstance(error, OSError):
         return _explain_os(error)
     if isinstance(error, ValueError) and "embedded null" in str(error):
@@ -91,6 +97,12 @@ def _explain_os(error: OSError) -> tuple[int, str] | None:
     if error.errno and error.errno not in _BUGS:
         return FAILED, f"{(error.strerror or 'the system refuses').lower()}{file}"
     return None
+
+
+def _is_of_cluster(error: BaseException) -> bool:
+    """Return whether the client of the cluster (Dask) raised the error, if the scheduler ended."""
+    modules = (frame.f_globals.get("__name__", "") for frame, _ in walk_tb(error.__traceback__))
+    return any(module.split(".")[0] == "distributed" for module in modules)
 
 
 def _is_suite_module(module: str | None) -> bool:

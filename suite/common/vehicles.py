@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from suite.common.console import Console
 from suite.common.options import options
+from tracks.geometry.camera import Camera
+
+if TYPE_CHECKING:
+    from eval.vehicles.vehicle import Vehicle
 
 OWN_CHECK = ("check", "delta", "diagnose", "identify")
 """Commands that list these doubts among the findings about their flights."""
+
+OTHER_CAMERA = "simulated images are those of the policy's camera; train a policy for the vehicle's"
+"""Advice for flights of a policy with another camera than that of the vehicle file."""
 
 
 def warn_of_vehicles(command: str, config: Any, console: Console) -> None:
@@ -30,3 +37,14 @@ def warn_of_vehicles(command: str, config: Any, console: Console) -> None:
             continue
         for doubt in doubts:
             console.note(f"warning: {doubt}")
+
+
+def camera_warnings(policy: Camera, vehicle: Vehicle, advice: str = OTHER_CAMERA) -> list[str]:
+    """Return a warning with `advice` if the camera of a policy is not that of the vehicle file.
+
+    A vehicle file without a camera has the default one, which says nothing about the vehicle.
+    """
+    from eval.logs.faults.vehicle import check_camera
+
+    findings = [] if vehicle.camera == Camera() else check_camera(policy, vehicle)
+    return [f"{each.evidence}; {advice}" for each in findings if each.status != "ok"]

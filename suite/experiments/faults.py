@@ -269,9 +269,10 @@ def _check(case: Case, vehicle_name: str, seed: int) -> Iterator[Answer]:
         signals = flight_signals(read_flight(case.path), vehicle, rng)
     faulty = inject(kind, signals, vehicle) if kind.names else signals
     vehicle = vehicle if kind.vehicle is None else kind.vehicle(vehicle)
-    fov = tuple(kind.fov * angle for angle in vehicle.camera.fov_deg)
+    wide, high = vehicle.camera.fov_deg
+    camera = replace(vehicle.camera, fov_deg=(kind.fov * wide, kind.fov * high))
     policy_hz = POLICY_HZ if case.format != "real" else None
-    context = CheckContext(vehicle, policy_hz, (fov[0], fov[1]))
+    context = CheckContext(vehicle, policy_hz, camera)
     try:
         if case.format in WRITERS:
             # The format of another program is written to a file; the import gives findings, too.

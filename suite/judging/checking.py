@@ -77,7 +77,7 @@ def check_flight_files(
     context = CheckContext(
         load_vehicle(vehicle) if vehicle else None,
         None if spec is None else spec.rate_hz,
-        None if spec is None else spec.camera.fov_deg,
+        None if spec is None else spec.camera,
     )
     all_findings: list[tuple[Finding, str | None]] = [(f, None) for f in check_files(context)]
     files = flight_files(flights) if flights else []

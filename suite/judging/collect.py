@@ -96,6 +96,7 @@ def collect(
         rows |= {t: row for t, r in journal.done.items() if (row := _row(out, r)) is not None}
         written = _Logs(out, described, rows, journal, console)
         load = partial(policy_for_workers, policy, content, manner=manner)
+        show_notes(console, collection.simulator, trial_set, [policy.spec])
         _fly_missing(collection, trial_set, load, written, workers)
         flights = [rows[trial] for trial in trial_set.trials]
         made = {"as_flown": as_flown, "flights": flights}
@@ -176,7 +177,6 @@ def _fly_missing(
     workers = workers_for(len(missing), workers, collection.simulator)
     title = f"{counted(len(missing), 'flight')} in {collection.simulator}"
     announce(console, title, flying_estimate(len(missing), workers, collection.simulator))
-    show_notes(console, collection.simulator, trial_set)
     with console.progress("flights", len(trial_set.trials), begun=len(rows)) as update:
 
         def keep(result: TrialResult, flight: Flight | None) -> None:

@@ -110,7 +110,7 @@ def evaluate(
     needs = flying_estimate(total, workers, evaluation.simulator)
     journals = _open_journals(evaluation, trial_set, entries, out)
     announce(console, f"{total} trial{'s' * (total != 1)} in {evaluation.simulator}", needs)
-    show_notes(console, evaluation.simulator, trial_set)
+    show_notes(console, evaluation.simulator, trial_set, [each.spec for each in policies])
     for warning in dict.fromkeys(each for policy in policies for each in notes_of(policy)):
         console.note(str(warning))
     results: list[TrialResult] = []

@@ -11,12 +11,14 @@ from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from suite.common.vehicles import camera_warnings
 from tracks.input.ranges import check_ranges
 
 if TYPE_CHECKING:
     from eval.sensors.sensors_file import SensorSet
     from eval.vehicles.vehicle import Vehicle
     from eval.worlds.trial import TrialSpec
+    from policies.spec import PolicySpec
     from suite.common.console import Console
     from suite.judging.requests import SimulatedFlights
     from tracks.track import Track
@@ -203,8 +205,15 @@ def refuse_equal_names(tracks: Iterable[str]) -> None:
             )
 
 
-def show_notes(console: Console, simulator: str, trial_set: TrialSet) -> None:
-    """Print the differences and notes of `trial_set`."""
+def show_notes(
+    console: Console, simulator: str, trial_set: TrialSet, specs: Iterable[PolicySpec]
+) -> None:
+    """Print the differences and notes of `trial_set`, which policies with these `specs` fly."""
+    cameras = [
+        f"warning: {warning}"
+        for camera in dict.fromkeys(spec.camera for spec in specs)
+        for warning in camera_warnings(camera, trial_set.vehicle)
+    ]
     differences = [f"{simulator}: {difference}" for difference in trial_set.differences]
-    for sentence in [*differences, *trial_set.notes]:
+    for sentence in [*cameras, *differences, *trial_set.notes]:
         console.note(sentence)

@@ -51,6 +51,7 @@ from eval.logs.faults.vehicle import (
 )
 from eval.logs.flight_log import FlightLog, columns_from_log, log_from_columns
 from eval.vehicles.vehicle import Vehicle
+from tracks.geometry.camera import Camera
 
 LEAST_ROWS = 50
 """Least rows for any check."""
@@ -70,8 +71,8 @@ class CheckContext:
     """The vehicle file; None: checks that need it are skipped."""
     policy_hz: float | None = None
     """Rate of the policy that flew [Hz]."""
-    policy_fov: tuple[float, float] | None = None
-    """Horizontal and vertical field of view of the policy's camera [deg]."""
+    policy_camera: Camera | None = None
+    """The policy's camera."""
     implausible: bool = False
     """Whether a vehicle file is given, but so implausible that no check uses it."""
     found: frozenset[str] = frozenset()
@@ -283,7 +284,7 @@ def with_fixes(log: FlightLog, readings: Readings) -> FlightLog:
 def check_files(against: CheckContext) -> list[Finding]:
     """Return the findings for the vehicle file and the policy's camera."""
     found = [] if against.vehicle is None else check_vehicle_numbers(against.vehicle)
-    return found + check_camera(against.policy_fov, against.vehicle)
+    return found + check_camera(against.policy_camera, against.vehicle)
 
 
 def not_identifiable(findings: Sequence[Finding]) -> list[dict[str, str]]:

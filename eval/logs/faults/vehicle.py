@@ -12,6 +12,7 @@ from eval.effects.interface import GRAVITY
 from eval.logs.faults.finding import Finding
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
+from tracks.geometry.camera import Camera
 from tracks.input.ranges import is_number
 
 ARM_M = (0.012, 1.5)
@@ -50,8 +51,8 @@ LOOP = "rate loop"
 """Subject of findings on the settings of the firmware's rate loop."""
 MOST_SETTINGS = 3
 """Largest number of differing settings that a finding's evidence lists."""
-FOV_DEG = 2.0
-"""Fields of view that differ by at most this belong to the same camera [deg]."""
+CAMERA_DEG = 2.0
+"""Fields of view and pitches that differ by at most this belong to the same camera [deg]."""
 
 
 def has_unusual_arms(vehicle: Vehicle) -> bool:
@@ -180,19 +181,17 @@ def _is_round(gyration: float) -> bool:
     return ROUND[0] <= gyration <= ROUND[1]
 
 
-def check_camera(policy_fov: tuple[float, float] | None, vehicle: Vehicle | None) -> list[Finding]:
-    """Return a finding on whether a policy's field of view agrees with the vehicle's camera."""
-    if policy_fov is None or vehicle is None:
+def check_camera(policy: Camera | None, vehicle: Vehicle | None) -> list[Finding]:
+    """Return a finding on whether the camera of a policy agrees with that of the vehicle."""
+    if policy is None or vehicle is None:
         return []
-    here = vehicle.camera.fov_deg
-    figures = (
-        f"the policy saw {policy_fov[0]:g} x {policy_fov[1]:g} deg, the vehicle's camera sees "
-    )
-    figures += f"{here[0]:g} x {here[1]:g} deg"
-    if max(abs(a - b) for a, b in zip(policy_fov, here, strict=True)) <= FOV_DEG:
+    seen, here = ((*camera.fov_deg, camera.pitch_deg) for camera in (policy, vehicle.camera))
+    text = "{:g} x {:g} deg, pitched up by {:g} deg"
+    figures = f"the policy's camera sees {text.format(*seen)}, the vehicle's {text.format(*here)}"
+    if max(abs(a - b) for a, b in zip(seen, here, strict=True)) <= CAMERA_DEG:
         return [Finding("ok", "camera", figures)]
-    fix = "camera.fov_deg of the vehicle file, or crop the image"
-    return [Finding("doubt", "camera", figures, "camera_fov", here[0] / policy_fov[0], 0.97, fix)]
+    fix = "camera.* of the vehicle file, or crop the image, or turn the camera"
+    return [Finding("doubt", "camera", figures, "camera_fov", here[0] / seen[0], 0.97, fix)]
 
 
 def check_vehicle_name(about: Mapping[str, Any], vehicle: Vehicle | None) -> list[Finding]:

@@ -8,6 +8,7 @@ points, and the autopilot takes control. The clock is an argument, for tests.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -88,6 +89,9 @@ class Companion:
         """Number of passed gates, which is the index of the next one."""
         self.missed_decisions = 0
         """Number of missed decisions."""
+        self.repeated_images = 0
+        """Number of decisions on the image of the decision before."""
+        self._decided_image_s = -math.inf
         self.outputs = Outputs(1, policy.spec.action)
         """Statistics of the policy's answers, as in the judge."""
         self.over: str | None = None
@@ -263,6 +267,8 @@ class Companion:
         # Observe.
         depth = self._depth
         assert depth is not None
+        self.repeated_images += self._depth_time_s == self._decided_image_s
+        self._decided_image_s = self._depth_time_s
         count = len(self._gates.center_w)
         view = view_of(
             state.pos_w[None],

@@ -119,6 +119,7 @@ def _fly_trial(
         "handed_over": None if companion.over == FINISHED else companion.over,
         "vehicle_slips": result.slips,
         "missed_decisions": companion.missed_decisions,
+        "repeated_images": companion.repeated_images,
         "file": write_log(companion, about, out, console),
     }
     return Flight(row, companion.rows)
@@ -197,6 +198,7 @@ def totals(flights: list[Flight], limits: Limits) -> dict[str, Any]:
         "vehicle_slips": sum(flight.row["vehicle_slips"] for flight in flights),
         "late_answers": sum(flight.row["late_actions"] for flight in flights),
         "missed_decisions": sum(flight.row["missed_decisions"] for flight in flights),
+        "repeated_images": sum(flight.row["repeated_images"] for flight in flights),
         **delays(rows, limits.deadline_s),
     }
 

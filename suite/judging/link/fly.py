@@ -52,6 +52,9 @@ from tracks.common.provenance import stamp
 
 FLY = "fly.json"
 """Name of the result file in the output folder."""
+REPEATED_SHARE = 0.1
+"""Share of decisions without a new image, above which there is a warning. A camera with a clock of
+its own repeats a few."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +123,7 @@ def fly_over_link(
         raise ValueError(
             f"--out {out} holds earlier flights, which are not continued; give another --out"
         )
-    show_notes(console, evaluation.simulator, trial_set)
+    show_notes(console, evaluation.simulator, trial_set, [loaded.spec])
     for note in policy_notes:
         console.note(str(note))
     rules = Rules(time_limit_s=evaluation.time_limit_s)
@@ -210,16 +213,18 @@ def _fly_real_vehicle(
     console.say(f"handed over: {companion.over}; log: {file or 'none'}")
     if link.strangers:
         console.note(f"{link.strangers} datagrams from other senders were ignored")
-    _warn_of_missed_decisions(companion.missed_decisions, console)
-    return {
+    answer = {
         **delays(companion.rows, limits.deadline_s),
         "late_answers": row["late_actions"],
         "missed_decisions": companion.missed_decisions,
+        "repeated_images": companion.repeated_images,
         "gates_passed": companion.gate,
         "success": companion.over == FINISHED,
         "strangers": link.strangers,
         "flights": [{**row, "file": file}],
     }
+    _warn_of_rates(answer, console)
+    return answer
 
 
 def _show_results(results: dict[str, Any], flights: list[Flight], console: Console) -> None:
@@ -248,14 +253,20 @@ def _show_results(results: dict[str, Any], flights: list[Flight], console: Conso
             f"warning: the simulated vehicle was late {results['vehicle_slips']} times; run again "
             "on a machine without other load"
         )
-    _warn_of_missed_decisions(results["missed_decisions"], console)
+    _warn_of_rates(results, console)
 
 
-def _warn_of_missed_decisions(count: int, console: Console) -> None:
-    """Print a warning with the probable reasons, if decisions were missed."""
-    if count:
+def _warn_of_rates(results: dict[str, Any], console: Console) -> None:
+    """Print warnings with the probable reasons, if decisions were missed or lacked a new image."""
+    if count := results["missed_decisions"]:
         console.note(
             f"warning: {count} decisions were missed: no state arrived in time (send ODOMETRY "
             "several times as often as the policy decides), or the policy took longer than one "
             "decision period"
+        )
+    count, decisions = results["repeated_images"], results.get("decisions", 0)
+    if count > REPEATED_SHARE * decisions:
+        console.note(
+            f"warning: {count} of {decisions} decisions had no new depth image: send one for each "
+            "decision of the policy (if packets are lost, over a better link)"
         )

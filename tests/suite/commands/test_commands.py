@@ -16,6 +16,7 @@ from policies import shipped
 from policies.formats import policy_file
 from suite.blind import make
 from suite.commands.train import Config, resolve
+from suite.common.vehicles import camera_warnings
 from suite.delta.replay import describe_dynamics
 from suite.judging.flying import checkpoint_folder
 from suite.train import run as training
@@ -23,6 +24,7 @@ from suite.train.overrides import rate_loop_warnings
 from tests.support.commands import answer, refused, run
 from tests.support.documents import unpainted
 from tests.support.marks import more
+from tracks.geometry.camera import Camera
 
 
 def test_tracks_command_lists_and_draws(tmp_path, capfd, monkeypatch):
@@ -65,6 +67,22 @@ def test_doubts_about_a_vehicle_file_are_printed_once_and_stop_nothing(workers, 
     assert capfd.readouterr().err.count("divide by 1000") == 1
     page = "reproduce robustness --policy no.onnx --out"
     assert "divide by 1000" in refused(capfd, page, tmp_path, "--vehicle", tmp_path / "mm.toml")
+
+
+def test_a_policy_with_another_camera_than_the_vehicle_file_gives_a_warning(tmp_path, capfd):
+    vehicle, tilted = load_vehicle("racer5"), tmp_path / "tilted.toml"
+    save_vehicle(replace(vehicle, camera=Camera(pitch_deg=35.0)), tilted)
+    flights = "eval --track zigzag --difficulty 0 --trials 1 --time-limit-s 0.1 --out"
+    assert run(flights, tmp_path / "out", "--vehicle", tilted) == 0
+    assert "deg, pitched up by 35 deg; simulated images are" in capfd.readouterr().err
+    training = "train --init-from nosuch --vehicle"
+    told = refused(capfd, training, tilted, "--out", tmp_path / "run")
+    advice = "give --set spec.camera.pitch_deg=35 spec.camera.fov_deg=78.4,63.8"
+    assert f"{advice} and leave --init-from out" in told, "a start has one camera"
+    same = "--set", "spec.camera.pitch_deg=35", "--out", tmp_path / "run"
+    assert "spec.camera.fov_deg" not in refused(capfd, training, tilted, *same)
+    # A vehicle file without a camera says nothing about it.
+    assert camera_warnings(Camera(pitch_deg=35.0), vehicle) == []
 
 
 def test_effects_command_lists_and_describes(capfd):

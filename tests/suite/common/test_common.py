@@ -150,6 +150,15 @@ def test_numpys_value_error_is_a_bug_and_one_raised_on_purpose_in_a_worker_proce
     assert (explain(met.value) or (None,))[0] == UNUSABLE
 
 
+def test_a_scheduler_that_ends_is_no_bug():
+    client = {"__name__": "distributed.comm.core"}
+    exec("def connect(): raise OSError('Timed out trying to connect')", client)
+    with pytest.raises(OSError, match="Timed out") as met:
+        client["connect"]()
+    code, said = explain(met.value) or (None, "")
+    assert code == FAILED and "finished work is kept: start scheduler and workers again" in said
+
+
 def test_what_the_system_refuses_is_one_line_with_the_file_and_a_mistake_of_ours_is_a_bug():
     usage = ("EROFS", "ENAMETOOLONG", "ELOOP", "ENXIO", "EACCES")
     trouble = ("ENOSPC", "EIO", "EMFILE", "EFBIG", "ESTALE", "ENOTCONN", "EREMOTEIO")

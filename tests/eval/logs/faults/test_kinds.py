@@ -1,6 +1,7 @@
 """Every kind of fault is named, its fix restores the flight, and good flights stay as they are."""
 
 import re
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -84,8 +85,9 @@ def logged(seed, end):
 
 
 def checked(parts, vehicle=VEHICLE, fov=1.0):
-    seen_deg = tuple(fov * angle for angle in vehicle.camera.fov_deg)
-    against = CheckContext(vehicle, POLICY_HZ, seen_deg)
+    wide, high = vehicle.camera.fov_deg
+    camera = replace(vehicle.camera, fov_deg=(fov * wide, fov * high))
+    against = CheckContext(vehicle, POLICY_HZ, camera)
     checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
     findings, readings, _ = run_checks(parts, checks, against, fix=True)
     commands = {name: value for name, value in parts.items() if name != "throttle"}

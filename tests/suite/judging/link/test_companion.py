@@ -11,6 +11,7 @@ from eval.worlds.trial import TrialSpec
 from policies.spec import ActionSpec, NoAnswer, PolicySpec
 from suite.common.console import Console
 from suite.judging.link.flights import write_log
+from suite.judging.link.fly import _warn_of_rates
 from suite.judging.link.messages import OperatorText, SetPoint, State, Wire, dialect, signing_key
 from suite.judging.link.watchdog import Limits, jump_fault
 from tests.support.commands import refused
@@ -239,6 +240,21 @@ def test_what_a_gap_between_states_missed_is_counted_and_not_made_up_for(bench):
     # States at 0, 10, 20, 30, 100, 110, 120 ms; those of 40, 60 and 80 ms did not come.
     assert [row.decided for row in one.companion.rows] == [True, False] * 3 + [True]
     assert one.companion.missed_decisions == 3
+
+
+def test_decisions_without_a_new_image_are_counted_and_reported(bench, capsys):
+    one = bench(Steady((0.0, 0.0, 0.0), spec=PolicySpec(rate_hz=50.0)))
+    for step in range(12):  # a decision at each second state, an image at each sixth
+        if step % 6 == 0:
+            one.show()
+        one.tell()
+        one.now += 0.01
+    assert one.companion.repeated_images == 4
+    results = {"missed_decisions": 0, "decisions": 6, "repeated_images": 4}
+    _warn_of_rates(results, Console())
+    assert "4 of 6 decisions had no new depth image" in " ".join(capsys.readouterr().err.split())
+    _warn_of_rates(results | {"decisions": 40}, Console())
+    assert capsys.readouterr().err == ""
 
 
 def test_half_of_the_messages_cut_off_is_flown_on_and_all_of_them_is_silence(bench):

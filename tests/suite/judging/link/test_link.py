@@ -152,7 +152,7 @@ def test_both_ends_agree_on_the_flight(flown, tmp_path):
     assert log.action_b is not None and log.action_b.shape == (len(rows), 3)
     assert log.gate is not None and log.gate.max() == companion.gate
     row = {**sim.result()._asdict(), "handed_over": None}
-    row |= {"vehicle_slips": 0, "missed_decisions": 0}
+    row |= {"vehicle_slips": 0, "missed_decisions": 0, "repeated_images": 0}
     assert totals([Flight(row, rows)], Limits())["set_points"] == len(rows)
 
 
@@ -320,7 +320,8 @@ def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first
     capsys, tmp_path, monkeypatch
 ):
     row = {"success": True, "handed_over": None, "seed": 0}
-    row |= dict.fromkeys(("vehicle_slips", "late_actions", "missed_decisions"), 0)
+    counts = ("vehicle_slips", "late_actions", "missed_decisions", "repeated_images")
+    row |= dict.fromkeys(counts, 0)
     stops = iter([WorkFailed("it died"), KeyboardInterrupt()])
 
     def interrupted(policy, course, *_):
