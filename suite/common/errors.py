@@ -100,9 +100,12 @@ def _explain_os(error: OSError) -> tuple[int, str] | None:
 
 
 def _is_of_cluster(error: BaseException) -> bool:
-    """Return whether the client of the cluster (Dask) raised the error, if the scheduler ended."""
-    modules = (frame.f_globals.get("__name__", "") for frame, _ in walk_tb(error.__traceback__))
-    return any(module.split(".")[0] == "distributed" for module in modules)
+    """Return whether the client of the cluster (Dask) raised the error, if the scheduler ended.
+
+    An error of the work passes through the client, too, but another module raised it.
+    """
+    modules = [frame.f_globals.get("__name__", "") for frame, _ in walk_tb(error.__traceback__)]
+    return any(module.split(".")[0] == "distributed" for module in modules[-1:])
 
 
 def _is_suite_module(module: str | None) -> bool:

@@ -158,6 +158,14 @@ def test_a_scheduler_that_ends_is_no_bug():
     code, said = explain(met.value) or (None, "")
     assert code == FAILED and "finished work is kept: start scheduler and workers again" in said
 
+    def work():
+        raise OSError(errno.ENOENT, "no such file", "of a job")
+
+    exec("def result(work): work()", client)
+    with pytest.raises(OSError, match="no such file") as met:
+        client["result"](work)
+    assert explain(met.value) == (UNUSABLE, "no such file: of a job"), "an error of the work"
+
 
 def test_what_the_system_refuses_is_one_line_with_the_file_and_a_mistake_of_ours_is_a_bug():
     usage = ("EROFS", "ENAMETOOLONG", "ELOOP", "ENXIO", "EACCES")
