@@ -21,7 +21,7 @@ class Config(Command):
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Folders (--out) of suite eval, two or more."""
+    """Folders (--out) of suite eval, two or more; with --against one is enough."""
     against: tuple[Path, ...] = ()
     """Folders with training seeds of another method, whose success rate is subtracted."""
     seeds: bool = False

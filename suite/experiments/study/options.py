@@ -27,7 +27,7 @@ class JudgingOptions:
 
     policy: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """A shipped policy's name, a checkpoint's folder or a policy file; may be given several times.
-    Without it the shipped policy flies."""
+    Without it the policy race flies."""
     difficulty: str = "3"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     trials: Trials = 32

@@ -26,7 +26,9 @@ from pathlib import Path
 import pytest
 
 import suite
+from eval.logs import files
 from policies import shipped
+from policies.formats import model_process
 from policies.formats.policy_file import load_policy_checkpoint
 from policies.spec import PolicySpec
 from suite import cli
@@ -34,8 +36,11 @@ from suite.commands.train import resolve
 from suite.common.usage import EXAMPLES
 from suite.train.recipes import named_recipe, with_model
 from suite.train.run import start_params
+from tests import test_fuzz
 from tests.support.judged_cells import cut_short
 from tracks.common.files import plain
+from tracks.common.work import cluster
+from tracks.formats import custom, mesh_reader
 
 ROOT = Path(__file__).resolve().parents[3]
 ARCHIVE = sorted((ROOT / "docs/archive").glob("*.md"))
@@ -204,6 +209,22 @@ def test_the_card_of_the_default_policy_has_rows_of_the_page_of_its_results():
 def test_the_page_of_policies_has_every_key_of_the_spec_with_its_default():
     (text,) = re.findall(r"```json\n(.*?)```", TEXTS[ROOT / "docs/policies.md"], re.DOTALL)
     assert json.loads(text)["spec"] == plain(PolicySpec())
+
+
+def test_the_page_of_promises_has_the_limits_of_the_code():
+    promised = TEXTS[ROOT / "docs/reliability.md"]
+    gates, rows, cells = custom.MOST_TABLES, files.MOST_ROWS, files.MOST_CELLS
+    for limits in (
+        f"limits of {mesh_reader.READ_S:g} s and {mesh_reader.MEMORY_BYTES / 2**30:g} GB",
+        f"at most {gates:,} gates and {gates:,} solids of each kind",
+        f"at most {rows / 1e6:g} million rows and {cells / 1e6:g} million values",
+        f"{model_process.LOAD_S:g} s to load, {model_process.ANSWER_S:g} s for an answer, and "
+        f"{model_process.MEMORY_BYTES / 2**30:g} GB",
+        f"ends within {cluster.ANSWER_S + cluster.GRACE_S:g} s",
+        f"damaged files of {len((*test_fuzz.KINDS, *test_fuzz.FOREIGN))} kinds",
+        f"refused with one line within {test_fuzz.WITHIN_S:g} s",
+    ):
+        assert limits in promised
 
 
 def test_every_page_installs_optional_packages_in_one_way():

@@ -343,7 +343,7 @@ def test_buffers_of_a_gltf_are_plain_files_beside_it(tmp_path):
 
 
 def test_more_memory_than_allowed_is_refused_by_its_size(tmp_path):
-    with pytest.raises(ValueError, match=r"model.gltf: .*(memory|cannot be read)"):
+    with pytest.raises(ValueError, match=r"model.gltf: takes more than 3 GB of memory"):
         load_convex_parts([gltf(tmp_path, count=1_500_000_000)])
     assert len(load_convex_parts([gltf(tmp_path)])[0][0]) == 12, "the next one is read"
 
