@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 from suite.common.console import Console
 from suite.common.options import options
-from tracks.geometry.camera import Camera
 
 if TYPE_CHECKING:
     from eval.vehicles.vehicle import Vehicle
+    from tracks.geometry.camera import Camera
 
 OWN_CHECK = ("check", "delta", "diagnose", "identify")
 """Commands that list these doubts among the findings about their flights."""
@@ -45,6 +45,7 @@ def camera_warnings(policy: Camera, vehicle: Vehicle, advice: str = OTHER_CAMERA
     A vehicle file without a camera has the default one, which says nothing about the vehicle.
     """
     from eval.logs.faults.vehicle import check_camera
+    from tracks.geometry.camera import Camera
 
     findings = [] if vehicle.camera == Camera() else check_camera(policy, vehicle)
     return [f"{each.evidence}; {advice}" for each in findings if each.status != "ok"]

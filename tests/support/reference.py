@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+import pytest
 
 from eval.judging import judge
 from eval.judging.guard import ActionLimits, Guarded, call_policy, first_action, limits_of
@@ -196,3 +197,13 @@ def _padded(values: np.ndarray, rows: int) -> np.ndarray:
     padded = np.zeros((rows, *values.shape[1:]), np.float32)
     padded[0] = values[0]
     return padded
+
+
+def assert_alike(found, wanted):
+    """Check that two results are equal, numbers except for rounding.
+
+    The wheels of NumPy and MuJoCo for different versions of Python round differently.
+    """
+    for one, other in zip(found, wanted, strict=True):
+        is_number = isinstance(other, float)
+        assert one == (pytest.approx(other, rel=1e-9, abs=1e-12) if is_number else other)
