@@ -31,6 +31,9 @@ REACH_S, STEP_S = 0.5, 0.02
 LEAST_S, SURE = 0.05, 8.0
 """Least delay that is a fault: in seconds, and in standard errors. In 37 real logs it is at most
 0.02 s where its error is that small."""
+CLEARER = 0.85
+"""With a delay the squared force across body z is at most this share of that without one. In slow
+flights drag explains about the same."""
 SEEN_S = 0.2
 """The delay is not identifiable where `SURE` standard errors exceed this [s]."""
 LEAST_ROWS, POINTS = 200, 2000
@@ -77,7 +80,8 @@ def delay_of_path(
 ) -> tuple[float, float] | None:
     """Return by how much the path is later than the attitude, and its standard error [s].
 
-    None: the flight is too short, hardly accelerates, or no delay up to `REACH_S` fits.
+    None: the flight is too short, hardly accelerates, no delay up to `REACH_S` fits, or the best
+    one fits hardly better than none.
 
     Args:
         time_s: (T,) increasing times.
@@ -116,5 +120,8 @@ def delay_of_path(
         side = side - np.clip(drag, -DRAG, 0.0)[..., None] * speed
         side = side - np.clip(side.mean(axis=-1, keepdims=True), -BIAS, BIAS)
         cost[:, some] = block_sums(np.sum(side**2, axis=0))
-    misfit = float(np.sqrt(cost.sum(axis=0).min() / len(at_s))) / level
-    return best_delay(trials, cost) if misfit < GOOD else None
+    total = cost.sum(axis=0)
+    misfit = float(np.sqrt(total.min() / len(at_s))) / level
+    best = best_delay(trials, cost) if misfit < GOOD else None
+    is_as_good_without = total.min() > CLEARER * total[count]
+    return None if best is None or (abs(best[0]) >= LEAST_S and is_as_good_without) else best

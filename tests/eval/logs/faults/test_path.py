@@ -114,6 +114,16 @@ def test_the_drag_of_a_fast_flight_forwards_is_no_delay():
     assert found.status == "ok"
 
 
+def test_a_delay_that_fits_hardly_better_than_none_is_not_identifiable(monkeypatch):
+    rows = circling(7.0, 5.0, 0.0025)
+    late = rows | {"pos": np.roll(rows["pos"], 40, axis=0)}
+    (found,) = check_position_delay(late)
+    assert found.fault == "position_delay" and found.size == pytest.approx(0.1, abs=0.005)
+    monkeypatch.setattr(path, "CLEARER", 0.0)
+    (unclear,), (fine,) = (check_position_delay(one) for one in (late, rows))
+    assert (unclear.status, fine.status) == ("not identifiable", "ok")
+
+
 def test_noise_is_as_large_at_every_delay_that_is_tried(monkeypatch):
     """Between two rows an interpolated path would have less of it, and fit better."""
     rows, costs = circling(1.2, 0.8, 0.0178), []
