@@ -30,9 +30,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
     config.out.mkdir(parents=True, exist_ok=True)
     contents = _real_files() if config.real else _simulated_files()
+    folder = command_line(config.out).encode()
     for name, content in contents.items():
         # The commands of the README read the files of this folder.
-        folder = command_line(config.out).encode()
         content = content.replace(b"FOLDER", folder) if ".md" in name else content
         with replacing_file(config.out / name) as new:
             new.write_bytes(content)

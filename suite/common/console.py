@@ -22,11 +22,6 @@ PLAIN_PERIOD_S = 10.0
 """Time between two lines about the progress if standard error is no terminal [s]."""
 
 
-def counted(count: int, noun: str) -> str:
-    """Return a number with its noun, such as "1 flight" or "2 flights"."""
-    return f"{count} {noun if count == 1 else noun + 's'}"
-
-
 Update = Callable[..., None]
 """Function (done, note) that shows that `done` of the total is finished, with a short note (or
 none)."""
@@ -186,6 +181,11 @@ def stdout_kept_clean() -> Iterator[None]:
 def command_line(*words: object) -> str:
     """Return a command to copy into a shell: a path with spaces is quoted."""
     return shlex.join(map(str, words))
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun, such as "1 flight" or "2 flights"."""
+    return f"{count} {noun if count == 1 else noun + 's'}"
 
 
 def duration(seconds: float) -> str:

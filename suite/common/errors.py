@@ -104,8 +104,10 @@ def _is_of_cluster(error: BaseException) -> bool:
 
     An error of the work passes through the client, too, but another module raised it.
     """
-    modules = [frame.f_globals.get("__name__", "") for frame, _ in walk_tb(error.__traceback__)]
-    return any(module.split(".")[0] == "distributed" for module in modules[-1:])
+    module = ""
+    for frame, _ in walk_tb(error.__traceback__):  # the last one raised it
+        module = frame.f_globals.get("__name__", "")
+    return module.split(".")[0] == "distributed"
 
 
 def _is_suite_module(module: str | None) -> bool:

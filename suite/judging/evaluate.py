@@ -109,7 +109,7 @@ def evaluate(
     total = count * len(entries)
     needs = flying_estimate(total, workers, evaluation.simulator)
     journals = _open_journals(evaluation, trial_set, entries, out)
-    announce(console, f"{total} trial{'s' * (total != 1)} in {evaluation.simulator}", needs)
+    announce(console, f"{counted(total, 'trial')} in {evaluation.simulator}", needs)
     show_notes(console, evaluation.simulator, trial_set, [each.spec for each in policies])
     for warning in dict.fromkeys(each for policy in policies for each in notes_of(policy)):
         console.note(str(warning))
@@ -145,7 +145,7 @@ def evaluate(
         console.say(sentence)
     for lap in (lap for lap in laps if lap.finished):
         prefix = f"{lap.policy}: " if len(laps) > 1 else ""
-        tracks = f"{lap.finished} track{'s' * (lap.finished != 1)}"
+        tracks = counted(lap.finished, "track")
         console.say(
             f"{prefix}laps take {with_interval(lap.ratio)} times a planned lap (median of "
             f"{tracks}; a plan knows the whole track)"

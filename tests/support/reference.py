@@ -5,6 +5,8 @@ Both use the same vehicle model, but this one counts gates and ends a trial by s
 
 from __future__ import annotations
 
+import sys
+
 import mujoco
 import numpy as np
 import pytest
@@ -200,10 +202,7 @@ def _padded(values: np.ndarray, rows: int) -> np.ndarray:
 
 
 def assert_alike(found, wanted):
-    """Check that two results are equal, numbers except for rounding.
-
-    The wheels of NumPy and MuJoCo for different versions of Python round differently.
-    """
+    """Check that two results are equal; on Python 3.13, whose packages differ, to 1e-9."""
     for one, other in zip(found, wanted, strict=True):
-        is_number = isinstance(other, float)
+        is_number = isinstance(other, float) and sys.version_info >= (3, 13)
         assert one == (pytest.approx(other, rel=1e-9, abs=1e-12) if is_number else other)

@@ -291,6 +291,17 @@ def is_usual(acc_size: np.ndarray) -> np.ndarray:
     return np.asarray(acc_size <= FAST * np.median(acc_size) + 1.0)
 
 
+def without_drag(force: np.ndarray, vel: np.ndarray) -> np.ndarray:
+    """Return measured forces (..., N) without the drag and the constant that fit them best.
+
+    Each is along one axis, as the velocity `vel` (..., N). Both are at most `DRAG` and `BIAS`.
+    """
+    change = vel - vel.mean(axis=-1, keepdims=True)
+    slope = (change * force).sum(-1) / np.maximum((change**2).sum(-1), 1e-9)
+    force = force - np.clip(slope, -DRAG, 0.0)[..., None] * vel
+    return force - np.clip(force.mean(axis=-1, keepdims=True), -BIAS, BIAS)
+
+
 def _force_misfits(
     axes: np.ndarray,
     path: tuple[np.ndarray, np.ndarray],
@@ -316,10 +327,7 @@ def _force_misfits(
         # Of each reading: (components, readings, N).
         force, vel_b = _in_body(changes, body, acc), _in_body(changes, body[:, :2], vel)
         force = force + GRAVITY * body[2][:, None]
-        change = vel_b - vel_b.mean(axis=-1, keepdims=True)
-        slope = (change * force[:2]).sum(-1) / np.maximum((change**2).sum(-1), 1e-9)
-        side = force[:2] - np.clip(slope, -DRAG, 0.0)[..., None] * vel_b
-        side = side - np.clip(side.mean(axis=-1, keepdims=True), -BIAS, BIAS)
+        side = without_drag(force[:2], vel_b)
         wrong = (side**2).sum(axis=0) + np.minimum(force[2], 0.0) ** 2  # thrust only pushes
         tilt = GRAVITY * body[:2, 2]
         leaning = (tilt - tilt.mean(axis=-1, keepdims=True)) ** 2

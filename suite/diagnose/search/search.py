@@ -79,15 +79,14 @@ def search(
         )
         current = with_inactive(known if at is best[1] else known.evidence.relinearise(at), among)
     named, at = _settle(task, current.evidence, current.at, named)
-    last = judged = _final_fit(current.evidence, at, named)
+    last = _final_fit(current.evidence, at, named)
+    found = SearchResult(tuple(named), start, last, last, first)
     # If even the best model leaves more than noise, decide again with the residual as noise.
     misfit = last.evidence.misfit_as_noise(last)
-    if misfit is not None:
-        say("the remaining error is more than noise: effects are tested again, with it as noise")
-        named, at = _settle(task, misfit, last.at, named)
-        judged = _final_fit(misfit, at, named)
-        last = last.evidence.fitted(judged.at, fitted_by(named), 0)  # no step: evaluated only
-    return SearchResult(tuple(named), start, last, judged, first)
+    if misfit is None:
+        return found
+    say("the remaining error is more than noise: effects are tested again, with it as noise")
+    return settled(replace(found, judged=last._replace(evidence=misfit)), among, say, seed)
 
 
 def settled(
@@ -95,7 +94,8 @@ def settled(
 ) -> SearchResult:
     """Return `found` with each name tested again, against all candidates of `among`.
 
-    A name that was withdrawn may have hidden a better candidate, or alternatives, of the others.
+    The evidence is that of `found.judged`. A name that was withdrawn may have hidden a better
+    candidate, or alternatives, of the others.
     """
     evidence = found.judged.evidence
     named, at = _settle(SearchTask(among, say, seed), evidence, found.estimate, list(found.named))

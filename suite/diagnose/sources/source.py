@@ -150,7 +150,7 @@ class Source(ABC):
         self, found: SearchResult, left_out: Collection[str], say: Callable[[str], None], seed: int
     ) -> SearchResult:
         """Test the names of `found` again, without the candidates of the `left_out` effects."""
-        among = [c for c in self.candidates if not {one.name for one in c.singles} & {*left_out}]
+        among = [c for c in self.candidates if not any(one.name in left_out for one in c.singles)]
         return settled(found, among, say, seed)
 
     def is_worse(self, before: Gap, after: Gap) -> bool:

@@ -14,15 +14,14 @@ from eval.effects.interface import GRAVITY
 from eval.logs.faults.clocks.delay import BLOCKS, best_delay, block_sums, delay_of
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import (
-    BIAS,
     CALM_ACC,
-    DRAG,
     GOOD,
     WIDTH_S,
     Rows,
     axes_of,
     is_usual,
     path_of,
+    without_drag,
 )
 from eval.logs.faults.relation import rms, shifted
 
@@ -114,11 +113,8 @@ def delay_of_path(
     cost = np.empty((BLOCKS, len(trials)))
     for some, values in shifted(at_s, trials, known_s, path):
         vel, force = values[:3], values[3:] + [[[0.0]], [[0.0]], [[GRAVITY]]]
-        side, speed = (np.sum(sides * x[:, None], axis=0) for x in (force, vel))  # (2, trials, N)
-        change = speed - speed.mean(axis=-1, keepdims=True)
-        drag = np.sum(change * side, axis=-1) / np.maximum(np.sum(change**2, axis=-1), 1e-9)
-        side = side - np.clip(drag, -DRAG, 0.0)[..., None] * speed
-        side = side - np.clip(side.mean(axis=-1, keepdims=True), -BIAS, BIAS)
+        # Along two axes of the body: (2, trials, N).
+        side = without_drag(*(np.sum(sides * x[:, None], axis=0) for x in (force, vel)))
         cost[:, some] = block_sums(np.sum(side**2, axis=0))
     total = cost.sum(axis=0)
     misfit = float(np.sqrt(total.min() / len(at_s))) / level
