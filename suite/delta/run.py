@@ -19,7 +19,7 @@ from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.stages import Estimate, announce, refuse_other_options
 from suite.delta.fit import DeltaFit, FitConfig, fit_network, fit_point_mass
 from suite.delta.replay import QUAD, describe_dynamics
-from suite.delta.windows import cut_windows, decision_rate
+from suite.delta.windows import cut_windows, decision_rate, on_state_rows
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from tracks.common.files import plain, write_json, write_text
 from tracks.common.grid import Grid, markdown, table_of
@@ -107,7 +107,7 @@ def fit_delta(
     refuse_other_run(out, request)
     refuse_other_options(out, request)
     # Hold some of the flights out.
-    logs, short = long_enough(flights.logs, config.horizon_s)
+    logs, short = long_enough([on_state_rows(log) for log in flights.logs], config.horizon_s)
 
     def warn(text: str) -> None:
         console.note(f"warning: {text}")

@@ -9,6 +9,7 @@ gates.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -122,6 +123,29 @@ def stack_windows(
         return np.stack(arrays).astype(np.float32)
 
     return jax.tree.map(stacked, *items)
+
+
+def on_state_rows(log: FlightLog) -> FlightLog:
+    """Return `log` without rows that lack a state; a command in one moves to the state before it.
+
+    `suite fly` logs a set point when it was sent, some milliseconds after the state it answers.
+    """
+    state = np.concatenate([log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b], axis=1)
+    has_state = np.isfinite(state).all(axis=1)
+    command = log.command
+    if has_state.all() or command is None:
+        return log
+    rows = np.flatnonzero(has_state)
+    # The first command from each state on, unless the next state comes before it.
+    sent = np.append(np.flatnonzero(np.isfinite(command).all(axis=1)), len(command))
+    first = sent[np.searchsorted(sent, rows)]
+    is_answer = first < np.append(rows[1:], len(command))
+    moved = np.full((len(rows), 4), np.nan)
+    moved[is_answer] = command[first[is_answer]]
+    arrays = {f.name: v for f in fields(log) if isinstance(v := getattr(log, f.name), np.ndarray)}
+    taken: dict[str, Any] = {name: values[rows] for name, values in arrays.items()}
+    taken |= {"thrust_cmd": moved[:, 0], "rate_cmd_b": moved[:, 1:]}
+    return replace(log, **taken, extra={name: v[rows] for name, v in log.extra.items()})
 
 
 def log_decisions(log: FlightLog) -> tuple[np.ndarray, np.ndarray]:

@@ -113,3 +113,20 @@ BREAKAGES = (
     dropped, holed, jittered, doubled, still, grounded, silent, wild, sparse, short, turned_over,
     far_away,
 )  # fmt: skip
+
+
+def with_sent_commands(log, late_s):
+    """Return `log` with its commands in rows of their own, `late_s` (T,) [s] after the states."""
+    twice = rows(log, np.repeat(np.arange(len(log.time_s)), 2))
+    is_sent = np.arange(len(twice.time_s)) % 2 == 1
+
+    def kept(chosen):
+        return lambda values: np.where(
+            chosen if values.ndim == 1 else chosen[:, None], values, np.nan
+        )
+
+    commands = ("thrust_cmd", "rate_cmd_b")
+    parts = {name: kept(is_sent if name in commands else ~is_sent) for name in FIELDS}
+    extra = {name: np.repeat(values, 2) for name, values in log.extra.items()}
+    time_s = twice.time_s + np.where(is_sent, np.repeat(late_s, 2), 0.0)
+    return replace(changed(twice, **parts), time_s=time_s, extra=extra)

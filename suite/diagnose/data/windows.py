@@ -139,6 +139,7 @@ def cut(
     like: FlightWindows | None = None,
     stride: int = 1,
     between: bool = False,
+    jitter: bool = False,
 ) -> tuple[FlightWindows | None, list[str]]:
     """Return the windows of `logs` (None if no flight has one) and warnings.
 
@@ -157,6 +158,7 @@ def cut(
         like: windows of an earlier call, to whose size these are padded.
         stride: factor on the length of the steps; only every `stride`-th rotor speed is used.
         between: half-way from one command to the next, their mean acts as another command.
+        jitter: the time of each command is shifted by chance, by the logs' `command_jitter_s`.
     """
     starts, warnings = list[tuple[int, int]](), list[str]()  # (flight, row) each
     states = [on_every_row(log, limits) for log in logs]
@@ -186,13 +188,24 @@ def cut(
     steps_s = [LONGEST_S * stride] * len(logs)
     if integrator == "euler":
         steps_s = [log.step_s or 1.0 / vehicle.controller.frequency for log in logs]
-    inputs = [_input_of(logs[k], row, vehicle, steps_s[k], between) for k, row in starts]
+    shifts_s = [command_jitter_s(log) if jitter else 0.0 for log in logs]
+    inputs = [
+        _input_of(logs[k], row, vehicle, steps_s[k], between, shifts_s[k]) for k, row in starts
+    ]
     sizes = _padded_sizes(inputs, like)
     windows = [
         _window(logs[k], states[k], k, row, vehicle, spacings_s.get(k), one, stride, sizes)
         for (k, row), one in zip(starts, inputs, strict=True)
     ]
     return jax.tree.map(lambda *field: np.stack(field), *windows), warnings
+
+
+def command_jitter_s(log: FlightLog) -> float:
+    """Return the standard deviation of the times of commands that `log` states; 0 if none [s]."""
+    stated = log.about.get("command_jitter_s")
+    if isinstance(stated, bool) or not isinstance(stated, int | float) or not stated > 0.0:
+        return 0.0
+    return float(stated)
 
 
 def take(data: Any, chosen: Array) -> Any:
@@ -243,9 +256,12 @@ class _Input(NamedTuple):
 
 
 def _input_of(
-    log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, between: bool
+    log: FlightLog, row: int, vehicle: Vehicle, longest_s: float, between: bool, shift_s: float
 ) -> _Input:
-    """Return the inputs of the window at `row`; without commands those of a hover. See `cut`."""
+    """Return the inputs of the window at `row`; without commands those of a hover. See `cut`.
+
+    The times of commands are shifted by the standard deviation `shift_s` [s].
+    """
     time_s, begin_s, period_s = log.time_s, log.time_s[row], 1.0 / vehicle.controller.frequency
     rows = np.flatnonzero((time_s >= begin_s - 1e-9) & (time_s <= begin_s + LENGTH_S + 1e-9))
     signals = (log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b, log.acc_b, log.rotor_speed)
@@ -264,6 +280,9 @@ def _input_of(
         time_s, command = (np.repeat(values, 2, axis=0)[:-1] for values in (time_s, command))
         time_s[1::2] += 0.5 * np.diff(time_s[::2])
         command[1::2] += 0.5 * np.diff(command[::2], axis=0)
+    if shift_s:
+        shift = np.random.default_rng(row).standard_normal(len(time_s))
+        time_s = np.sort(time_s + shift_s * shift)
 
     def grid(since_s: float, until_s: float) -> StepGrid:
         inside_s = time_s[(time_s > since_s + 1e-6) & (time_s < until_s - 1e-6)]

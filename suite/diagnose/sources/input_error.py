@@ -4,7 +4,8 @@ If the drone received commands between the rows of the log, these are taken as t
 neighbours. The true ones gave another thrust and torque. How large they are is estimated by a
 comparison with commands that hold until the next row, since the truth lies about as far on the
 other side. Thrust and torque at the knots of a window become nuisance parameters of this size, and
-what changes faster than the knots counts as noise.
+what changes faster than the knots counts as noise. Commands at uncertain times (jitter) have such
+an error, too; there the comparison is with commands whose times are shifted by chance.
 """
 
 from __future__ import annotations
@@ -89,8 +90,8 @@ def unknown_commands(
 ) -> tuple[np.ndarray, Thresholds]:
     """Return the error (W, 4) of thrust and torque by unknown commands, and limits with its noise.
 
-    Held commands change the residuals by the `difference` (W, N, 19). For `push` see
-    `push_slopes`.
+    Other commands, which are as likely, change the residuals by the `difference` (W, N, 19). For
+    `push` see `push_slopes`.
     """
     noise = measured_noise(linear, limits)
     difference, _ = _zeroed(difference)

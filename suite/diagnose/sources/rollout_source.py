@@ -192,7 +192,8 @@ class RolloutSource(Source):
             return Remaining(False, share, reason=TOO_SMALL, details=details)
         # Slow errors are those that a low polynomial over a window describes: noise has few.
         slow = of_rollouts(found.last).slow_errors(found.last.block)
-        is_uncertain = self.rotor_input or self.coarser is not None
+        has_error = self.held.input_error is not None
+        is_uncertain = self.rotor_input or self.coarser is not None or has_error
         where = structure_where(slow, structure, is_uncertain, self.limits)
         swing = self._swing(found.estimate.theta) if wind or where else None
         # Wind explains the structure, unless the force oscillates regularly.

@@ -1,7 +1,7 @@
 """Cuts flights into stretches of 1 s, simulates them, and estimates the error of the simulation.
 
 A stretch (a window; W is their number) is simulated with the nominal vehicle. Unknown inputs and
-the time steps cause an error, which is estimated by simulations with coarser inputs.
+the time steps cause an error, which is estimated by simulations with other or coarser inputs.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from eval.logs.flight_log import FlightLog
 from suite.diagnose.data.noise import Linearisation
 from suite.diagnose.data.sampling import own_spacing_s
 from suite.diagnose.data.steps import rows_show_torque
-from suite.diagnose.data.windows import FlightWindows, cut, take
+from suite.diagnose.data.windows import FlightWindows, command_jitter_s, cut, take
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.sources.input_error import (
@@ -55,8 +55,8 @@ class Stretches:
     coarser_share: float = 0.0
     """See `RolloutSource.coarser_share`."""
     push_error: np.ndarray | None = None
-    """(W, 4) error of thrust [m/s^2] and torque [rad/s^2] by commands that the logs lack; None if
-    they lack none."""
+    """(W, 4) error of thrust [m/s^2] and torque [rad/s^2] by commands that the logs lack, or whose
+    times they do not know exactly; None if all are known."""
 
     def overlapping(self, flights: Collection[int], since_s: float) -> tuple[FlightWindows, int]:
         """Return overlapping windows of `flights` after `since_s` [s], and how many diverge.
@@ -111,13 +111,16 @@ def simulated_stretches(
             rotors = [(log.time_s, log.rotor_speed) for log in logs if log.rotor_speed is not None]
             dense = all(rows_show_torque(vehicle, own_spacing_s(*rotor)) for rotor in rotors)
             made = replace(made, coarser=coarser, coarser_share=0.5 if dense else 2.0)
+    if not rotor_input and any(map(command_jitter_s, logs)):
+        jittered = take(windows_of(like=windows, jitter=True)[0], is_finite)
+        made, _ = _with_unknown(made, jittered)
     commands = [(log.time_s, log.rate_cmd_b) for log in logs if log.rate_cmd_b is not None]
     are_slow = any(own_spacing_s(*command) > limits.command_spacing_s for command in commands)
     if rotor_input or not are_slow:
         return made, warnings
     # The drone may have received commands between the rows.
     between = take(windows_of(between=True)[0], is_finite)
-    low, high = share_between(linear, _difference(model, linear, between), limits)
+    low, high = share_between(made.linear, _difference(model, linear, between), made.limits)
     if low > limits.lacking_share:
         return _with_unknown_commands(made), [*warnings, LACKING]
     if high > limits.held_share:  # unclear, so effects must be larger than what it changes
@@ -137,19 +140,21 @@ def _with_unknown_commands(made: Stretches) -> Stretches:
     assert windows is not None  # the same flights had some before
     linear, is_finite = _simulated(made.model, windows, made.limits)
     held = take(held_of(like=windows)[0], is_finite)
-    push = push_slopes(made.model, linear)
-    difference = _difference(made.model, linear, held)
-    error, limits = unknown_commands(linear, push, difference, made.limits)
-    return Stretches(
-        logs,
-        windows_of,
-        made.model,
-        linear._replace(windows=with_input_error(linear.windows, push, error)),
-        limits,
-        coarser=with_input_error(held, push, error),
-        coarser_share=2.0,
-        push_error=error,
-    )
+    made, held = _with_unknown(replace(made, logs=logs, cut=windows_of, linear=linear), held)
+    return replace(made, coarser=held, coarser_share=2.0)
+
+
+def _with_unknown(made: Stretches, other: FlightWindows) -> tuple[Stretches, FlightWindows]:
+    """Return the stretches and the `other` windows with the error of their commands.
+
+    Those are the same windows with commands that are as likely.
+    """
+    push = push_slopes(made.model, made.linear)
+    difference = _difference(made.model, made.linear, other)
+    error, limits = unknown_commands(made.linear, push, difference, made.limits)
+    windows, other = (with_input_error(w, push, error) for w in (made.linear.windows, other))
+    linear = made.linear._replace(windows=windows)
+    return replace(made, linear=linear, limits=limits, push_error=error), other
 
 
 def check_count(count: int, limits: Thresholds) -> None:

@@ -243,7 +243,8 @@ class Companion:
         self.rows.append(
             Row(
                 state, thrust, rate_b, self._action_b[0], decided, self.gate,
-                now_s - self._state_arrival_s, now_s - state.time_s, image_age_s,
+                self._clock_check.vehicle_time(now_s), now_s - self._state_arrival_s,
+                now_s - state.time_s, image_age_s,
             )
         )  # fmt: skip
         return [datagram]
@@ -321,6 +322,8 @@ class Row(NamedTuple):
     """Whether the policy decided on this state."""
     gate: int
     """Index of the next gate."""
+    sent_s: float
+    """Time at which the set point was sent, by the vehicle's clock [s]."""
     answered_s: float
     """Time from the state's arrival to its set point [s]."""
     state_age_s: float

@@ -1,7 +1,7 @@
 """Fly over the link in real time: many trials with a simulated vehicle, or one with a real vehicle.
 
 The companion (`companion.py`) runs the policy and its checks. This module exchanges its datagrams
-with the vehicle, writes its logs and computes statistics of its delays.
+with the vehicle, and computes statistics of its delays.
 """
 
 from __future__ import annotations
@@ -16,21 +16,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.logs import flight as recorded
-from eval.logs.columns import FlightLogError
-from eval.logs.flight_log import log_from_flight, write_flight
 from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.trial import Rules, TrialSpec, track_of
 from policies.observation import Observation
 from policies.policy import Policy
 from suite.common.console import Console
 from suite.judging.link.companion import FINISHED, Companion, Row
+from suite.judging.link.log import write_log
 from suite.judging.link.messages import Wire
 from suite.judging.link.server import COMPANION, VEHICLE, WAIT_S, VehicleProcess
 from suite.judging.link.simulated import FlightRequest
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
-from suite.judging.trials import TrialSet, log_name
+from suite.judging.trials import TrialSet
 
 HEARTBEAT_S = 1.0
 """Time between heartbeats of the companion [s]."""
@@ -145,47 +143,6 @@ def fly_link(
             link.send(companion.receive(link.receive(POLL_S)))
             if not companion.rows and clock() - begin_s > wait_s:
                 return
-
-
-def write_log(
-    companion: Companion, about: dict[str, Any], out: Path, console: Console
-) -> str | None:
-    """Write a flight's log into `out` and return its name; None if it is no valid flight log.
-
-    A flight with fewer than two states has none. `about` is stored in the log: track, level and
-    seed, and of a simulated flight the integrator. `console` shows why a log is not written.
-    """
-    rows = companion.rows
-    if len(rows) < 2:
-        return None
-    start_s = rows[0].state.time_s
-    flight = recorded.Flight(
-        time_s=np.array([row.state.time_s - start_s for row in rows]),
-        pos_w=np.stack([row.state.pos_w for row in rows]),
-        quat_wxyz=np.stack([row.state.quat_wxyz for row in rows]),
-        vel_w=np.stack([row.state.vel_w for row in rows]),
-        rate_b=np.stack([row.state.rate_b for row in rows]),
-        thrust_cmd=np.array([row.thrust for row in rows]),
-        rate_cmd_b=np.stack([row.rate_b for row in rows]),
-        rotor_speed=np.full((len(rows), 4), np.nan),
-        action_b=np.stack([row.action_b for row in rows]),
-        policy_step=np.array([row.decided for row in rows]),
-        gate=np.array([row.gate for row in rows], np.int32),
-        depth_m=None,
-        depth_time_s=None,
-        about={**about, "events": companion.events, "handed_over": companion.over},
-        action_kind=companion.action_kind,
-    )
-    name, log = (
-        log_name(about["track"], about["difficulty"], about["seed"]),
-        log_from_flight(flight),
-    )
-    try:
-        write_flight(out / name, log)
-    except FlightLogError as error:
-        console.note(f"warning: the flight's log is not written: {error}")
-        return None
-    return name
 
 
 def totals(flights: list[Flight], limits: Limits) -> dict[str, Any]:

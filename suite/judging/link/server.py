@@ -20,9 +20,9 @@ VEHICLE, COMPANION = 1, 2
 """MAVLink system numbers of the two ends of the link."""
 WAIT_S = 30.0
 """Longest time that the vehicle waits for the first set point [s]."""
-SLIP_S = 0.02
-"""Longest delay of a step that the following steps make up for [s]. After a longer one (a slip) the
-later steps are shifted in time."""
+LATE_S, SHIFT_S = 0.02, 0.05
+"""Delays of a step: above the first it counts as a slip, and the following steps make up for it up
+to the second; above that, later steps are shifted in time [s]."""
 
 
 class VehicleResult(NamedTuple):
@@ -30,7 +30,7 @@ class VehicleResult(NamedTuple):
 
     trial: TrialResult
     slips: int
-    """Number of steps with a delay above `SLIP_S`, which a busy machine causes."""
+    """Number of delays above `LATE_S`, which a busy machine causes."""
 
 
 class VehicleProcess:
@@ -102,20 +102,22 @@ def fly_in_real_time(request: FlightRequest, pipe: Connection) -> VehicleResult:
     link = UdpLink(request.address)
     try:
         vehicle = SimulatedVehicle(request, Wire(VEHICLE, COMPANION))
-        begin, due, slips = time.monotonic(), time.monotonic(), 0
+        begin, due, slips, is_late = time.monotonic(), time.monotonic(), 0, False
         while not vehicle.over and not pipe.poll():
             # Wait until the step is due; if it is too late, shift the later steps.
             due += vehicle.dt
             now = time.monotonic()
+            was_late, is_late = is_late, now - due > LATE_S
+            slips += is_late and not was_late
             if now < due:
                 time.sleep(due - now)
-            elif now - due > SLIP_S:
-                due, slips = now, slips + 1
+            elif now - due > SHIFT_S:
+                due = now
             if not vehicle.begun and now - begin > WAIT_S:
                 break
             link.send(vehicle.step(link.receive(), clock_s=due))
         # A handover during a delay ends the loop before the delay is counted.
-        slips += not vehicle.over and time.monotonic() - due > SLIP_S + vehicle.dt
+        slips += not (vehicle.over or is_late) and time.monotonic() - due > LATE_S + vehicle.dt
     finally:
         link.close()
     return VehicleResult(vehicle.result(), slips)

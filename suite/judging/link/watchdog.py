@@ -142,6 +142,14 @@ class ClockCheck:
         self._offset_s = min(self._offset_s, offset_s)
         return None
 
+    def vehicle_time(self, now_s: float) -> float:
+        """Return the time of the vehicle's clock at `now_s` of the companion's clock [s].
+
+        It is early by the shortest delay of a state, which no clock at one end of a link shows.
+        """
+        assert self._offset_s is not None  # a state has arrived
+        return now_s - self._offset_s
+
 
 Clock = Callable[[], float]
 """Monotonic time [s]."""

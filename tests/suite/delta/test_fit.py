@@ -38,10 +38,11 @@ from suite.delta.replay import (
     replay_point_mass,
 )
 from suite.delta.run import errors_grid, fit_delta, long_enough, split
-from suite.delta.windows import cut_windows, log_decisions
+from suite.delta.windows import cut_windows, log_decisions, on_state_rows
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from suite.train.overrides import with_changes
 from suite.train.recipes import quick, race, race_paper
+from tests.support.broken_logs import with_sent_commands
 from tests.support.commands import run
 from tests.support.point_mass_flights import fly
 from tests.support.vehicles import with_lag
@@ -71,6 +72,26 @@ def test_lag_drag_and_delay_of_a_point_mass_are_identified_in_a_third_of_the_ste
     for iterations in (2, 9):
         identify(FitConfig(iterations=iterations), PHYSICS, nothing)
     assert taken == [1, 3]
+
+
+def test_commands_in_rows_of_their_own_move_to_the_states_that_they_answer():
+    """As in the logs of `suite fly`."""
+    (log,) = fly(nominal_model(PHYSICS), 1)
+    count = len(log.time_s)
+    assert on_state_rows(log) is log
+    log = replace(log, thrust_cmd=np.arange(count) + 1.0, rate_cmd_b=log.rate_b)
+    assert on_state_rows(log) is log
+    late_s = np.full(count, 0.2) * np.diff(log.time_s).min()
+    sent = with_sent_commands(log, late_s)
+    # A state without an answer has no command.
+    lost = np.arange(2 * count) != 9
+    sent = replace(sent, thrust_cmd=np.where(lost, sent.thrust_cmd, np.nan))
+    again = on_state_rows(sent)
+    for name in ("time_s", "pos_w", "quat_wxyz", "vel_w", "rate_b"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(log, name))
+    np.testing.assert_array_equal(again.policy_step, log.policy_step)
+    np.testing.assert_array_equal(np.isnan(again.thrust_cmd), np.arange(count) == 4)
+    np.testing.assert_array_equal(np.delete(again.thrust_cmd, 4), np.delete(log.thrust_cmd, 4))
 
 
 def push(vel_b, action_b):

@@ -28,7 +28,7 @@ from suite.diagnose.sources import rollout_source, rollouts, stretches
 from suite.diagnose.sources.source import DiagnosisInput
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tests.support import diagnosis_flights
-from tests.support.broken_logs import BREAKAGES, rows
+from tests.support.broken_logs import BREAKAGES, rows, with_sent_commands
 from tests.support.diagnosis_flights import fly, fly_all
 from tests.support.real_flights import Pendulum
 from tests.support.vehicles import LAGGED, PLAIN, REMEMBERING, with_effects, with_lag
@@ -336,6 +336,20 @@ def test_an_effect_at_the_threshold_of_relevance_is_named_without_half_of_the_co
     assert [one.candidate.name for _, one in found.named] == ["linear_drag"]
     ((effect, size),) = found.main.sizes.items()
     assert effect == "linear_drag" and size.force < 2.0 * THRESHOLDS.relevance[0]
+
+
+@pytest.mark.extended
+def test_times_of_commands_are_as_uncertain_as_a_log_states():
+    """As in the logs of `suite fly`: commands act later than logged, by more or less."""
+    true, count = with_effects(LAGGED, command_delay=(0.004,)), 3
+    logs, rng = flights(true, count=count, duration_s=5.0, noise=0.0), np.random.default_rng(0)
+    late_s = rng.uniform(0.0005, 0.0075, (count, len(logs[0].time_s)))
+    sent = [with_sent_commands(*one) for one in zip(logs, late_s, strict=True)]
+    jitter_s = float(late_s.std())
+    stated = [replace(log, about={**log.about, "command_jitter_s": jitter_s}) for log in sent]
+    as_exact, as_stated = by_rollout(sent), by_rollout(stated)
+    assert as_exact["gap"]["before"] > 5.0 * as_stated["gap"]["before"]
+    assert (as_stated["verdict"], as_stated["effects"]) == ("no_gap", [])
 
 
 @pytest.mark.slow

@@ -225,6 +225,16 @@ def test_eulers_steps_are_those_that_a_log_states_or_periods_of_the_rate_loop(lo
         np.testing.assert_allclose(length_s[length_s > 0.0], step_s, rtol=1e-6)
 
 
+@pytest.mark.parametrize("stated", [None, True, "0.002", -0.1, float("nan"), 0.002])
+def test_times_of_commands_are_shifted_as_far_as_a_log_states(log, stated):
+    jittery = replace(log, about={"command_jitter_s": stated})
+    as_logged, shifted = (cut([jittery], PLAIN, False, jitter=on)[0] for on in (False, True))
+    used = np.isfinite(as_logged.command_s)
+    shift_s = (shifted.command_s - np.where(used, as_logged.command_s, 0.0))[used]
+    assert np.std(shift_s) == pytest.approx(0.002 if stated == 0.002 else 0.0, rel=0.2)
+    np.testing.assert_array_equal(shifted.command, as_logged.command)
+
+
 def test_few_shapes_hold_rows_of_every_rate(log):
     few, many = (144 + 512 + 1, 192), (144 + 512 + 1, 1536)
     more = 704 - 512
