@@ -115,6 +115,8 @@ def evaluate_policy(
     check_type("difficulty", difficulty, (str, Integral), "a level, or several as a text: '0,3'")
     check_type("vehicle", vehicle, (*PATH, Vehicle), "a name, a path or a Vehicle")
     check_type("sensors", sensors, PATH, "a name or a path")
+    for name, number in (("trials", trials), ("seed", seed)):
+        check_type(name, number, (Integral,), "a whole number")
     if workers is not None:
         check_number("workers", workers, Range(1, MOST, whole=True))
     if isinstance(vehicle, Vehicle):
@@ -170,15 +172,25 @@ def train_policy(
         progress: print progress.
 
     Raises:
-        ValueError: for a recipe or setting that cannot be used, or a folder with another run.
+        ValueError: for a recipe or setting that cannot be used, or a folder with another run, or
+            in which another program writes.
     """
-    from suite.commands.train import Config, resolve
+    from eval.worlds.engine import warn_of
+    from suite.commands.train import Config, doubts, refuse_policy_folder, resolve
+    from suite.common.running.lock import one_writer
     from suite.train.run import train
+    from tracks.input.ranges import check_ranges
 
-    with _options_as_arguments("seed", set="settings"):
-        changes = _all("settings", settings)
-        resolved = resolve(Config(recipe=recipe, iterations=iterations, set=changes, seed=seed))
-    outcome = train(resolved, as_path("out", out), _console(progress))
+    folder, changes = as_path("out", out), _all("settings", settings)
+    check_type("seed", seed, (Integral,), "a whole number")
+    with _options_as_arguments("seed", "iterations", "out", set="settings"):
+        config = Config(recipe=recipe, iterations=iterations, set=changes, seed=seed)
+        check_ranges(config, options=True)
+        resolved = resolve(config)
+        refuse_policy_folder(folder)
+        with one_writer(folder), _precision_of_commands():
+            warn_of(doubts(resolved))
+            outcome = train(resolved, folder, _console(progress))
     return Path(outcome.policy)
 
 
@@ -188,6 +200,7 @@ def diagnose_flights(
     out: Source,
     *,
     reference: Source | Sequence[Source] = (),
+    accept: str | Sequence[str] = (),
     progress: bool = True,
 ) -> dict[str, Any]:
     """Name the physical effect that a vehicle file lacks; return the contents of diagnosis.json.
@@ -197,11 +210,14 @@ def diagnose_flights(
         vehicle: a vehicle file or a shipped name.
         out: folder for diagnosis.json, vehicle.toml and report.html.
         reference: earlier flights; with them the diagnosis names what has changed since.
+        accept: faults of the logs that do not stop it, by the names that its message gives.
         progress: whether to print progress.
 
     Raises:
-        ValueError: for flights or a vehicle that cannot be used.
+        ValueError: for flights or a vehicle that cannot be used, or a folder in which another
+            program writes.
     """
+    from suite.common.running.lock import one_writer
     from suite.diagnose.config import Config
     from suite.diagnose.run import diagnose_files
 
@@ -209,30 +225,45 @@ def diagnose_flights(
         tuple(map(Path, _all(name, given)))
         for name, given in (("flights", flights), ("reference", reference))
     )
-    file = str(as_path("vehicle", vehicle))
-    config = Config(flights=paths, vehicle=file, reference=before, out=as_path("out", out))
-    return diagnose_files(config, _console(progress))
+    file, folder, faults = (
+        str(as_path("vehicle", vehicle)),
+        as_path("out", out),
+        _all("accept", accept),
+    )
+    config = Config(flights=paths, vehicle=file, reference=before, out=folder, accept=faults)
+    with _options_as_arguments("out", "accept"), one_writer(folder), _precision_of_commands():
+        return diagnose_files(config, _console(progress))
 
 
 def identify_vehicle(
-    flights: Source | Sequence[Source], vehicle: Source, out: Source, *, progress: bool = True
+    flights: Source | Sequence[Source],
+    vehicle: Source,
+    out: Source,
+    *,
+    accept: str | Sequence[str] = (),
+    progress: bool = True,
 ) -> dict[str, Any]:
     """Estimate the parameters of a vehicle file from flights, and return them with intervals.
 
     Args:
         flights: flight logs or folders of them: one, or a sequence.
         vehicle: the file or shipped name to start from.
-        out: the vehicle file to write.
-        progress: whether to print progress.
+        out: the vehicle file to write (.toml), another one than `vehicle`.
+        accept: faults of the logs that do not stop it, by the names that its message gives.
+        progress: whether to print progress and warnings.
 
     Raises:
         ValueError: for flights or a vehicle that cannot be used.
     """
     from suite.diagnose.identify.run import identify_files
 
-    paths = [*map(Path, _all("flights", flights))]
-    start = str(as_path("vehicle", vehicle))
-    return identify_files(paths, start, as_path("out", out), (), _console(progress))
+    paths, faults = [*map(Path, _all("flights", flights))], _all("accept", accept)
+    start, file, console = str(as_path("vehicle", vehicle)), as_path("out", out), _console(progress)
+    with _options_as_arguments("out", "accept"), _precision_of_commands():
+        result = identify_files(paths, start, file, (), console, faults)
+    for warning in result["warnings"]:
+        console.note(f"warning: {warning}")
+    return result
 
 
 def _all(name: str, given: Any) -> tuple[Any, ...]:
@@ -303,6 +334,15 @@ def _options_as_arguments(*same: str, **others: str) -> Iterator[None]:
         if text != str(error):
             error.args = (text,)
         raise
+
+
+@contextmanager
+def _precision_of_commands() -> Iterator[None]:
+    """Compute as commands do, whatever precision the calling program has chosen in JAX."""
+    import jax
+
+    with jax.enable_x64(False), jax.default_matmul_precision("highest"):
+        yield
 
 
 def _console(progress: bool) -> Console:

@@ -3,10 +3,14 @@
 import shutil
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
+import jax
 import pytest
 
 import suite
+from policies.shipped import locate
+from suite.common.running.lock import one_writer
 from suite.diagnose import example
 
 EXAMPLE = Path(example.__file__).parent
@@ -25,8 +29,8 @@ def identify(tmp_path):
 @pytest.mark.parametrize(
     ("out", "said"),
     [
-        ("vehicle.toml", "vehicle.toml is also an input and would be overwritten"),
-        ("flight_1.parquet", "its ending must be .toml$"),
+        ("vehicle.toml", "out: .*vehicle.toml is also an input .*; give another out$"),
+        ("flight_1.parquet", "out is .*flight_1.parquet'; its ending must be .toml$"),
     ],
 )
 def test_an_identification_overwrites_neither_its_vehicle_nor_a_log(identify, tmp_path, out, said):
@@ -39,3 +43,78 @@ def test_an_identification_overwrites_neither_its_vehicle_nor_a_log(identify, tm
 def test_an_identified_file_says_from_how_many_flights_it_is(identify, tmp_path):
     identify(tmp_path / "mine.toml", progress=False)
     assert "by suite identify, 3 flights (rates)" in (tmp_path / "mine.toml").read_text()
+
+
+def test_faults_are_accepted_by_name_and_the_warnings_of_an_identification_printed(
+    tmp_path, monkeypatch, capsys
+):
+    given = []
+
+    def stop(*args):
+        given.append(args)
+        raise ValueError("correct it, or continue anyway with --accept rate_sign")
+
+    monkeypatch.setattr("suite.diagnose.run.diagnose_files", stop)
+    for accept in ("rate_sign", ["rate_sign"]):
+        with pytest.raises(ValueError, match=r"anyway with accept rate_sign$"):
+            suite.diagnose_flights("none", "racer5", tmp_path / "out", accept=accept)
+    assert [config.accept for config, _ in given] == [("rate_sign",)] * 2
+    assert not (tmp_path / "out").exists()
+
+    name = "suite.diagnose.identify.run.identify_files"
+    monkeypatch.setattr(name, lambda *args: given.append(args) or {"warnings": ["a doubt"]})
+    suite.identify_vehicle("none", "racer5", tmp_path / "v.toml", accept="rate_sign")
+    assert given[-1][-1] == ("rate_sign",)
+    assert "warning: a doubt" in capsys.readouterr().err
+
+
+def test_a_folder_in_which_another_program_writes_or_that_is_a_file_is_refused_before_the_work(
+    tmp_path, monkeypatch
+):
+    for work in ("suite.diagnose.run.diagnose_files", "suite.train.run.train"):
+        monkeypatch.setattr(work, lambda *_: pytest.fail("the work began"))
+    (tmp_path / "file").write_text("kept")
+    calls = (
+        lambda out: suite.diagnose_flights([EXAMPLE], "racer5", out),
+        lambda out: suite.train_policy(out, "quick"),
+    )
+    with one_writer(tmp_path / "locked"):
+        for call in calls:
+            with pytest.raises(ValueError, match="is being written by .* or give another out$"):
+                call(tmp_path / "locked")
+            with pytest.raises(FileExistsError, match="file"):
+                call(tmp_path / "file")
+
+
+def test_a_training_warns_as_the_command_does_and_names_arguments(tmp_path, monkeypatch):
+    outcome = SimpleNamespace(policy=str(tmp_path))
+    monkeypatch.setattr("suite.train.run.train", lambda *_: outcome)
+    train = partial(suite.train_policy, tmp_path / "run", "quick")
+    with pytest.warns(UserWarning, match="spec.camera.fov_deg is in degrees"):
+        train(settings="spec.camera.fov_deg=(1.4,1.1)")
+    for call, said in (
+        (partial(train, seed=None), "seed is None, allowed is a whole number"),
+        (partial(train, iterations=0), "iterations is 0, allowed is 1 to"),
+        (partial(suite.evaluate_policy, seed=None), "seed is None, allowed is a whole number"),
+        (partial(suite.evaluate_policy, trials=None), "trials is None, allowed is a whole number"),
+    ):
+        with pytest.raises(ValueError, match=f"^{said}"):
+            call()
+    with pytest.raises(ValueError, match="^out .* is the folder of a policy"):
+        suite.train_policy(locate("race-small"), "quick")
+
+
+def test_the_precision_that_a_program_chose_in_jax_does_not_change_a_training(
+    tmp_path, monkeypatch
+):
+    seen = []
+
+    def train(*_):
+        seen.append((jax.config.jax_enable_x64, jax.config.jax_default_matmul_precision))
+        return SimpleNamespace(policy="")
+
+    monkeypatch.setattr("suite.train.run.train", train)
+    with jax.enable_x64(True), jax.default_matmul_precision("default"):
+        suite.train_policy(tmp_path / "run", "quick")
+        assert jax.config.jax_enable_x64
+    assert seen == [(False, "highest")]
