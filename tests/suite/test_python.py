@@ -104,17 +104,14 @@ def test_a_training_warns_as_the_command_does_and_names_arguments(tmp_path, monk
         suite.train_policy(locate("race-small"), "quick")
 
 
-def test_the_precision_that_a_program_chose_in_jax_does_not_change_a_training(
-    tmp_path, monkeypatch
-):
-    seen = []
-
-    def train(*_):
-        seen.append((jax.config.jax_enable_x64, jax.config.jax_default_matmul_precision))
-        return SimpleNamespace(policy="")
-
-    monkeypatch.setattr("suite.train.run.train", train)
-    with jax.enable_x64(True), jax.default_matmul_precision("default"):
-        suite.train_policy(tmp_path / "run", "quick")
+def test_a_training_does_not_depend_on_the_precision_that_a_program_chose_in_jax(tmp_path):
+    settings = ("episode.batch=2", "episode.steps=2", "optimizer.warmup=1")
+    train = partial(suite.train_policy, settings=settings, iterations=2, progress=False)
+    weights = [train(tmp_path / "plain", "quick") / "weights.safetensors"]
+    jax.config.update("jax_enable_x64", True)  # for all threads
+    try:
+        weights.append(train(tmp_path / "x64", "quick") / "weights.safetensors")
         assert jax.config.jax_enable_x64
-    assert seen == [(False, "highest")]
+    finally:
+        jax.config.update("jax_enable_x64", False)
+    assert weights[0].read_bytes() == weights[1].read_bytes()
