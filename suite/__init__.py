@@ -83,7 +83,8 @@ def evaluate_policy(
             with commas.
         difficulty: a level 0 to 9, "0,3", "0-9" or "all"; ignored for a track of your own.
         trials: number of trials on every track at every level. A track of your own is flown once if
-            nothing in its flights is random; policy objects may be random.
+            nothing in its flights is random; policy objects may be random. In results a Track that
+            `make_track` drew has the name FAMILY-LEVEL-SEED.
         seed: seed of the first trial; each further trial adds one.
         vehicle: a vehicle, a shipped name or a vehicle file.
         simulator: a name of `suite list simulators`.
@@ -106,7 +107,7 @@ def evaluate_policy(
     from suite.judging.content import PolicyContent
     from suite.judging.flying import fly_trials, policy_for_workers
     from suite.judging.requests import Evaluation
-    from suite.judging.trials import read_trial_set
+    from suite.judging.trials import equal_flights, read_trial_set
     from tracks.common.work import MOST
     from tracks.track import Track
 
@@ -149,6 +150,7 @@ def evaluate_policy(
     known = {doubt.fault for doubt in doubts}
     in_flight = action_report(results, loaded.spec.action, known)["warnings"]
     warn_of(f"policy {loaded.name!r}: {doubt}" for doubt in (*doubts, *in_flight))
+    warn_of(equal_flights(results, trial_set.tracks))
     return results
 
 

@@ -12,6 +12,7 @@ import suite
 from policies.shipped import locate
 from suite.common.running.lock import one_writer
 from suite.diagnose import example
+from tests.support.pilots import Pursuit
 
 EXAMPLE = Path(example.__file__).parent
 """Folder of the example's flights and its vehicle file."""
@@ -115,3 +116,14 @@ def test_a_training_does_not_depend_on_the_precision_that_a_program_chose_in_jax
     finally:
         jax.config.update("jax_enable_x64", False)
     assert weights[0].read_bytes() == weights[1].read_bytes()
+
+
+def test_a_track_of_a_family_has_a_name_of_its_own_and_equal_flights_count_as_one():
+    track, pilot = suite.make_track("zigzag", 3, 5), Pursuit()
+    fly = partial(suite.evaluate_policy, track=track)
+    with pytest.warns(UserWarning, match="zigzag-3-5: 2 equal flights, .* count as one trial"):
+        results = fly(pilot, trials=2)
+    # By these a trial of the family would be on another track.
+    assert {result.trial[:2] for result in results} == {("zigzag-3-5", 3)}
+    (drawn,) = suite.evaluate_policy(pilot, track="zigzag", difficulty=3, seed=5, trials=1)
+    assert results[0][6:] == drawn[6:]
