@@ -144,7 +144,17 @@ def evaluate_policy(
     flown, processes = loaded, 1 if workers is None else workers
     if is_source:
         flown = policy_for_workers(loaded, PolicyContent.of(policy), processes)
-    results = fly_trials(flown, evaluation, trial_set, processes)
+    elif processes > 1:
+        _check_sendable(loaded)
+    try:
+        results = fly_trials(flown, evaluation, trial_set, processes)
+    except AttributeError as error:
+        if processes == 1 or "__mp_main__" not in str(error) and "__main__" not in str(error):
+            raise
+        raise ValueError(
+            f"another process lacks what this program defines ({error}); define it in a module or "
+            'above `if __name__ == "__main__":`, or leave workers out, as in a notebook'
+        ) from error
     # An object is probed after its flights, so that the probe cannot change them.
     doubts = () if before or hasattr(loaded, "notes") else object_faults(loaded)
     known = {doubt.fault for doubt in doubts}
@@ -266,6 +276,19 @@ def identify_vehicle(
     for warning in result["warnings"]:
         console.note(f"warning: {warning}")
     return result
+
+
+def _check_sendable(policy: Policy) -> None:
+    """Refuse a policy object that cannot fly in other processes, such as a loaded one."""
+    from tracks.common.work.pickling import pack
+
+    try:
+        pack(policy)
+    except ValueError as error:
+        raise ValueError(
+            f"policy {policy.name!r} cannot be sent to other processes; give its name or path "
+            "instead of the object, or leave workers out"
+        ) from error
 
 
 def _all(name: str, given: Any) -> tuple[Any, ...]:

@@ -13,9 +13,21 @@ from policies.shipped import locate
 from suite.common.running.lock import one_writer
 from suite.diagnose import example
 from tests.support.pilots import Pursuit
+from tests.support.tools import python
 
 EXAMPLE = Path(example.__file__).parent
 """Folder of the example's flights and its vehicle file."""
+PROGRAM = """
+import suite
+from tests.support.pilots import Pursuit
+
+if __name__ == "__main__":
+    class Pilot(Pursuit):
+        pass
+
+    suite.evaluate_policy(Pilot(), track="zigzag", trials=2, workers=2)
+"""
+"""A program whose policy other processes lack."""
 
 
 @pytest.fixture
@@ -127,3 +139,12 @@ def test_a_track_of_a_family_has_a_name_of_its_own_and_equal_flights_count_as_on
     assert {result.trial[:2] for result in results} == {("zigzag-3-5", 3)}
     (drawn,) = suite.evaluate_policy(pilot, track="zigzag", difficulty=3, seed=5, trials=1)
     assert results[0][6:] == drawn[6:]
+
+
+def test_what_cannot_be_sent_to_other_processes_is_refused_with_what_can():
+    fly = partial(suite.evaluate_policy, track="zigzag", difficulty=0, trials=2, workers=2)
+    with pytest.raises(ValueError, match="^policy 'race-small' cannot .* give its name or path"):
+        fly(suite.load_policy("race-small"))
+    ended = python(PROGRAM)
+    assert "ValueError: another process lacks what this program defines" in ended.stderr
+    assert "Pilot" in ended.stderr and "or leave workers out" in ended.stderr
