@@ -105,7 +105,7 @@ def evaluate_policy(
     from policies.policy import check_is_policy, load_policy
     from suite.common.vehicles import camera_warnings
     from suite.judging.content import PolicyContent
-    from suite.judging.flying import fly_trials, policy_for_workers
+    from suite.judging.flying import fly_from_python
     from suite.judging.requests import Evaluation
     from suite.judging.trials import equal_flights, read_trial_set
     from tracks.common.work import MOST
@@ -141,20 +141,9 @@ def evaluate_policy(
     cameras = camera_warnings(loaded.spec.camera, trial_set.vehicle)
     doubts_of_files = [*vehicle_doubts(trial_set.vehicle), *cameras]
     warn_of([*doubts_of_files, *trial_set.differences, *notes])
-    flown, processes = loaded, 1 if workers is None else workers
-    if is_source:
-        flown = policy_for_workers(loaded, PolicyContent.of(policy), processes)
-    elif processes > 1:
-        _check_sendable(loaded)
-    try:
-        results = fly_trials(flown, evaluation, trial_set, processes)
-    except AttributeError as error:
-        if processes == 1 or "__mp_main__" not in str(error) and "__main__" not in str(error):
-            raise
-        raise ValueError(
-            f"another process lacks what this program defines ({error}); define it in a module or "
-            'above `if __name__ == "__main__":`, or leave workers out, as in a notebook'
-        ) from error
+    processes = 1 if workers is None else workers
+    content = PolicyContent.of(policy) if is_source else None
+    results = fly_from_python(loaded, content, evaluation, trial_set, processes)
     # An object is probed after its flights, so that the probe cannot change them.
     doubts = () if before or hasattr(loaded, "notes") else object_faults(loaded)
     known = {doubt.fault for doubt in doubts}
@@ -276,19 +265,6 @@ def identify_vehicle(
     for warning in result["warnings"]:
         console.note(f"warning: {warning}")
     return result
-
-
-def _check_sendable(policy: Policy) -> None:
-    """Refuse a policy object that cannot fly in other processes, such as a loaded one."""
-    from tracks.common.work.pickling import pack
-
-    try:
-        pack(policy)
-    except ValueError as error:
-        raise ValueError(
-            f"policy {policy.name!r} cannot be sent to other processes; give its name or path "
-            "instead of the object, or leave workers out"
-        ) from error
 
 
 def _all(name: str, given: Any) -> tuple[Any, ...]:

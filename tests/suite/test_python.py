@@ -141,10 +141,15 @@ def test_a_track_of_a_family_has_a_name_of_its_own_and_equal_flights_count_as_on
     assert results[0][6:] == drawn[6:]
 
 
-def test_what_cannot_be_sent_to_other_processes_is_refused_with_what_can():
+def test_what_cannot_be_sent_to_other_processes_is_refused_with_what_can(tmp_path):
     fly = partial(suite.evaluate_policy, track="zigzag", difficulty=0, trials=2, workers=2)
     with pytest.raises(ValueError, match="^policy 'race-small' cannot .* give its name or path"):
         fly(suite.load_policy("race-small"))
     ended = python(PROGRAM)
     assert "ValueError: another process lacks what this program defines" in ended.stderr
     assert "Pilot" in ended.stderr and "or leave workers out" in ended.stderr
+    # Other processes import a file, and without the guard its call too.
+    call = 'suite.evaluate_policy("race-small", track="zigzag", trials=2, workers=2)'
+    (path := tmp_path / "program.py").write_text(f"import suite\n{call}\n")
+    ended = python("import runpy, sys; runpy.run_path(sys.argv[1], run_name='__main__')", path)
+    assert "With exit code 1 it could not import this program: call eval" in ended.stderr
