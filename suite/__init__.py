@@ -309,6 +309,8 @@ def register_track(name: str, make: Any) -> None:
     """
     from tracks.families import FAMILIES
 
+    if name == "all":
+        raise ValueError("name is 'all', which means the judged families; register another name")
     FAMILIES.register(name, make)
 
 
@@ -316,10 +318,12 @@ def register_simulator(name: str, simulator: Any) -> None:
     """Add a simulator, a class as `eval.worlds.World` describes it, for this process.
 
     Raises:
-        ValueError: for a name in use, or a simulator that is no class.
+        ValueError: for a name in use, or a simulator that is no class or lacks methods.
     """
     from eval.worlds import WORLDS
 
+    if missing := ", ".join(sorted(getattr(simulator, "__abstractmethods__", ()))):
+        raise ValueError(f"simulator {name!r}: {simulator.__name__} lacks its methods {missing}")
     WORLDS.register(name, simulator)
 
 

@@ -9,11 +9,14 @@ import jax
 import pytest
 
 import suite
+from eval.worlds import WORLDS
+from eval.worlds.scene_slots import SceneSlots
 from policies.shipped import locate
 from suite.common.running.lock import one_writer
 from suite.diagnose import example
 from tests.support.pilots import Pursuit
 from tests.support.tools import python
+from tracks.families import FAMILIES
 
 EXAMPLE = Path(example.__file__).parent
 """Folder of the example's flights and its vehicle file."""
@@ -153,3 +156,21 @@ def test_what_cannot_be_sent_to_other_processes_is_refused_with_what_can(tmp_pat
     (path := tmp_path / "program.py").write_text(f"import suite\n{call}\n")
     ended = python("import runpy, sys; runpy.run_path(sys.argv[1], run_name='__main__')", path)
     assert "With exit code 1 it could not import this program: call eval" in ended.stderr
+
+
+def test_what_cannot_be_used_is_not_registered(monkeypatch):
+    class Incomplete(SceneSlots):
+        """A simulator without `_move`."""
+
+    with pytest.raises(ValueError, match="'incomplete': Incomplete lacks its methods _move$"):
+        suite.register_simulator("incomplete", Incomplete)
+    with pytest.raises(ValueError, match="'all', which means the judged families"):
+        suite.register_track("all", FAMILIES["zigzag"])
+    for kept in ("_entries", "_values"):
+        monkeypatch.setattr(FAMILIES, kept, {**getattr(FAMILIES, kept)})
+    suite.register_track("own", FAMILIES["zigzag"])
+    # A cell of a notebook that runs again: what was compiled and checked knows the first one.
+    for name, said in (("own", "or restart the program .*kernel.$"), ("zigzag", "another name$")):
+        with pytest.raises(ValueError, match=f"'{name}' exists already; .*{said}"):
+            suite.register_track(name, FAMILIES["zigzag"])
+    assert not {"incomplete", "all"} & {*FAMILIES, *WORLDS}
