@@ -390,7 +390,7 @@ def write_flight(path: str | Path, log: FlightLog) -> Path:
         OSError: where the file cannot be written; nothing is left under its name.
     """
     file = as_path("path", path)
-    check_type("log", log, (FlightLog,), "a FlightLog")
+    check_type("log", log, (FlightLog,), "a FlightLog; of a Flight, log_from_flight makes one")
     for name in ("about", "extra"):
         check_type(f"log.{name}", getattr(log, name), (Mapping,), "a dict")
     columns = columns_from_log(log)
