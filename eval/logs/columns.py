@@ -242,7 +242,7 @@ def split_group(group: str, values: Any, field: str, name: str) -> dict[str, np.
         allowed = f"(T, {len(columns)})" if len(columns) > 1 else "(T,)"
         reason = f"`{field}` is {array.dtype} of shape {array.shape}"
         raise FlightLogError(name, f"{reason}, allowed are numbers of shape {allowed}")
-    numbers = array.astype(np.float64).filled(np.nan)
+    numbers = np.ma.filled(array.astype(np.float64), np.nan)
     return dict(zip(columns, numbers.reshape(-1, len(columns)).T, strict=True))
 
 
