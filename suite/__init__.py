@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral
 from pathlib import Path
@@ -109,6 +109,7 @@ def evaluate_policy(
     from suite.judging.requests import Evaluation
     from suite.judging.trials import equal_flights, read_trial_set
     from tracks.common.work import MOST
+    from tracks.formats.custom import load_track
     from tracks.track import Track
 
     check_type("track", track, (*PATH, Track), "a text, a path or a Track; several in one text "
@@ -124,6 +125,8 @@ def evaluate_policy(
         checked_vehicle(vehicle)
     loaded = load_policy(policy) if isinstance(policy, PATH) else policy
     check_is_policy(loaded)
+    if isinstance(track, os.PathLike) and "," in os.fspath(track):
+        track = load_track(track)  # in a text commas separate tracks
     given: dict[str, Any] = {"track": track, "vehicle": vehicle}
     sources = {name: os.fspath(each) for name, each in given.items() if isinstance(each, PATH)}
     objects = {name: each for name, each in given.items() if name not in sources}
@@ -182,7 +185,10 @@ def train_policy(
     from suite.train.run import train
     from tracks.input.ranges import check_ranges
 
-    folder, changes = as_path("out", out), _all("settings", settings)
+    folder, changes = (
+        as_path("out", out),
+        _all("settings", settings, "a text such as 'loss.progress=2'"),
+    )
     check_type("seed", seed, (Integral,), "a whole number")
     with _options_as_arguments("seed", "iterations", "out", set="settings"):
         config = Config(recipe=recipe, iterations=iterations, set=changes, seed=seed)
@@ -229,7 +235,7 @@ def diagnose_flights(
     file, folder, faults = (
         str(as_path("vehicle", vehicle)),
         as_path("out", out),
-        _all("accept", accept),
+        _all("accept", accept, "the name of a fault"),
     )
     config = Config(flights=paths, vehicle=file, reference=before, out=folder, accept=faults)
     with _options_as_arguments("out", "accept"), one_writer(folder), _precision_of_commands():
@@ -258,7 +264,10 @@ def identify_vehicle(
     """
     from suite.diagnose.identify.run import identify_files
 
-    paths, faults = [*map(Path, _all("flights", flights))], _all("accept", accept)
+    paths, faults = (
+        [*map(Path, _all("flights", flights))],
+        _all("accept", accept, "the name of a fault"),
+    )
     start, file, console = str(as_path("vehicle", vehicle)), as_path("out", out), _console(progress)
     with _options_as_arguments("out", "accept"), _precision_of_commands():
         result = identify_files(paths, start, file, (), console, faults)
@@ -267,13 +276,12 @@ def identify_vehicle(
     return result
 
 
-def _all(name: str, given: Any) -> tuple[Any, ...]:
+def _all(name: str, given: Any, allowed: str = "a text or a path") -> tuple[Any, ...]:
     """Return the argument `name`, one text or path or a sequence of them, as a tuple."""
-    entries = (
-        tuple(given) if isinstance(given, Iterable) and not isinstance(given, str) else (given,)
-    )
+    is_several = isinstance(given, Iterable) and not isinstance(given, str | bytes | Mapping)
+    entries = tuple(given) if is_several else (given,)
     for entry in entries:
-        as_path(name, entry)
+        as_path(name, entry, f"{allowed}, or a sequence of these")
     return entries
 
 

@@ -14,6 +14,7 @@ from eval.worlds.scene_slots import SceneSlots
 from policies.shipped import locate
 from suite.common.running.lock import one_writer
 from suite.diagnose import example
+from tests.support.courses import ONE_GATE
 from tests.support.pilots import Pursuit
 from tests.support.tools import python
 from tracks.families import FAMILIES
@@ -174,3 +175,25 @@ def test_what_cannot_be_used_is_not_registered(monkeypatch):
         with pytest.raises(ValueError, match=f"'{name}' exists already; .*{said}"):
             suite.register_track(name, FAMILIES["zigzag"])
     assert not {"incomplete", "all"} & {*FAMILIES, *WORLDS}
+
+
+def test_lists_of_other_things_are_named_whole_and_a_path_with_a_comma_is_one_track(tmp_path):
+    diagnose = partial(suite.diagnose_flights, vehicle="racer5", out=tmp_path / "out")
+    for call, said in (
+        (
+            partial(diagnose, b"flight"),
+            "flights is b'flight', allowed is a text or a path, or a se",
+        ),
+        (partial(diagnose, {"a": "b"}), "flights is {'a': 'b'}, allowed is"),
+        (partial(diagnose, "none", accept=None), "accept is None, allowed is the name of a fault"),
+        (
+            partial(suite.train_policy, tmp_path, settings=""),
+            "settings is '', allowed is a text su",
+        ),
+    ):
+        with pytest.raises(ValueError, match=f"^{said}"):
+            call()
+    (tmp_path / "a,b").mkdir()
+    (tmp_path / "a,b" / "course.toml").write_text(ONE_GATE)
+    (result,) = suite.evaluate_policy(Pursuit(), track=tmp_path / "a,b" / "course.toml", trials=1)
+    assert result.track == suite.load_track(tmp_path / "a,b" / "course.toml").family
