@@ -118,7 +118,8 @@ def evaluate_policy(
     check_type("vehicle", vehicle, (*PATH, Vehicle), "a name, a path or a Vehicle")
     check_type("sensors", sensors, PATH, "a name or a path")
     for name, number in (("trials", trials), ("seed", seed)):
-        check_type(name, number, (Integral,), "a whole number")
+        if number is None:  # a range lets it pass, for settings that may have no value
+            raise ValueError(f"{name} is None, allowed is a whole number")
     if workers is not None:
         check_number("workers", workers, Range(1, MOST, whole=True))
     if isinstance(vehicle, Vehicle):
@@ -189,7 +190,8 @@ def train_policy(
         as_path("out", out),
         _all("settings", settings, "a text such as 'loss.progress=2'"),
     )
-    check_type("seed", seed, (Integral,), "a whole number")
+    if seed is None:
+        raise ValueError("seed is None, allowed is a whole number")
     with _options_as_arguments("seed", "iterations", "out", set="settings"):
         config = Config(recipe=recipe, iterations=iterations, set=changes, seed=seed)
         check_ranges(config, options=True)
@@ -317,7 +319,7 @@ def register_track(name: str, make: Any) -> None:
     """
     from tracks.families import FAMILIES
 
-    if name == "all":
+    if isinstance(name, str) and name == "all":
         raise ValueError("name is 'all', which means the judged families; register another name")
     FAMILIES.register(name, make)
 
