@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral
 from pathlib import Path
@@ -83,7 +83,8 @@ def evaluate_policy(
             with commas.
         difficulty: a level 0 to 9, "0,3", "0-9" or "all"; ignored for a track of your own.
         trials: number of trials on every track at every level. A track of your own is flown once if
-            nothing in its flights is random; policy objects may be random.
+            nothing in its flights is random; policy objects may be random. In results a Track that
+            `make_track` drew has the name FAMILY-LEVEL-SEED.
         seed: seed of the first trial; each further trial adds one.
         vehicle: a vehicle, a shipped name or a vehicle file.
         simulator: a name of `suite list simulators`.
@@ -104,10 +105,11 @@ def evaluate_policy(
     from policies.policy import check_is_policy, load_policy
     from suite.common.vehicles import camera_warnings
     from suite.judging.content import PolicyContent
-    from suite.judging.flying import fly_trials, policy_for_workers
+    from suite.judging.flying import fly_from_python
     from suite.judging.requests import Evaluation
-    from suite.judging.trials import read_trial_set
+    from suite.judging.trials import equal_flights, read_trial_set
     from tracks.common.work import MOST
+    from tracks.formats.custom import load_track
     from tracks.track import Track
 
     check_type("track", track, (*PATH, Track), "a text, a path or a Track; several in one text "
@@ -115,12 +117,17 @@ def evaluate_policy(
     check_type("difficulty", difficulty, (str, Integral), "a level, or several as a text: '0,3'")
     check_type("vehicle", vehicle, (*PATH, Vehicle), "a name, a path or a Vehicle")
     check_type("sensors", sensors, PATH, "a name or a path")
+    for name, number in (("trials", trials), ("seed", seed)):
+        if number is None:  # a range lets it pass, for settings that may have no value
+            raise ValueError(f"{name} is None, allowed is a whole number")
     if workers is not None:
         check_number("workers", workers, Range(1, MOST, whole=True))
     if isinstance(vehicle, Vehicle):
         checked_vehicle(vehicle)
     loaded = load_policy(policy) if isinstance(policy, PATH) else policy
     check_is_policy(loaded)
+    if isinstance(track, os.PathLike) and "," in os.fspath(track):
+        track = load_track(track)  # in a text commas separate tracks
     given: dict[str, Any] = {"track": track, "vehicle": vehicle}
     sources = {name: os.fspath(each) for name, each in given.items() if isinstance(each, PATH)}
     objects = {name: each for name, each in given.items() if name not in sources}
@@ -138,15 +145,15 @@ def evaluate_policy(
     cameras = camera_warnings(loaded.spec.camera, trial_set.vehicle)
     doubts_of_files = [*vehicle_doubts(trial_set.vehicle), *cameras]
     warn_of([*doubts_of_files, *trial_set.differences, *notes])
-    flown, processes = loaded, 1 if workers is None else workers
-    if is_source:
-        flown = policy_for_workers(loaded, PolicyContent.of(policy), processes)
-    results = fly_trials(flown, evaluation, trial_set, processes)
+    processes = 1 if workers is None else workers
+    content = PolicyContent.of(policy) if is_source else None
+    results = fly_from_python(loaded, content, evaluation, trial_set, processes)
     # An object is probed after its flights, so that the probe cannot change them.
     doubts = () if before or hasattr(loaded, "notes") else object_faults(loaded)
     known = {doubt.fault for doubt in doubts}
     in_flight = action_report(results, loaded.spec.action, known)["warnings"]
     warn_of(f"policy {loaded.name!r}: {doubt}" for doubt in (*doubts, *in_flight))
+    warn_of(equal_flights(results, trial_set.tracks))
     return results
 
 
@@ -170,15 +177,29 @@ def train_policy(
         progress: print progress.
 
     Raises:
-        ValueError: for a recipe or setting that cannot be used, or a folder with another run.
+        ValueError: for a recipe or setting that cannot be used, or a folder with another run, or
+            in which another program writes.
     """
-    from suite.commands.train import Config, resolve
+    from eval.worlds.engine import warn_of
+    from suite.commands.train import Config, doubts, refuse_policy_folder, resolve
+    from suite.common.running.lock import one_writer
     from suite.train.run import train
+    from tracks.input.ranges import check_ranges
 
-    with _options_as_arguments("seed", set="settings"):
-        changes = _all("settings", settings)
-        resolved = resolve(Config(recipe=recipe, iterations=iterations, set=changes, seed=seed))
-    outcome = train(resolved, as_path("out", out), _console(progress))
+    folder, changes = (
+        as_path("out", out),
+        _all("settings", settings, "a text such as 'loss.progress=2'"),
+    )
+    if seed is None:
+        raise ValueError("seed is None, allowed is a whole number")
+    with _options_as_arguments("seed", "iterations", "out", set="settings"):
+        config = Config(recipe=recipe, iterations=iterations, set=changes, seed=seed)
+        check_ranges(config, options=True)
+        resolved = resolve(config)
+        refuse_policy_folder(folder)
+        with one_writer(folder), _precision_of_commands():
+            warn_of(doubts(resolved))
+            outcome = train(resolved, folder, _console(progress))
     return Path(outcome.policy)
 
 
@@ -188,6 +209,7 @@ def diagnose_flights(
     out: Source,
     *,
     reference: Source | Sequence[Source] = (),
+    accept: str | Sequence[str] = (),
     progress: bool = True,
 ) -> dict[str, Any]:
     """Name the physical effect that a vehicle file lacks; return the contents of diagnosis.json.
@@ -197,11 +219,14 @@ def diagnose_flights(
         vehicle: a vehicle file or a shipped name.
         out: folder for diagnosis.json, vehicle.toml and report.html.
         reference: earlier flights; with them the diagnosis names what has changed since.
+        accept: faults of the logs that do not stop it, by the names that its message gives.
         progress: whether to print progress.
 
     Raises:
-        ValueError: for flights or a vehicle that cannot be used.
+        ValueError: for flights or a vehicle that cannot be used, or a folder in which another
+            program writes.
     """
+    from suite.common.running.lock import one_writer
     from suite.diagnose.config import Config
     from suite.diagnose.run import diagnose_files
 
@@ -209,39 +234,56 @@ def diagnose_flights(
         tuple(map(Path, _all(name, given)))
         for name, given in (("flights", flights), ("reference", reference))
     )
-    file = str(as_path("vehicle", vehicle))
-    config = Config(flights=paths, vehicle=file, reference=before, out=as_path("out", out))
-    return diagnose_files(config, _console(progress))
+    file, folder, faults = (
+        str(as_path("vehicle", vehicle)),
+        as_path("out", out),
+        _all("accept", accept, "the name of a fault"),
+    )
+    config = Config(flights=paths, vehicle=file, reference=before, out=folder, accept=faults)
+    with _options_as_arguments("out", "accept"), one_writer(folder), _precision_of_commands():
+        return diagnose_files(config, _console(progress))
 
 
 def identify_vehicle(
-    flights: Source | Sequence[Source], vehicle: Source, out: Source, *, progress: bool = True
+    flights: Source | Sequence[Source],
+    vehicle: Source,
+    out: Source,
+    *,
+    accept: str | Sequence[str] = (),
+    progress: bool = True,
 ) -> dict[str, Any]:
     """Estimate the parameters of a vehicle file from flights, and return them with intervals.
 
     Args:
         flights: flight logs or folders of them: one, or a sequence.
         vehicle: the file or shipped name to start from.
-        out: the vehicle file to write.
-        progress: whether to print progress.
+        out: the vehicle file to write (.toml), another one than `vehicle`.
+        accept: faults of the logs that do not stop it, by the names that its message gives.
+        progress: whether to print progress and warnings.
 
     Raises:
         ValueError: for flights or a vehicle that cannot be used.
     """
     from suite.diagnose.identify.run import identify_files
 
-    paths = [*map(Path, _all("flights", flights))]
-    start = str(as_path("vehicle", vehicle))
-    return identify_files(paths, start, as_path("out", out), (), _console(progress))
-
-
-def _all(name: str, given: Any) -> tuple[Any, ...]:
-    """Return the argument `name`, one text or path or a sequence of them, as a tuple."""
-    entries = (
-        tuple(given) if isinstance(given, Iterable) and not isinstance(given, str) else (given,)
+    paths, faults = (
+        [*map(Path, _all("flights", flights))],
+        _all("accept", accept, "the name of a fault"),
     )
+    start, file, console = str(as_path("vehicle", vehicle)), as_path("out", out), _console(progress)
+    with _options_as_arguments("out", "accept"), _precision_of_commands():
+        result = identify_files(paths, start, file, (), console, faults)
+    for warning in result["warnings"]:
+        console.note(f"warning: {warning}")
+    return result
+
+
+def _all(name: str, given: Any, allowed: str = "a text or a path") -> tuple[Any, ...]:
+    """Return the argument `name`, one text or path or a sequence of them, as a tuple."""
+    is_several = isinstance(given, Iterable) and not isinstance(given, str | bytes | Mapping)
+    entries = tuple(given) if is_several else (given,)
     for entry in entries:
-        as_path(name, entry)
+        as_path(name, entry, f"{allowed}, or a sequence of these")
     return entries
 
 
@@ -277,6 +319,8 @@ def register_track(name: str, make: Any) -> None:
     """
     from tracks.families import FAMILIES
 
+    if isinstance(name, str) and name == "all":
+        raise ValueError("name is 'all', which means the judged families; register another name")
     FAMILIES.register(name, make)
 
 
@@ -284,10 +328,12 @@ def register_simulator(name: str, simulator: Any) -> None:
     """Add a simulator, a class as `eval.worlds.World` describes it, for this process.
 
     Raises:
-        ValueError: for a name in use, or a simulator that is no class.
+        ValueError: for a name in use, or a simulator that is no class or lacks methods.
     """
     from eval.worlds import WORLDS
 
+    if missing := ", ".join(sorted(getattr(simulator, "__abstractmethods__", ()))):
+        raise ValueError(f"simulator {name!r}: {simulator.__name__} lacks its methods {missing}")
     WORLDS.register(name, simulator)
 
 
@@ -303,6 +349,15 @@ def _options_as_arguments(*same: str, **others: str) -> Iterator[None]:
         if text != str(error):
             error.args = (text,)
         raise
+
+
+@contextmanager
+def _precision_of_commands() -> Iterator[None]:
+    """Compute as commands do, whatever precision the calling program has chosen in JAX."""
+    import jax
+
+    with jax.enable_x64(False), jax.default_matmul_precision("highest"):
+        yield
 
 
 def _console(progress: bool) -> Console:

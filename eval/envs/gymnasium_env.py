@@ -5,6 +5,7 @@ Importing this file registers them under `ID`, for `gymnasium.make` and `gymnasi
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from numbers import Integral
 from types import NoneType
@@ -20,9 +21,10 @@ from eval.envs.race import STATE_LIMIT
 from eval.envs.races import RaceConfig, Races
 from eval.worlds.trial import FLYING
 from policies.contract import Contract
+from policies.shipped import names
 from policies.spec import PolicySpec
 from tracks.common.names import unknown_name
-from tracks.input.ranges import check_type
+from tracks.input.ranges import PATH, check_type
 
 if TYPE_CHECKING:
     from eval.view.chase import Scenery
@@ -84,10 +86,26 @@ def seeds_of(seed: Any, count: int) -> list[int | None]:
     return [None if each is None else int(each) for each in seeds]
 
 
+def with_full_paths(config: RaceConfig) -> dict[str, Any]:
+    """Return the arguments of a `config` whose files were read, with the full paths of the files.
+
+    So a copy of an environment reads the same files in another working folder.
+    """
+    is_file = {
+        "track": os.fspath(config.track).endswith(".toml"),
+        "vehicle": isinstance(config.vehicle, PATH) and os.path.isfile(config.vehicle),
+        "spec": isinstance(config.spec, PATH) and os.fspath(config.spec) not in names(),
+    }
+    given = vars(config)
+    return given | {name: os.path.abspath(given[name]) for name in is_file if is_file[name]}
+
+
 class _OfRaces:
     """What the two environments have in common: their contract, and copies before `reset`."""
 
     _races: Races
+    _config: dict[str, Any]
+    """Fields of its `RaceConfig`, with full paths."""
     _arguments: dict[str, Any]
     """Arguments of the environment, in addition to the fields of its `RaceConfig`."""
 
@@ -101,7 +119,7 @@ class _OfRaces:
 
     def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
         """Return the arguments for pickling; the copy is a new environment before `reset`."""
-        return _make, (type(self), vars(self._races.config), self._arguments)
+        return _make, (type(self), self._config, self._arguments)
 
 
 class RaceEnv(_OfRaces, gymnasium.Env):
@@ -133,6 +151,7 @@ class RaceEnv(_OfRaces, gymnasium.Env):
         """
         check_render_mode(render_mode, self.metadata["render_modes"])
         self._races = Races(RaceConfig.of(**config), 1)
+        self._config = with_full_paths(self._races.config)
         self.action_space = action_space(self._races.spec)
         self.observation_space = observation_space(self._races.spec)
         self.render_mode, self._arguments = render_mode, {"render_mode": render_mode}
@@ -164,7 +183,7 @@ class RaceEnv(_OfRaces, gymnasium.Env):
         if self._races.ended[0] != FLYING:
             reason = self._races.ended_by(0)
             raise RuntimeError(f"the episode has ended by {reason}: call reset() before step()")
-        reward = self._races.step(np.reshape(action, (1, -1)))
+        reward = self._races.step(np.asarray(action).reshape(1, -1))
         info = self._races.info(0)
         truncated = info["ended_by"] == "timeout"
         terminated = bool(info["ended_by"]) and not truncated
@@ -217,6 +236,7 @@ class RaceVectorEnv(_OfRaces, VectorEnv):
         """
         check_render_mode(render_mode, ())
         self._races = Races(RaceConfig.of(**config), num_envs, threads)
+        self._config = with_full_paths(self._races.config)
         self.num_envs, self.render_mode = num_envs, render_mode
         self._arguments = {"num_envs": num_envs, "threads": threads, "render_mode": render_mode}
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}

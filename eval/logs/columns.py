@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -225,6 +226,24 @@ def as_numbers(values: np.ndarray, column: str, name: str) -> np.ndarray:
             hint = "; if this row has the units, delete it" if k == 0 else ""
             raise FlightLogError(name, f"{value!r} is not a number{hint}", column, k + 1) from None
     return numbers
+
+
+def split_group(group: str, values: Any, field: str, name: str) -> dict[str, np.ndarray]:
+    """Return an array (T, N) as the columns of a group, (T,) each; a masked value is missing.
+
+    An array of a group with one column is (T,) or (T, 1). `field` and `name` are for messages.
+
+    Raises:
+        FlightLogError: for an array of another shape, or of complex numbers, dates or spans.
+    """
+    columns, array = GROUPS[group], np.ma.asarray(values)
+    flat = array.ndim == 1 and len(columns) == 1
+    if not (flat or array.shape[1:] == (len(columns),)) or array.dtype.kind in "cMm":
+        allowed = f"(T, {len(columns)})" if len(columns) > 1 else "(T,)"
+        reason = f"`{field}` is {array.dtype} of shape {array.shape}"
+        raise FlightLogError(name, f"{reason}, allowed are numbers of shape {allowed}")
+    numbers = np.ma.filled(array.astype(np.float64), np.nan)
+    return dict(zip(columns, numbers.reshape(-1, len(columns)).T, strict=True))
 
 
 def _check_time(time: np.ndarray, row_number: np.ndarray, name: str) -> None:

@@ -14,7 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from eval.logs.columns import COMMANDS, GROUPS, KNOWN, NEEDED, FlightLogError, check_columns
+from eval.logs.columns import (
+    COMMANDS,
+    GROUPS,
+    KNOWN,
+    NEEDED,
+    FlightLogError,
+    check_columns,
+    split_group,
+)
 from eval.logs.files import read_columns, write_columns
 from eval.logs.flight import Flight
 from eval.logs.velocity import velocity_from_position
@@ -264,20 +272,25 @@ def columns_from_log(log: FlightLog) -> dict[str, np.ndarray]:
     """Return the columns of `log` by name; a computed velocity is left out.
 
     Raises:
-        FlightLogError: where an array's length is not that of `time_s`.
+        FlightLogError: where an array has another shape or type than its field, or an extra column
+            has the name of a known one.
     """
-    columns = {"time": np.asarray(log.time_s, dtype=np.float64)}
+    columns = split_group("time", log.time_s, "time_s", log.name)
     for key, attribute in _FIELDS.items():
         values = getattr(log, attribute)
         lacks = key in log.partial or (key == "vel" and log.velocity_derived)
         if values is None or lacks:
             continue
-        parts = np.asarray(values, dtype=np.float64).reshape(len(values), -1).T
-        columns |= dict(zip(GROUPS[key], parts, strict=True))
-    columns |= {key: np.asarray(values) for key, values in log.extra.items()}
+        columns |= split_group(key, values, attribute, log.name)
+    for name, values in log.extra.items():
+        if not isinstance(name, str) or name in KNOWN:
+            reason = "allowed in `extra` are texts that are no column of a flight log"
+            raise FlightLogError(log.name, reason, str(name))
+        columns[name] = np.asarray(values)
     for column, values in columns.items():
-        if len(values) != len(log.time_s):
-            reason = f"{len(values)} values, but `time` has {len(log.time_s)}"
+        if values.shape != columns["time"].shape:
+            kind = f"{len(values)} values" if values.ndim == 1 else f"shape {values.shape}"
+            reason = f"{kind}, but `time` has {len(columns['time'])}"
             raise FlightLogError(log.name, reason, column)
     return columns
 
@@ -377,7 +390,9 @@ def write_flight(path: str | Path, log: FlightLog) -> Path:
         OSError: where the file cannot be written; nothing is left under its name.
     """
     file = as_path("path", path)
-    check_type("log", log, (FlightLog,), "a FlightLog")
+    check_type("log", log, (FlightLog,), "a FlightLog; of a Flight, log_from_flight makes one")
+    for name in ("about", "extra"):
+        check_type(f"log.{name}", getattr(log, name), (Mapping,), "a dict")
     columns = columns_from_log(log)
     check_columns(columns, log.name, bool(log.partial))
     about = {**log.about, **stamp(SCHEMA, log.about.get("seed"))}

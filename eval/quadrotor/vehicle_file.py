@@ -10,7 +10,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, NoneType
 from typing import Any
 
 from eval.effects import EFFECTS
@@ -125,11 +125,10 @@ def vehicle_table(vehicle: Vehicle) -> dict[str, Any]:
     """Return `vehicle` as the nested table of its file: strings, numbers, lists and dicts.
 
     Raises:
-        ValueError: for an unknown effect.
+        ValueError: for an unknown effect, or a part of another type.
     """
+    _check_parts(vehicle)
     camera, effects = vehicle.camera, {}
-    for name in vehicle.effects:
-        EFFECTS.find(name)
     for name in EFFECTS:
         if name in vehicle.effects:
             values = vehicle.effects[name]
@@ -151,6 +150,24 @@ def vehicle_table(vehicle: Vehicle) -> dict[str, Any]:
         **({"motors": _plain(vars(vehicle.motors))} if vehicle.motors else {}),
         **({"effects": effects} if effects else {}),
     }
+
+
+def _check_parts(vehicle: Vehicle) -> None:
+    """Refuse a vehicle with a part of another type, such as a dict for an effect's values."""
+    parts = {"rotors": Rotors, "controller": Controller, "body": CollisionBox, "camera": Camera}
+    for name, kind in parts.items():
+        check_type(name, getattr(vehicle, name), (kind,), f"a {kind.__name__}")
+    check_type("motors", vehicle.motors, (MotorMap, NoneType), "a MotorMap or None")
+    check_type("effects", vehicle.effects, (Mapping,), "values by name of the effect")
+    for name, values in vehicle.effects.items():
+        kind = EFFECTS.find(name).values
+        fields = ", ".join(f"{field}=..." for field in getattr(kind, "_fields", ()))
+        allowed = f"EFFECTS[{name!r}].values({fields}), with EFFECTS of eval.effects"
+        check_type(f"effects.{name}", values, (kind,), allowed)
+    module = KINDS.get(vehicle.controller.kind)
+    if module is not None:
+        allowed = f"Settings of {module.__name__}"
+        check_type("controller.settings", vehicle.controller.settings, (module.Settings,), allowed)
 
 
 def _effects(tables: Table, vehicle: Vehicle) -> dict[str, Any]:
@@ -227,8 +244,8 @@ def _controller(table: Table) -> Controller:
 def _controller_table(controller: Controller) -> dict[str, Any]:
     """Return the table [controller] of a controller."""
     table = _plain({k: v for k, v in vars(controller).items() if k not in ("kind", "settings")})
-    if controller.kind == NOMINAL:
-        return table
+    if controller.kind not in KINDS:
+        return {**table, "kind": controller.kind}
     settings, group = _plain(vars(controller.settings)), KINDS[controller.kind].GROUP
     return {"kind": controller.kind, **table, **({group: settings} if group else settings)}
 

@@ -24,6 +24,7 @@ from eval.view.colours import SPEED_MAP, hex_text
 from eval.view.solids import outline, track_solids
 from eval.worlds.trial import TrialResult
 from tracks.common.files import replacing_file
+from tracks.input.ranges import check_type
 from tracks.track import Track
 
 Shown = tuple[Track, Flight | None, TrialResult | None]
@@ -53,8 +54,10 @@ def write_picture(
     the result. The picture is up to 9.5 inches wide and 9.2 high.
 
     Raises:
+        ValueError: for an ending that is no format of a picture, or something else than a track.
         OSError: where the file cannot be written; nothing is left under its name.
     """
+    check_type("track", track, (Track,), "a Track, as of make_track or load_track")
     low, high = _limits(track, flight)
     extent_x, extent_y, extent_z = high - low
     # Both views have the same scale [inch/m], so their heights follow from the track's extent.
@@ -86,7 +89,7 @@ def write_grid(path: str | Path, trials: Sequence[Shown], columns: int = 3) -> P
     The file's ending sets the format. `columns` panels are in a row.
 
     Raises:
-        ValueError: where `trials` is empty.
+        ValueError: where `trials` is empty, or for an ending that is no format of a picture.
         OSError: where the file cannot be written; nothing is left under its name.
     """
     if not trials:
@@ -293,8 +296,14 @@ def _outcome(result: TrialResult, short: bool = False) -> str:
 
 
 def _save(figure: Figure, path: str | Path, dpi: int) -> Path:
-    """Write a figure as a file, completely or not at all."""
-    FigureCanvasAgg(figure)
+    """Write a figure as a file, completely or not at all.
+
+    Raises:
+        ValueError: for an ending that is no format of a picture.
+    """
+    formats, ending = FigureCanvasAgg(figure).get_supported_filetypes(), Path(path).suffix
+    if ending[1:].lower() not in formats:
+        raise ValueError(f"{path}: ending {ending!r}; a picture ends in .png, .pdf or .svg")
     for text in figure.findobj(Text):
         text.set_parse_math(False)  # names of policies and tracks may have dollar signs
     with replacing_file(path) as temporary:

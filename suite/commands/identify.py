@@ -10,7 +10,6 @@ import tyro
 
 from suite.common.console import Console
 from suite.common.options import Advanced, Command
-from tracks.common.files import check_no_input, check_place
 
 
 @dataclass(frozen=True)
@@ -48,12 +47,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         ValueError: for flights or a vehicle file that cannot be used.
     """
     out = _out_path(config)
-    if out.suffix.lower() != ".toml":
-        raise ValueError(f"--out is {str(out)!r}; its ending must be .toml")
-    check_place(out)
     if config.sensors:
+        from suite.diagnose.identify.run import check_out
         from suite.diagnose.sensors.identify import identify_sensors, say_held_out
 
+        check_out(out)
         if config.vehicle or config.leave or config.accept:
             raise ValueError("--sensors takes no --vehicle, --leave and --accept: leave them out")
         result = identify_sensors(config.flights, out, console)
@@ -66,7 +64,6 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             raise ValueError(
                 "--vehicle is missing: the vehicle file to start from, or a shipped name"
             )
-        check_no_input(out, [config.vehicle])
         inputs = (config.flights, config.vehicle, out, config.leave)
         result = identify_files(*inputs, console, config.accept)
         console.say(f"driven by {MODEL_INPUTS[result['drive']]}")

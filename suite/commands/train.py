@@ -123,6 +123,41 @@ def resolve(config: Config) -> TrainConfig:
     return run
 
 
+def refuse_policy_folder(out: Path) -> None:
+    """Refuse a run in the folder of a policy.
+
+    Raises:
+        ValueError: naming the folder, and what to give instead.
+    """
+    from policies.formats.checkpoint import CONFIG
+
+    if (out / CONFIG).exists():
+        raise ValueError(
+            f"--out {out} is the folder of a policy; give a folder for the new run, which gets its "
+            "policy in policy/"
+        )
+
+
+def doubts(resolved: TrainConfig, anew: str = "") -> list[str]:
+    """Return warnings about settings that are probably mistakes.
+
+    `anew` follows the advice on another camera.
+    """
+    from eval.logs.faults.vehicle import narrow_view
+
+    warnings = [*warmup_warnings(resolved), *rate_loop_warnings(resolved)]
+    if text := narrow_view(resolved.spec.camera.fov_deg):
+        text = f"the policy: {text}; spec.camera.fov_deg is in degrees, not radians"
+        warnings = [text, *warnings]
+    if resolved.quadrotor is None:
+        return warnings
+    vehicle = resolved.quadrotor.vehicle
+    pitch, (wide, high) = vehicle.camera.pitch_deg, vehicle.camera.fov_deg
+    advice = f"--set spec.camera.pitch_deg={pitch:g} spec.camera.fov_deg={wide:g},{high:g}"
+    advice = f"to train with the vehicle's, give {advice}{anew}"
+    return warnings + camera_warnings(resolved.spec.camera, vehicle, advice)
+
+
 def run(config: Config, console: Console) -> dict[str, Any]:
     """Train a policy; print its folder and the last row of the curve."""
     if config.list_settings:
@@ -135,7 +170,6 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
     import jax
 
-    from eval.logs.faults.vehicle import narrow_view
     from policies.formats.checkpoint import CONFIG
     from policies.formats.policy_file import load_delta, load_policy_checkpoint
     from suite.delta.replay import check_corrects
@@ -143,23 +177,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from suite.train.run import start_params, train
 
     resolved = resolve(config)
-    if (config.out / CONFIG).exists():
-        raise ValueError(
-            f"--out {config.out} is the folder of a policy; give a folder for the new run, which "
-            "gets its policy in policy/"
-        )
-    if text := narrow_view(resolved.spec.camera.fov_deg):
-        console.note(f"warning: the policy: {text}; spec.camera.fov_deg is in degrees, not radians")
-    for warning in (*warmup_warnings(resolved), *rate_loop_warnings(resolved)):
+    refuse_policy_folder(config.out)
+    anew = "" if config.init_from is None else " and leave --init-from out"
+    for warning in doubts(resolved, anew):
         console.note(f"warning: {warning}")
-    if resolved.quadrotor is not None:
-        vehicle = resolved.quadrotor.vehicle
-        pitch, (wide, high) = vehicle.camera.pitch_deg, vehicle.camera.fov_deg
-        advice = f"--set spec.camera.pitch_deg={pitch:g} spec.camera.fov_deg={wide:g},{high:g}"
-        anew = "" if config.init_from is None else " and leave --init-from out"
-        advice = f"to train with the vehicle's, give {advice}{anew}"
-        for warning in camera_warnings(resolved.spec.camera, vehicle, advice):
-            console.note(f"warning: {warning}")
     params, delta = None, None
     if config.init_from is not None:
         # The trained policy goes to out/policy, which must not be the one to start from.

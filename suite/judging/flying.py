@@ -219,6 +219,53 @@ def fly_trials(
     )  # fmt: skip
 
 
+def fly_from_python(
+    policy: Policy,
+    content: PolicyContent | None,
+    request: SimulatedFlights,
+    trial_set: TrialSet,
+    processes: int,
+) -> list[TrialResult]:
+    """Fly all trials for a program, in this process or in several that import the program again.
+
+    `content` are the files of a policy that the program gave by name or path, None for an object.
+
+    Raises:
+        ValueError: for an object that cannot be sent to other processes, or of a class that they
+            lack.
+        WorkerDied: where they cannot import the program, or died twice with the same trials.
+    """
+    from tracks.common.work.pickling import WorkerDied, pack
+
+    if processes == 1:
+        return fly_trials(policy, request, trial_set)
+    flown: Policy | Callable[[], Policy] = policy
+    if content is not None:
+        flown = policy_for_workers(policy, content, processes)
+    try:
+        pack(flown)
+    except ValueError as error:
+        raise ValueError(
+            f"policy {policy.name!r} cannot be sent to other processes; give its name or path "
+            "instead of the object, or leave workers out"
+        ) from error
+    guard = '`if __name__ == "__main__":`'
+    try:
+        return fly_trials(flown, request, trial_set, processes)
+    except AttributeError as error:
+        if "__mp_main__" not in str(error) and "__main__" not in str(error):
+            raise
+        raise ValueError(
+            f"another process lacks what this program defines ({error}); define it in a module or "
+            f"above {guard}, or leave workers out, as in a notebook"
+        ) from error
+    except WorkerDied as error:
+        raise WorkerDied(
+            f"{error} With exit code 1 it could not import this program: call evaluate_policy "
+            f"below {guard}."
+        ) from error
+
+
 def policy_record(source: str, policy: Policy, content: PolicyContent) -> dict[str, Any]:
     """Return name, source (name or path), and SHA-256 of files and settings, for a result file."""
     return {

@@ -17,7 +17,7 @@ from tracks.input.ranges import check_ranges
 if TYPE_CHECKING:
     from eval.sensors.sensors_file import SensorSet
     from eval.vehicles.vehicle import Vehicle
-    from eval.worlds.trial import TrialSpec
+    from eval.worlds.trial import TrialResult, TrialSpec
     from policies.spec import PolicySpec
     from suite.common.console import Console
     from suite.judging.requests import SimulatedFlights
@@ -151,7 +151,8 @@ def read_trial_set(
         names, levels = parse_tracks(options.track), parse_levels(options.difficulty)
         tracks = {name: load_track(name) for name in names if is_track_file(name)}
     else:
-        names, levels, tracks = [track.family], [0], {track.family: track}
+        names, levels = [track_name(track)], [track.level]
+        tracks = {names[0]: track}
     notes = without_signal(vehicle)
     # Without random effects every seed would give the same flight on a track from a file.
     is_random = sensors.random or any(EFFECTS[name].random for name in vehicle.effects)
@@ -159,7 +160,7 @@ def read_trial_set(
     if options.trials > 1:
         notes += [
             f"{name}: flown once, not {options.trials} times: without random effects (gusts, "
-            "noise) all flights on a track from a file are equal"
+            "noise) all flights on one track are equal"
             for name in once
         ]
     notes += [
@@ -183,6 +184,32 @@ def read_trial_set(
     trials = trial_list(names, levels, options.trials, options.seed, once)
     simulator_differences = differences(options.simulator, vehicle)
     return TrialSet(trials, tracks, vehicle, sensors, simulator_differences, notes)
+
+
+def track_name(track: Track) -> str:
+    """Return the name of a track object in results.
+
+    It is the object's own name, but not that of a family: by it a trial would be one of the
+    family's tracks with the trial's seed.
+    """
+    from tracks.families import FAMILIES
+
+    if track.family not in FAMILIES:
+        return track.family
+    return f"{track.family}-{track.level}-{track.seed}"
+
+
+def equal_flights(results: Sequence[TrialResult], tracks: Collection[str]) -> list[str]:
+    """Return a note for each of `tracks` on which all of several flights are the same."""
+    notes = []
+    for name in tracks:
+        flights = [result._replace(seed=0) for result in results if result.track == name]
+        if len(flights) > 1 and len(set(flights)) == 1:
+            notes.append(
+                f"{name}: {len(flights)} equal flights, as nothing in them is random; they count "
+                "as one trial"
+            )
+    return notes
 
 
 def log_name(track: str, difficulty: int, seed: int) -> str:

@@ -138,8 +138,9 @@ def make_shards(
         def compute_on_device(shard: int) -> Shard:
             part = jax.tree.map(lambda leaf: leaf[shard * size : (shard + 1) * size], worlds)
             arguments = (params, hidden, iteration, part)
-            # Accelerators round products by default, too coarsely for rotations.
-            with jax.default_matmul_precision("highest"):
+            # Accelerators round products by default, too coarsely for rotations. Both settings
+            # are those of this thread; a program may have chosen others for all threads.
+            with jax.enable_x64(False), jax.default_matmul_precision("highest"):
                 result = compute(*jax.device_put(arguments, devices[shard % len(devices)]))
             return jax.block_until_ready(jax.device_put(result, devices[0]))
 

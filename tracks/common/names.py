@@ -114,7 +114,10 @@ class Registry(Mapping[str, T]):
         """
         check_type(f"{self._kind} (register)", name, (str,), "a name, as a text")
         if name in self:
-            raise ValueError(f"{self._kind} {name!r} exists already; register another name")
+            restart = "" if name in self.own else ", or restart the program (the notebook's kernel)"
+            raise ValueError(
+                f"{self._kind} {name!r} exists already; register another name{restart}"
+            )
         self._values[name] = self._checked(name, value, "register")
         self._entries[name] = value
 

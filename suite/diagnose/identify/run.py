@@ -16,6 +16,7 @@ from suite.diagnose.estimate.parameters import refuse_own_motion
 from suite.diagnose.identify.drive import unmodelled_effects
 from suite.diagnose.identify.identify import PARTS, identify
 from suite.diagnose.identify.numbers import number_lines, numbers_json
+from tracks.common.files import check_no_input, check_place
 
 SCHEMA = 1
 """Version of the JSON that `suite identify` prints."""
@@ -37,8 +38,9 @@ def identify_files(
     command. Returned is the JSON object that `--json` prints.
 
     Raises:
-        ValueError: if flights or vehicle cannot be used.
+        ValueError: if flights or vehicle cannot be used, or `out` is no place for the file.
     """
+    check_out(out, vehicle)
     for part in leave:
         if part not in PARTS:
             raise ValueError(f"--leave {part!r}: allowed: {', '.join(PARTS)}")
@@ -61,7 +63,8 @@ def identify_files(
             "estimates include their share, and they stay in the file; start without them"
         )
     identified = identify(logs, start, leave)
-    lines = [f"From {vehicle} {MADE_BY}, {counted} ({identified.drive}); 95 % intervals:"]
+    flown = counted(len(logs), "flight")
+    lines = [f"From {vehicle} {MADE_BY}, {flown} ({identified.drive}); 95 % intervals:"]
     lines += number_lines(identified.numbers)
     header = "\n".join([*lines, *(f"not identifiable: {t}" for t in identified.not_identified)])
     try:
@@ -80,6 +83,19 @@ def identify_files(
         "warnings": [*warnings, *identified.notes],
         **stamp(SCHEMA, None),
     }
+
+
+def check_out(out: Path, vehicle: str = "") -> None:
+    """Refuse to write a file at `out` before the work for it.
+
+    Raises:
+        ValueError: for an ending that is not .toml, or the file `vehicle` to start from.
+        OSError: where it cannot be written.
+    """
+    if out.suffix.lower() != ".toml":
+        raise ValueError(f"--out is {str(out)!r}; its ending must be .toml")
+    check_place(out)
+    check_no_input(out, [vehicle])
 
 
 def is_identified(vehicle: str) -> bool:

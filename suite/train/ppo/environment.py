@@ -145,6 +145,8 @@ class JaxRace:
 
     @functools.cached_property
     def _race(self) -> Race:
+        if jnp.zeros(()).dtype != jnp.float32:
+            raise ValueError("JaxRace computes in float32: turn JAX's jax_enable_x64 off")
         # The first call may be in a function that a learner compiles. Without this line the arrays
         # made here would exist in that compilation only.
         with jax.ensure_compile_time_eval():

@@ -6,6 +6,7 @@ import os
 import pickle
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 os.environ.setdefault("MUJOCO_GL", "disable")
 
@@ -22,13 +23,13 @@ from eval.envs.gymnasium_env import ID, RaceEnv, RaceVectorEnv
 from eval.envs.race import ACTION_LIMIT
 from eval.envs.races import REWARDS
 from eval.judging.judge import JudgeOptions, fly
-from eval.quadrotor.vehicle_file import load_vehicle
+from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import with_effects
 from eval.view import colours
 from eval.worlds.trial import Rules, TrialSpec
 from policies.contract import read_contract
 from policies.spec import PolicySpec
-from tests.support.courses import end_of
+from tests.support.courses import ONE_GATE, end_of
 from tests.support.marks import more
 from tests.support.pilots import Pursuit
 from tests.support.pixels import share
@@ -254,6 +255,35 @@ def test_environments_and_vehicles_travel(copied):
     assert np.array_equal(first["image"], second["image"])
     assert again.render().shape == (360, 640, 3) and again.render().max() > 0
     assert copied(RaceVectorEnv(2, rules=SHORT)).num_envs == 2
+
+
+def test_a_copy_reads_the_files_of_its_environment_in_another_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "course.toml").write_text(ONE_GATE)
+    save_vehicle(load_vehicle("racer5"), "mine.toml")
+    (tmp_path / "race").mkdir()  # a name of the suite stays a name
+    files = {"track": "course.toml", "vehicle": Path("mine.toml"), "spec": "race"}
+    envs = [RaceEnv(rules=SHORT, **files), RaceVectorEnv(1, rules=SHORT, **files)]
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir(tmp_path / "other")
+    for env in envs:
+        assert all(
+            np.array_equal(*pair)
+            for pair in zip(
+                *(copied.reset(seed=1)[0].values() for copied in (env, copy.deepcopy(env))),
+                strict=True,
+            )
+        )
+
+
+def test_a_tensor_is_an_action_without_a_warning():
+    import torch
+
+    env = RaceEnv(rules=SHORT)
+    env.reset(seed=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env.step(torch.zeros(3))
 
 
 @pytest.mark.slow

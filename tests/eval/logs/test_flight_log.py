@@ -151,3 +151,52 @@ def test_derived_velocity_where_little_is_known():
     velocity = velocity_from_position(time, pos)
     assert np.isnan(velocity_from_position(time, np.full((5, 3), np.nan))).all()
     np.testing.assert_allclose(velocity[:, 0], 3.0)
+
+
+TIME = np.arange(150) * 0.01
+
+
+def made(**changed):
+    """Return a log that a program makes of arrays, at rest for 1.5 s."""
+    zeros = np.zeros((len(TIME), 3))
+    quat = np.tile([1.0, 0.0, 0.0, 0.0], (len(TIME), 1))
+    log = flight_log.FlightLog("made", TIME, zeros, quat, zeros, zeros, TIME + 9.81, zeros)
+    return replace(log, **changed)
+
+
+@pytest.mark.parametrize(
+    ("field", "values", "said"),
+    [
+        ("pos_w", np.zeros((3, 150)), r"`pos_w` is float64 of shape \(3, 150\), .* \(T, 3\)$"),
+        ("quat_wxyz", np.zeros((150, 3)), r"`quat_wxyz` is .* of shape \(T, 4\)$"),
+        ("thrust_cmd", 9.81, r"`thrust_cmd` is float64 of shape \(\), .* of shape \(T,\)$"),
+        ("thrust_cmd", np.ones((150, 4)), r"of shape \(150, 4\), allowed are .* \(T,\)$"),
+        ("pos_w", np.zeros((150, 3), complex), "`pos_w` is complex128"),
+        ("time_s", (TIME * 1e9).astype("m8[ns]"), r"`time_s` is timedelta64\[ns\]"),
+        ("rate_b", np.zeros((149, 3)), "rate_x: 149 values, but `time` has 150$"),
+        ("extra", {"pos_x": TIME}, "pos_x: allowed in `extra` are texts that are no column"),
+        ("extra", {3: TIME}, "column 3: allowed in `extra`"),
+        ("extra", {"a": 3.0}, r"column a: shape \(\)"),
+        ("extra", {"a": np.zeros((150, 2))}, r"column a: shape \(150, 2\)"),
+        ("extra", None, "log.extra is None, allowed is a dict"),
+        ("about", None, "log.about is None, allowed is a dict"),
+    ],
+)
+def test_arrays_of_another_shape_or_type_than_their_field_are_refused(
+    tmp_path, field, values, said
+):
+    with pytest.raises(ValueError, match=said):
+        flight_log.write_flight(tmp_path / "a.parquet", made(**{field: values}))
+    empty = {name: np.zeros((0, 3)) for name in ("pos_w", "vel_w", "rate_b", "rate_cmd_b")}
+    empty |= {"time_s": TIME[:0], "thrust_cmd": TIME[:0], "quat_wxyz": np.zeros((0, 4))}
+    with pytest.raises(flight_log.FlightLogError, match="no rows"):
+        flight_log.write_flight(tmp_path / "a.parquet", made(**empty))
+    assert not list(tmp_path.iterdir())
+
+
+def test_masked_values_are_missing_and_a_column_of_one_is_a_vector(tmp_path):
+    pos_w = np.ma.masked_array(np.ones((150, 3)), np.arange(450).reshape(150, 3) == 4)
+    log = made(pos_w=pos_w, thrust_cmd=TIME[:, None])
+    back = flight_log.read_flight(flight_log.write_flight(tmp_path / "a.parquet", log))
+    assert np.argwhere(np.isnan(back.pos_w)).tolist() == [[1, 1]]
+    np.testing.assert_array_equal(back.thrust_cmd, TIME)

@@ -20,6 +20,7 @@ from tracks.common.provenance import stamp, stamp_text
 from tracks.common.toml_table import to_toml
 from tracks.geometry.camera import optical_axis_b
 
+DRAG = EFFECTS["linear_drag"].values((0.3, 0.3, 0.3))
 TABLE = tomllib.loads((vehicle_file.SHIPPED / "racer5.toml").read_text())
 
 
@@ -170,6 +171,30 @@ def test_a_vehicle_of_a_program_is_checked_as_a_file_is(tmp_path, effect, drag, 
     with pytest.raises(ValueError, match=said):
         suite.evaluate_policy(Pursuit(), trials=1, vehicle=vehicle)
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "said"),
+    [
+        ("rotors", None, "rotors is None, allowed is a Rotors"),
+        ("camera", 90.0, "camera is 90.0, allowed is a Camera"),
+        ("motors", (1.0, 2.0), "motors is .*, allowed is a MotorMap or None"),
+        ("effects", ["linear_drag"], "effects is .*, allowed is values by name of the effect"),
+        ("effects", {"linear_drag": {"coefficient": (0.3, 0.3, 0.3)}}, "effects.linear_drag is {"),
+        ("effects", {"linear_drag": 0.3}, r"allowed is EFFECTS\['linear_drag'\].values\(coeff"),
+        # Its coefficients have another unit.
+        ("effects", {"quadratic_drag": DRAG}, "effects.quadratic_drag is LinearDrag"),
+        ("controller", replace(PLAIN.controller, kind="pid"), "controller.kind is 'pid', allowed"),
+        ("controller", replace(PLAIN.controller, kind="px4"), "controller.settings is None, allo"),
+    ],
+)
+def test_a_part_of_another_type_is_refused_by_its_name(tmp_path, part, value, said):
+    vehicle = replace(PLAIN, **{part: value})
+    with pytest.raises(ValueError, match=said):
+        vehicle_file.save_vehicle(vehicle, tmp_path / "v.toml")
+    with pytest.raises(ValueError, match=said):
+        suite.evaluate_policy(Pursuit(), track="zigzag", trials=1, vehicle=vehicle)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_weak_motor_has_an_index_or_a_scale_for_each_rotor():

@@ -92,6 +92,15 @@ def test_a_name_with_dollar_signs_is_a_name(tmp_path):
 
 
 @pytest.mark.extended
+def test_bad_picture_requests_are_refused(tmp_path):
+    for name in ("trial", "trial.xyz"):
+        with pytest.raises(ValueError, match="a picture ends in .png, .pdf or .svg"):
+            write_picture(tmp_path / name, small_track())
+    with pytest.raises(ValueError, match="track is 'zigzag', allowed is a Track"):
+        write_picture(tmp_path / "a.png", "zigzag")  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_grid_has_a_panel_a_trial(tmp_path):
     trials = [rollout(), rollout("collision", 1.5, False), (small_track(4, seed=2), None, None)]
     write_grid(tmp_path / "one.png", trials[:1])

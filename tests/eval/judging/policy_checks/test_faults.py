@@ -244,3 +244,20 @@ def test_a_policy_that_returns_tensors_is_tested_without_a_warning():
 
     (note,) = check_rows(Tensors(3.0))
     assert note.fault == "memory_outside"
+
+
+def test_a_torch_network_in_training_is_refused_as_its_rows_depend_on_each_other():
+    import torch
+
+    torch.manual_seed(0)
+    network = torch.nn.Sequential(torch.nn.Linear(12, 3), torch.nn.BatchNorm1d(3))
+
+    class Normalised(Pursuit):
+        def act(self, hidden, state, image, fresh):
+            with torch.no_grad():
+                return network(torch.as_tensor(state)).numpy(), hidden
+
+    with pytest.raises(ValueError, match=r"other rows of its batch.*eval\(\)"):
+        check_rows(Normalised())  # a single row is an error of the network
+    network.eval()
+    assert not check_rows(Normalised())

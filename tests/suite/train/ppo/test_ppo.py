@@ -345,3 +345,8 @@ def test_an_action_of_another_shape_is_refused_and_one_that_is_not_finite_ends(w
 
 def test_its_contract_is_that_of_the_judges_environments():
     assert ENV.contract == Races(RaceConfig(spec=ENV.config.spec), 1).contract
+
+
+def test_it_is_refused_with_the_numbers_of_64_bits_that_a_program_may_choose(worlds):
+    with jax.enable_x64(True), pytest.raises(ValueError, match="turn JAX's jax_enable_x64 off"):
+        replace(ENV).reset(KEYS[0], worlds)
