@@ -19,7 +19,7 @@ from tracks.common.work import Workers
 
 ROOT = Path(__file__).resolve().parents[3]
 """Folder of the project, which has the four packages."""
-NO_RESULT = ("view", "importers", "faults", "envs")
+NO_RESULT = ("view", "importers", "logs", "faults", "envs", "policy_checks")
 """Names of the folders within packages whose code cannot change a flight."""
 FLIES = ("tracks", "policies", "eval")
 """Packages whose code can change a flight."""
@@ -27,7 +27,7 @@ MEASURED = {
     "ablation": ("suite/train", "suite/experiments/study"),
     "schemes": ("suite/train", "suite/experiments/study"),
     "four_gates": ("suite/train", "suite/experiments/study"),
-    "faults": ("suite/experiments/injected", "eval/importers", "eval/logs/faults"),
+    "faults": ("suite/experiments/injected", "eval/importers", "eval/logs", "eval/logs/faults"),
 }
 """Page -> folders with the code that it measures, besides `FLIES`."""
 
