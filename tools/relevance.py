@@ -9,8 +9,10 @@ TIMES (1) the threshold of practical relevance (`Thresholds.relevance`): it must
 RotorPy's aerodynamics differ from the vehicle file. So its flights are diagnosed against the file
 that describes them best, and nothing is hidden in them.
 
-The tool prints a line for each set. Then it prints the shares, with their 95 % intervals (Clopper
-and Pearson): that of the named effects for each kind of log. 60 sets take about 30 minutes on one
+The tool prints a line for each set, with the size of the hidden effect in standard deviations of
+its estimate: no method finds what is within the noise of a log. Then it prints the shares, with
+their 95 % intervals (Clopper and Pearson): that of the named effects for each kind of log, among
+all and among those of at least `VISIBLE` standard deviations. 60 sets take about 30 minutes on one
 core.
 """
 
@@ -36,7 +38,8 @@ from eval.worlds import nearest
 from suite.blind.oracle import Column
 from suite.common.console import Silent
 from suite.common.startup import keep_compiled
-from suite.diagnose.diagnose import diagnose
+from suite.diagnose.diagnose import Diagnosis, diagnose
+from suite.diagnose.estimate.parameters import FittedNumber
 from suite.diagnose.evidence.rollouts import rollouts_along
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.thresholds import THRESHOLDS
@@ -53,6 +56,8 @@ FLIGHTS = 4
 """Number of flights of a set."""
 NOISE = SENSORS["full"]
 """Measurement noise of the noisy sets."""
+VISIBLE = 4.0
+"""Size of an effect that its log shows clearly, in standard deviations."""
 
 
 class Setting(NamedTuple):
@@ -139,14 +144,31 @@ def at_threshold(
     space = model.space
     indices = [k for k, entry in enumerate(space.entries) if entry.effect == name]
     slope = model.linearise(start, windows, indices).slope
-    entries = [space.entries[k] for k in indices]
-    target = [Column(name, e.parameter, e.component or 0).value(values) for e in entries]
-    change = np.array(target) - start.theta[indices]
+    change = _array_of(name, values, [space.entries[k] for k in indices]) - start.theta[indices]
     size = rollout_size(slope @ change, windows)
     shares = [(s or 0.0) / limit for s, limit in zip(size, THRESHOLDS.relevance, strict=True)]
     theta = start.theta.copy()
     theta[indices] += times * change / max(shares)
     return space.effects(theta)[name]
+
+
+def in_deviations(name: str, values: Any, diagnosis: Diagnosis) -> float:
+    """Return the change by the effect's `values` in standard deviations of its estimate.
+
+    Other effects count as known, so it is an upper limit.
+    """
+    evaluation = diagnosis.main.source.begin
+    space, start = evaluation.evidence.space, evaluation.at.theta
+    indices = [k for k, entry in enumerate(space.entries) if entry.effect == name]
+    change = _array_of(name, values, [space.entries[k] for k in indices]) - start[indices]
+    information, _ = evaluation.block.equations.take(indices).sums()
+    return float(np.sqrt(change @ information @ change))
+
+
+def _array_of(name: str, values: Any, entries: Sequence[FittedNumber]) -> np.ndarray:
+    """Return the numbers of an effect's `values` that belong to `entries`."""
+    columns = (Column(name, entry.parameter, entry.component or 0) for entry in entries)
+    return np.array([column.value(values) for column in columns])
 
 
 def main(
@@ -157,7 +179,7 @@ def main(
 ) -> None:
     """Run the sets, and print a line for each and the shares."""
     keep_compiled()
-    clean, named = 0, dict[str, list[bool]]()
+    clean, named = 0, dict[str, list[tuple[bool, float]]]()
     for number in range(first, first + sets):
         rng = np.random.default_rng([seed, number])
         setting = draw(number, rng, seed)
@@ -172,15 +194,19 @@ def main(
         if vehicle is flown:
             hidden = at_threshold(effect, values, vehicle, logs, times)
             logs = fly_logs(setting, with_effects(flown, {effect: hidden}), rng)
-            found = diagnosis_json(diagnose(logs, vehicle, seed=number))
+            diagnosis = diagnose(logs, vehicle, seed=number)
+            found = diagnosis_json(diagnosis)
             outcome = outcome_of(effect, found["effects"])
-            named.setdefault(setting.kind, []).append(outcome.startswith("named"))
-            line += f" | {effect}: {outcome}, {_found(found)}"
+            size = in_deviations(effect, hidden, diagnosis)
+            named.setdefault(setting.kind, []).append((outcome.startswith("named"), size))
+            line += f" | {effect} of {size:.1f} sigma: {outcome}, {_found(found)}"
         print(line, flush=True)
     print(share_line("clean sets with the verdict no_gap", clean, sets))
     for kind, outcomes in named.items():
         what = f"effects of {times:g} times the threshold that are named, {kind}"
-        print(share_line(what, sum(outcomes), len(outcomes)))
+        clear = [is_named for is_named, size in outcomes if size >= VISIBLE]
+        print(share_line(what, sum(is_named for is_named, _ in outcomes), len(outcomes)))
+        print(share_line(f"of those of at least {VISIBLE:g} sigma", sum(clear), len(clear)))
 
 
 def _found(found: Any) -> str:
