@@ -186,10 +186,8 @@ def train_policy(
     from suite.train.run import train
     from tracks.input.ranges import check_ranges
 
-    folder, changes = (
-        as_path("out", out),
-        _all("settings", settings, "a text such as 'loss.progress=2'"),
-    )
+    folder = as_path("out", out)
+    changes = _all("settings", settings, "a text such as 'loss.progress=2'")
     if seed is None:
         raise ValueError("seed is None, allowed is a whole number")
     with _options_as_arguments("seed", "iterations", "out", set="settings"):
@@ -234,11 +232,8 @@ def diagnose_flights(
         tuple(map(Path, _all(name, given)))
         for name, given in (("flights", flights), ("reference", reference))
     )
-    file, folder, faults = (
-        str(as_path("vehicle", vehicle)),
-        as_path("out", out),
-        _all("accept", accept, "the name of a fault"),
-    )
+    file, folder = str(as_path("vehicle", vehicle)), as_path("out", out)
+    faults = _all("accept", accept, "the name of a fault")
     config = Config(flights=paths, vehicle=file, reference=before, out=folder, accept=faults)
     with _options_as_arguments("out", "accept"), one_writer(folder), _precision_of_commands():
         return diagnose_files(config, _console(progress))
@@ -266,10 +261,8 @@ def identify_vehicle(
     """
     from suite.diagnose.identify.run import identify_files
 
-    paths, faults = (
-        [*map(Path, _all("flights", flights))],
-        _all("accept", accept, "the name of a fault"),
-    )
+    paths = [*map(Path, _all("flights", flights))]
+    faults = _all("accept", accept, "the name of a fault")
     start, file, console = str(as_path("vehicle", vehicle)), as_path("out", out), _console(progress)
     with _options_as_arguments("out", "accept"), _precision_of_commands():
         result = identify_files(paths, start, file, (), console, faults)
