@@ -79,7 +79,7 @@ class SlotStates(NamedTuple):
 
 
 class MjxWorld(Slots):
-    """A world that simulates all slots in one compiled JAX program, for GPUs."""
+    """The same model for many drones in one compiled JAX program, for GPUs."""
 
     integrator = "euler"
     compiles = True

@@ -11,7 +11,7 @@ from tracks.geometry.rotation import to_world
 
 
 class MujocoWorld(SceneSlots):
-    """A world in which the quadrotor model gives force and torque, and MuJoCo moves the body.
+    """MuJoCo moves the body by force and torque of the quadrotor model; all tables use it.
 
     Each step also computes the contacts at the new state, which may end the trial.
     """

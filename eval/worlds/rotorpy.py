@@ -59,7 +59,7 @@ class StepInput(NamedTuple):
 
 
 class RotorpyWorld(SceneSlots):
-    """A world whose drones are RotorPy's `BatchedMultirotor`; the package is optional.
+    """RotorPy's own drone, `BatchedMultirotor`; the package is optional.
 
     It has no attribute `integrator`, so its flight logs count as continuous in time.
     """

@@ -12,6 +12,7 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from suite.common.report import Part, Section
+from suite.diagnose.data.sampling import on_every_row, own_spacing_s
 from suite.diagnose.data.windows import SLICES, UNITS
 from suite.diagnose.diagnose import Diagnosis
 from suite.diagnose.report.summary import figure, remaining_words, short_name, superscripts
@@ -43,7 +44,7 @@ def logs_section(logs: Sequence[FlightLog]) -> Section:
 
 
 def _facts(log: FlightLog) -> tuple[str, ...]:
-    """Return the table row of a log, with the share of its rows that lack a state or a command."""
+    """Return the table row of a log, with the share of its rows that lie in a hole of a signal."""
     optional = {
         "commands": log.thrust_cmd is not None,
         "velocity": not log.velocity_derived,
@@ -57,9 +58,9 @@ def _facts(log: FlightLog) -> tuple[str, ...]:
         short_name(log.name),
         f"{log.duration_s:.1f} s",
         f"{len(log.time_s)}",
-        f"{1.0 / float(np.median(steps)):.0f} Hz",
+        f"{1.0 / own_spacing_s(log.time_s, log.rate_b):.0f} Hz",
         f"{1e3 * float(steps.max()):.0f} ms",
-        f"{100 * float(1.0 - log.whole.mean()):.1f} %",
+        f"{100 * float(1.0 - on_every_row(log).whole.mean()):.1f} %",
         f"{speed.max():.1f} m/s" if len(speed) else "",
         ", ".join(name for name, is_logged in optional.items() if is_logged) or "none",
     )
