@@ -11,6 +11,7 @@ an error, too; there the comparison is with commands whose times are shifted by 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,10 +42,31 @@ def with_model_error(
     return _raised(_unexplained_rms(difference, linear, noise, whitening), limits)
 
 
-def share_between(
-    linear: Linearisation, difference: np.ndarray, limits: Thresholds
-) -> tuple[float, float]:
-    """Return the ends (three standard errors) of the share of commands between the rows.
+class Share(NamedTuple):
+    """Estimated share of commands between the rows of logs."""
+
+    value: float
+    error: float
+    """Standard error of `value`, which includes the misfit."""
+    misfit: float
+    """RMS of what no share and no parameter explains, over the noise."""
+
+    def are_lacking(self, limits: Thresholds) -> bool:
+        """Return whether logs lack commands.
+
+        Where nothing else explains the flights, less evidence suffices: a policy that decides less
+        often than the rows gives most of its commands at a row.
+        """
+        is_sure = self.value - 3.0 * self.error > limits.lacking_share
+        return is_sure or (self.misfit > limits.lacking_misfit and self.value > 2.0 * self.error)
+
+    def are_complete(self, limits: Thresholds) -> bool:
+        """Return whether logs certainly have every command."""
+        return self.value + 3.0 * self.error <= limits.held_share
+
+
+def share_between(linear: Linearisation, difference: np.ndarray, limits: Thresholds) -> Share:
+    """Return the share of commands between the rows.
 
     The share is 0 if each command holds until the next row, and 1 if the mean of two commands acts
     half-way, as it does on average if the drone received others in between. This changes the
@@ -68,8 +90,8 @@ def share_between(
     freedom = int(np.asarray(linear.windows.valid).sum()) - linear.offset.size - len(best)
     chi2 = float(((residual - slope @ best) ** 2).sum())
     scale = np.sqrt(max(chi2 / max(freedom, 1), 1.0))
-    share, half_width = best[0] / size[0], 3.0 * scale * np.sqrt(inverse[0, 0]) / size[0]
-    return float(share - half_width), float(share + half_width)
+    error = scale * np.sqrt(inverse[0, 0]) / size[0]
+    return Share(float(best[0] / size[0]), float(error), float(scale))
 
 
 def push_slopes(model: RolloutModel, linear: Linearisation) -> np.ndarray:

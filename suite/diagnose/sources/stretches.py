@@ -120,10 +120,10 @@ def simulated_stretches(
         return made, warnings
     # The drone may have received commands between the rows.
     between = take(windows_of(between=True)[0], is_finite)
-    low, high = share_between(made.linear, _difference(model, linear, between), made.limits)
-    if low > limits.lacking_share:
+    share = share_between(made.linear, _difference(model, linear, between), made.limits)
+    if share.are_lacking(limits):
         return _with_unknown_commands(made), [*warnings, LACKING]
-    if high > limits.held_share:  # unclear, so effects must be larger than what it changes
+    if not share.are_complete(limits):  # effects must be larger than what it changes
         made = replace(made, coarser=between, coarser_share=1.0)
     return made, warnings
 

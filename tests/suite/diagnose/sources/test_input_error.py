@@ -9,6 +9,7 @@ from suite.diagnose.data.noise import Linearisation
 from suite.diagnose.data.windows import CHANNELS, KNOTS, STATE
 from suite.diagnose.sources.input_error import (
     WIDE,
+    Share,
     share_between,
     unknown_commands,
     with_input_error,
@@ -50,9 +51,9 @@ def test_the_share_of_commands_between_rows_is_fitted_next_to_effects_that_resem
         )
         effect = 0.05 * linear.slope[..., 0]
         residual = linear.residual - share * difference + effect
-        low, high = share_between(linear._replace(residual=residual), difference, THRESHOLDS)
-        assert 0.0 < high - low < 1.0
-        covered.append(low < share < high)
+        found = share_between(linear._replace(residual=residual), difference, THRESHOLDS)
+        assert 0.0 < found.error < 0.17 and found.misfit < 1.05
+        covered.append(abs(found.value - share) < 3.0 * found.error)
     assert sum(covered) >= 19
 
 
@@ -63,8 +64,18 @@ def test_a_misfit_widens_the_interval_of_the_share():
     difference = 0.1 * rng.standard_normal(linear.residual.shape)
     time_s = linear.windows.row_s[..., None]
     drift = linear._replace(residual=linear.residual + 5.0 * time_s**2)
-    widths = [np.diff(share_between(one, difference, THRESHOLDS)).item() for one in (linear, drift)]
-    assert widths[1] > 3.0 * widths[0]
+    known, unclear = (share_between(one, difference, THRESHOLDS) for one in (linear, drift))
+    assert unclear.error > 3.0 * known.error and unclear.misfit > 3.0 * known.misfit
+
+
+def test_logs_lack_commands_if_a_share_is_sure_or_explains_what_nothing_else_does():
+    cases = {
+        Share(0.0, 0.03, 1.0): (False, True), Share(0.25, 0.14, 1.02): (False, False),
+        Share(0.6, 0.02, 1.2): (True, False), Share(0.15, 0.057, 45.0): (True, True),
+        Share(0.15, 0.057, 1.0): (False, True), Share(0.1, 0.06, 45.0): (False, True),
+    }  # fmt: skip
+    for share, expected in cases.items():
+        assert (share.are_lacking(THRESHOLDS), share.are_complete(THRESHOLDS)) == expected, share
 
 
 def test_the_error_of_unknown_commands_is_that_of_the_thrust_and_torque_which_they_gave():
