@@ -68,6 +68,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             users = " and ".join(actions)
             reason = f"`suite blind {config.what}` does not take it, only {users}"
             config.refuse_unused([name], reason)
+    if config.seed is not None:
+        config.refuse_unused(["set"], f"--seed {config.seed} makes another set")
     workers = read_workers_option(config.workers, whole_cores=True)
     if config.what == "plan":
         return _plan(config, console)

@@ -118,6 +118,7 @@ def test_an_option_of_another_work_is_refused(tmp_path, monkeypatch, capsys):
         ("run --count 24", "--count is 24, but"),
         ("score --simulator rotorpy", "--simulator is rotorpy, but"),
         ("run --effects inflow gusts", "--effects is inflow gusts, but"),
+        ("make --set published --seed 3", "--set is published, but --seed 3 makes another set;"),
         ("make --effects inflow", "does not take it, only plan; leave it out"),
         ("score --workers 2", "--workers is 2, but `suite blind score` does not take it, "),
         ("plan --effects inflow gusts --out elsewhere", "--out is elsewhere, but"),
