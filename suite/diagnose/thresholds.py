@@ -84,6 +84,8 @@ class Thresholds:
     """Sizes below which an effect is not reported: force per mass [m/s^2] (0.5 % of the weight),
     angular acceleration [rad/s^2], and position error after 1 s [m], which such a force causes."""
 
+    visible_sigma: float = 4.0
+    """Size of an effect that flights show clearly, in standard errors."""
     slow_degree: int = 5
     """Degree of the polynomials over a window. Their part of the residual (the slow errors)
     measures the model's error."""

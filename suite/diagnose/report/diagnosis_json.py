@@ -34,6 +34,8 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             for name, size in one.negligible
         ],
         "relevance": dict(zip(EffectSize._fields, limits.relevance, strict=True)),
+        "visible": main.remaining.visible
+        and {"force": main.remaining.visible.force, "torque": main.remaining.visible.torque},
         "separate_with": list(dict.fromkeys(advice(*pair) for pair in pairs)),
         "driven_by": diagnosis.flights.driven_by,
         "seconds": diagnosis.seconds,

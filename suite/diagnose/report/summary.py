@@ -121,7 +121,21 @@ def answer(result: Mapping[str, Any]) -> str:
     for is_large, reason in NEGLIGIBLE.items() if verdict == "no_gap" else ():
         names = [one["name"] for one in result["negligible"] if one["relevant"] == is_large]
         words += [f"{reason}: {', '.join(names)}."] * bool(names)
+    if verdict == "no_gap" and (hidden := _not_visible(result)):
+        words.append(f"These flights would not show {' or '.join(hidden.values())}.")
     return " ".join(words)
+
+
+def _not_visible(result: Mapping[str, Any]) -> dict[str, str]:
+    """Return words for a relevant constant force or torque that the flights do not show, by it."""
+    if not (visible := result.get("visible")):
+        return {}
+    units, least = {"force": "m/s^2", "torque": "rad/s^2"}, result["relevance"]
+    return {
+        name: f"a constant {name} below {rounded(visible[name], 2)} {unit}"
+        for name, unit in units.items()
+        if visible[name] > least[name] > 0.0
+    }
 
 
 def _explains_instead(result: Mapping[str, Any]) -> str:
@@ -187,8 +201,11 @@ def next_steps(result: Mapping[str, Any]) -> list[str]:
     if verdict == "no_gap":
         if is_change:
             return [f"Keep the vehicle file that you use. {UNTESTED}"]
+        hidden = " or ".join(_not_visible(result))
+        smaller = [f"To see a smaller {hidden}, log every command, and fly longer."]
         return [
             "Use the vehicle file as it is.",
+            *(smaller if hidden else []),
             "If your task is faster than these flights, fly faster or turn harder, and repeat "
             "this.",
         ]

@@ -68,6 +68,7 @@ from suite.diagnose.verdict.residual_structure import (
     ResidualStructure,
     beyond_model_error,
     disturbance_equations,
+    least_visible,
     residual_structure,
 )
 
@@ -179,7 +180,10 @@ class RolloutSource(Source):
 
         Random wind and an oscillating force (swing) are tested apart: no parameter reproduces them.
         """
-        structure, wind = self._structure(found, seed)
+        evidence = of_rollouts(found.last)
+        equations = disturbance_equations(evidence, evidence.trusted, found.estimate)
+        visible = least_visible(equations)
+        structure, wind = self._structure(found, equations, seed)
         details = {
             "shapes": [
                 {"label": shape.candidate.label, "gain": shape.gain, "p_value": shape.p_value}
@@ -189,7 +193,7 @@ class RolloutSource(Source):
         }
         share = remaining_share(*gaps) if found.named else 0.0
         if not (structure.size.relevant(self.limits) or self.is_relevant(gaps[1])):
-            return Remaining(False, share, reason=TOO_SMALL, details=details)
+            return Remaining(False, share, reason=TOO_SMALL, visible=visible, details=details)
         # Slow errors are those that a low polynomial over a window describes: noise has few.
         slow = of_rollouts(found.last).slow_errors(found.last.block)
         has_error = self.held.input_error is not None
@@ -199,17 +203,19 @@ class RolloutSource(Source):
         # Wind explains the structure, unless the force oscillates regularly.
         if wind and not swing:
             share, reason = remaining_share(*gaps), "by the random course of the wind"
-            return Remaining(False, share, reason=reason, wind=wind, details=details)
+            return Remaining(
+                False, share, None, reason, wind=wind, visible=visible, details=details
+            )
         if (where or swing) and not found.named:
             share = 1.0
-        return Remaining(bool(where or swing), share, where, swing=swing, details=details)
+        is_structured = bool(where or swing)
+        return Remaining(is_structured, share, where, swing=swing, visible=visible, details=details)
 
     def _structure(
-        self, found: SearchResult, seed: int
+        self, found: SearchResult, equations: DisturbanceEquations, seed: int
     ) -> tuple[ResidualStructure, TestedEffect | None]:
         """Return the structure in the remaining error, and the wind that may cause it."""
         evidence = of_rollouts(found.last)
-        equations = disturbance_equations(evidence, evidence.trusted, found.estimate)
         residual = residual_structure(equations, evidence.folds(found.last.block), seed)
         wind = self._wind(found, equations, residual)
         is_significant = any(s.p_value <= self.limits.shape_p_value for s in residual.shapes)

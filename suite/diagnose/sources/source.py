@@ -62,6 +62,8 @@ class Remaining(NamedTuple):
     """Random wind that explains the error."""
     swing: Swing | None = None
     """An oscillating force in the error, such as a load on a line causes."""
+    visible: EffectSize | None = None
+    """Smallest constant force and torque that the flights show, if known."""
     details: Mapping[str, Any] = {}
     """Further entries of `unexplained` in diagnosis.json."""
     gap_details: Mapping[str, Any] = {}

@@ -119,6 +119,18 @@ def beyond_model_error(
     return structure._replace(shapes=shapes, size=_size(equations, shapes, error_of))
 
 
+def least_visible(equations: DisturbanceEquations) -> EffectSize:
+    """Return the smallest constant force and torque that the windows show, along the worst axis.
+
+    It is `Thresholds.visible_sigma` standard errors; the drift is not computed.
+    """
+    each_axis = np.tile(np.eye(6), (KNOTS, 1))
+    hessian, _ = _along(equations, np.broadcast_to(each_axis, (len(equations.unit), 6 * KNOTS, 6)))
+    variance = np.diag(np.linalg.inv(hessian.sum(axis=0) + 1e-9 * np.eye(6)))
+    size = equations.limits.visible_sigma * np.sqrt(variance).reshape(2, 3).max(axis=1)
+    return EffectSize(float(size[0]), float(size[1]), None)
+
+
 def _fit(equations: DisturbanceEquations, columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Return the coefficients (C,) of columns of the shapes, and their covariance (C, C)."""
     hessian, gradient = _along(equations, equations.unit[..., list(columns)])

@@ -65,6 +65,32 @@ def test_an_answer_has_the_effect_its_values_and_its_size_or_what_is_too_small()
     )
 
 
+@pytest.mark.parametrize(
+    ("force", "torque", "least", "words"),
+    [
+        (0.03, 1.14, 0.5, " These flights would not show a constant torque below 1.1 rad/s^2."),
+        (
+            0.2,
+            1.14,
+            0.5,
+            "show a constant force below 0.2 m/s^2 or a constant torque below 1.1 rad",
+        ),
+        (0.03, 0.4, 0.5, ""),
+        (0.03, 0.4, 0.0, ""),
+    ],
+)
+def test_an_answer_without_a_gap_says_which_relevant_push_the_flights_would_not_show(
+    force, torque, least, words
+):
+    relevance = {"force": 0.05, "torque": least, "drift": 0.025}
+    more = {"visible": {"force": force, "torque": torque}, "relevance": relevance}
+    found = entries("no_gap", **more)
+    said, steps = summary.answer(found), " ".join(summary.next_steps(found))
+    assert (words in said) if words else ("not show" not in said and "To see" not in steps)
+    assert ("To see a smaller force or torque, log every" in steps) == (force > 0.05)
+    assert "not show" not in summary.answer(entries("unknown", **more))
+
+
 def test_a_large_effect_has_its_size_without_powers_of_ten():
     large = {**DRAG, "size": {"force": 0.0, "torque": 123.4, "drift": 99.7}}
     assert "causes 123 rad/s² and 100 m after one second" in summary.answer(
