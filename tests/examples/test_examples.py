@@ -86,7 +86,7 @@ def test_the_helpers_of_a_track_family_are_where_the_docs_say_with_these_argumen
 @pytest.fixture(autouse=True)
 def as_a_program(tmp_path, monkeypatch):
     """Run in an empty folder, train in few worlds; effects that a program adds go again."""
-    few = ("episode.batch=4", "episode.steps=8")
+    few = ("episode.batch=4", "episode.steps=8", "optimizer.warmup=0")
     monkeypatch.setattr(train_command, "named_recipe", lambda name: with_changes(RECIPE(name), few))
     monkeypatch.chdir(tmp_path)
     for table in ("_entries", "_values"):
