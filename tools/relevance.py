@@ -12,8 +12,8 @@ that describes them best, and nothing is hidden in them.
 The tool prints a line for each set, with the size of the hidden effect in standard deviations of
 its estimate: no method finds what is within the noise of a log. Then it prints the shares, with
 their 95 % intervals (Clopper and Pearson): that of the named effects for each kind of log, among
-all and among those of at least `VISIBLE` standard deviations. 60 sets take about 30 minutes on one
-core.
+all and among those that the log shows clearly (`Thresholds.visible_sigma`). 60 sets take about
+30 minutes on one core.
 """
 
 from __future__ import annotations
@@ -56,8 +56,6 @@ FLIGHTS = 4
 """Number of flights of a set."""
 NOISE = SENSORS["full"]
 """Measurement noise of the noisy sets."""
-VISIBLE = 4.0
-"""Size of an effect that its log shows clearly, in standard deviations."""
 
 
 class Setting(NamedTuple):
@@ -204,9 +202,10 @@ def main(
     print(share_line("clean sets with the verdict no_gap", clean, sets))
     for kind, outcomes in named.items():
         what = f"effects of {times:g} times the threshold that are named, {kind}"
-        clear = [is_named for is_named, size in outcomes if size >= VISIBLE]
+        least = THRESHOLDS.visible_sigma
+        clear = [is_named for is_named, size in outcomes if size >= least]
         print(share_line(what, sum(is_named for is_named, _ in outcomes), len(outcomes)))
-        print(share_line(f"of those of at least {VISIBLE:g} sigma", sum(clear), len(clear)))
+        print(share_line(f"of those of at least {least:g} sigma", sum(clear), len(clear)))
 
 
 def _found(found: Any) -> str:

@@ -46,7 +46,7 @@ class FlightLog:
     """One flight as arrays on its T rows; a value that is missing is NaN.
 
     Row k holds what was measured at `time_s[k]` before the command of row k acts; that command
-    holds from `time_s[k]` to `time_s[k + 1]`.
+    holds from `time_s[k]` to the next command.
     """
 
     name: str

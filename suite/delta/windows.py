@@ -126,22 +126,22 @@ def stack_windows(
 
 
 def on_state_rows(log: FlightLog) -> FlightLog:
-    """Return `log` without rows that lack a state; a command in one moves to the state before it.
+    """Return `log` without rows that lack a state, with the commands from each state to the next.
 
-    `suite fly` logs a set point when it was sent, some milliseconds after the state it answers.
+    `suite fly` logs a set point when it was sent, some milliseconds after the state it answers. A
+    state gets the first command before the next state, or else the one before goes on.
     """
     state = np.concatenate([log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b], axis=1)
     has_state = np.isfinite(state).all(axis=1)
     command = log.command
-    if has_state.all() or command is None:
+    if has_state.all() or command is None or not np.isfinite(command).all(axis=1).any():
         return log
     rows = np.flatnonzero(has_state)
-    # The first command from each state on, unless the next state comes before it.
-    sent = np.append(np.flatnonzero(np.isfinite(command).all(axis=1)), len(command))
-    first = sent[np.searchsorted(sent, rows)]
-    is_answer = first < np.append(rows[1:], len(command))
-    moved = np.full((len(rows), 4), np.nan)
-    moved[is_answer] = command[first[is_answer]]
+    # Places in `sent` of the first command from each state on, and of the last one before the next.
+    sent = np.flatnonzero(np.isfinite(command).all(axis=1))
+    last = np.searchsorted(sent, np.append(rows[1:], len(command))) - 1
+    place = np.minimum(np.searchsorted(sent, rows), last)
+    moved = np.where(place[:, None] >= 0, command[sent[place]], np.nan)
     arrays = {f.name: v for f in fields(log) if isinstance(v := getattr(log, f.name), np.ndarray)}
     taken: dict[str, Any] = {name: values[rows] for name, values in arrays.items()}
     taken |= {"thrust_cmd": moved[:, 0], "rate_cmd_b": moved[:, 1:]}

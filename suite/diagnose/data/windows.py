@@ -275,7 +275,9 @@ def _input_of(
         time_s, command = time_s[finite], given[finite]
     first_s, last_s = begin_s - BURN_IN_S - HISTORY_S - 1e-9, begin_s + length_s + 1e-9
     used = slice(max(np.searchsorted(time_s, first_s) - 1, 0), np.searchsorted(time_s, last_s) + 1)
-    time_s, command = with_lost_rows(time_s[used] - begin_s, command[used])
+    time_s, command = time_s[used] - begin_s, command[used]
+    if "command_jitter_s" not in log.about:  # else each command has the time at which it was sent
+        time_s, command = with_lost_rows(time_s, command)
     if between:
         time_s, command = (np.repeat(values, 2, axis=0)[:-1] for values in (time_s, command))
         time_s[1::2] += 0.5 * np.diff(time_s[::2])

@@ -13,6 +13,7 @@ import numpy as np
 
 from eval.effects import EFFECTS
 from suite.diagnose.sources.source import FAR
+from suite.diagnose.sources.stretches import LACKING
 from suite.diagnose.verdict.gap import EffectSize
 from tracks.common.figures import rounded, with_unit
 
@@ -202,7 +203,9 @@ def next_steps(result: Mapping[str, Any]) -> list[str]:
         if is_change:
             return [f"Keep the vehicle file that you use. {UNTESTED}"]
         hidden = " or ".join(_not_visible(result))
-        smaller = [f"To see a smaller {hidden}, log every command, and fly longer."]
+        lacks = LACKING in result.get("warnings", ()) or result.get("driven_by") != "commands"
+        how = "log every command, and fly longer" if lacks else "fly longer"
+        smaller = [f"To see a smaller {hidden}, {how}."]
         return [
             "Use the vehicle file as it is.",
             *(smaller if hidden else []),

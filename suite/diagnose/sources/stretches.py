@@ -32,8 +32,9 @@ from suite.diagnose.thresholds import Thresholds
 BASE_S, STRETCH_S = 5.0, 0.25
 """Estimated duration on two cores: fixed part, and for each stretch [s]."""
 LACKING = (
-    "the drone received commands between the rows of the log; the mean of their neighbours stands "
-    "for them, and what it may change counts as noise: log every command, to find smaller effects"
+    "the drone probably received commands between the rows of the log; the mean of their "
+    "neighbours stands for them, and what it may change counts as noise: log every command, to "
+    "find smaller effects"
 )
 
 
@@ -56,7 +57,7 @@ class Stretches:
     """See `RolloutSource.coarser_share`."""
     push_error: np.ndarray | None = None
     """(W, 4) error of thrust [m/s^2] and torque [rad/s^2] by commands that the logs lack, or whose
-    times they do not know exactly; None if all are known."""
+    times are uncertain; None if all are known."""
 
     def overlapping(self, flights: Collection[int], since_s: float) -> tuple[FlightWindows, int]:
         """Return overlapping windows of `flights` after `since_s` [s], and how many diverge.
@@ -112,7 +113,7 @@ def simulated_stretches(
             dense = all(rows_show_torque(vehicle, own_spacing_s(*rotor)) for rotor in rotors)
             made = replace(made, coarser=coarser, coarser_share=0.5 if dense else 2.0)
     if not rotor_input and any(map(command_jitter_s, logs)):
-        jittered = take(windows_of(like=windows, jitter=True)[0], is_finite)
+        jittered = take(windows_of(jitter=True)[0], is_finite)
         made, _ = _with_unknown(made, jittered)
     commands = [(log.time_s, log.rate_cmd_b) for log in logs if log.rate_cmd_b is not None]
     are_slow = any(own_spacing_s(*command) > limits.command_spacing_s for command in commands)

@@ -122,7 +122,8 @@ def beyond_model_error(
 def least_visible(equations: DisturbanceEquations) -> EffectSize:
     """Return the smallest constant force and torque that the windows show, along the worst axis.
 
-    It is `Thresholds.visible_sigma` standard errors; the drift is not computed.
+    It is `Thresholds.visible_sigma` standard errors, if nothing else is fitted. The model's own
+    error comes on top. The drift is not computed.
     """
     each_axis = np.tile(np.eye(6), (KNOTS, 1))
     hessian, _ = _along(equations, np.broadcast_to(each_axis, (len(equations.unit), 6 * KNOTS, 6)))

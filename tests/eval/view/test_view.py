@@ -91,7 +91,6 @@ def test_a_name_with_dollar_signs_is_a_name(tmp_path):
     assert opened(tmp_path / "grid.png").size[0] > 300
 
 
-@pytest.mark.extended
 def test_bad_picture_requests_are_refused(tmp_path):
     for name in ("trial", "trial.xyz"):
         with pytest.raises(ValueError, match="a picture ends in .png, .pdf or .svg"):
@@ -101,6 +100,7 @@ def test_bad_picture_requests_are_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.extended
 def test_a_grid_has_a_panel_a_trial(tmp_path):
     trials = [rollout(), rollout("collision", 1.5, False), (small_track(4, seed=2), None, None)]
     write_grid(tmp_path / "one.png", trials[:1])

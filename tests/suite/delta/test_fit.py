@@ -83,15 +83,18 @@ def test_commands_in_rows_of_their_own_move_to_the_states_that_they_answer():
     assert on_state_rows(log) is log
     late_s = np.full(count, 0.2) * np.diff(log.time_s).min()
     sent = with_sent_commands(log, late_s)
-    # A state without an answer has no command.
+    # At a state without an answer before the next one, the command before goes on.
     lost = np.arange(2 * count) != 9
     sent = replace(sent, thrust_cmd=np.where(lost, sent.thrust_cmd, np.nan))
     again = on_state_rows(sent)
     for name in ("time_s", "pos_w", "quat_wxyz", "vel_w", "rate_b"):
         np.testing.assert_array_equal(getattr(again, name), getattr(log, name))
     np.testing.assert_array_equal(again.policy_step, log.policy_step)
-    np.testing.assert_array_equal(np.isnan(again.thrust_cmd), np.arange(count) == 4)
-    np.testing.assert_array_equal(np.delete(again.thrust_cmd, 4), np.delete(log.thrust_cmd, 4))
+    held = np.where(np.arange(count) == 4, log.thrust_cmd[3], log.thrust_cmd)
+    np.testing.assert_array_equal(again.thrust_cmd, held)
+    np.testing.assert_array_equal(log_decisions(again)[1], log.policy_step)
+    none = replace(sent, thrust_cmd=np.full(2 * count, np.nan))
+    assert on_state_rows(none) is none
 
 
 def push(vel_b, action_b):

@@ -235,6 +235,14 @@ def test_times_of_commands_are_shifted_as_far_as_a_log_states(log, stated):
     np.testing.assert_array_equal(shifted.command, as_logged.command)
 
 
+def test_a_pause_of_commands_with_stated_times_is_no_lost_row(log):
+    some = replace(log, thrust_cmd=np.where(np.arange(len(log.time_s)) % 9, log.thrust_cmd, np.nan))
+    stated = replace(some, about={"command_jitter_s": 0.0})
+    filled, held = (cut([one], PLAIN, False)[0] for one in (some, stated))
+    counts = [np.isfinite(one.command_s).sum(axis=1) for one in (filled, held)]
+    assert (counts[0] > counts[1] + 10).all()
+
+
 def test_few_shapes_hold_rows_of_every_rate(log):
     few, many = (144 + 512 + 1, 192), (144 + 512 + 1, 1536)
     more = 704 - 512

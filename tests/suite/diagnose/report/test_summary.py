@@ -88,6 +88,8 @@ def test_an_answer_without_a_gap_says_which_relevant_push_the_flights_would_not_
     said, steps = summary.answer(found), " ".join(summary.next_steps(found))
     assert (words in said) if words else ("not show" not in said and "To see" not in steps)
     assert ("To see a smaller force or torque, log every" in steps) == (force > 0.05)
+    by_all = " ".join(summary.next_steps({**found, "driven_by": "commands"}))
+    assert ("To see a smaller force or torque, fly longer" in by_all) == (force > 0.05)
     assert "not show" not in summary.answer(entries("unknown", **more))
 
 

@@ -7,7 +7,7 @@ from eval.logs.flight_log import read_flight
 from eval.worlds.trial import TrialSpec
 from policies.spec import ActionSpec, PolicySpec
 from suite.common.console import Console
-from suite.judging.link.log import write_log
+from suite.judging.link.log import command_jitter_s, write_log
 from tests.support.pilots import Steady
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed (the extra mavlink)")
@@ -51,6 +51,10 @@ def test_late_states_show_how_uncertain_the_times_of_set_points_are(bench, tmp_p
     sent_s = [row.sent_s - row.state.time_s for row in one.companion.rows]
     np.testing.assert_allclose(sent_s, late_s, atol=2e-4)
     assert log.about["command_jitter_s"] == pytest.approx(0.002, abs=2e-4)
+    # One long delay changes nothing.
+    rows = one.companion.rows
+    rows[50] = rows[50]._replace(sent_s=rows[50].sent_s + 0.15)
+    assert command_jitter_s(rows) == pytest.approx(0.002, abs=2e-4)
 
 
 def test_a_flight_of_thrust_and_rates_becomes_a_log(bench, tmp_path):
