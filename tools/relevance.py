@@ -39,7 +39,7 @@ from suite.blind.oracle import Column
 from suite.common.console import Silent
 from suite.common.startup import keep_compiled
 from suite.diagnose.diagnose import Diagnosis, diagnose
-from suite.diagnose.estimate.parameters import FittedNumber
+from suite.diagnose.estimate.parameters import ParameterSpace
 from suite.diagnose.evidence.rollouts import rollouts_along
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.thresholds import THRESHOLDS
@@ -140,9 +140,8 @@ def at_threshold(
     by_rotors = logs[0].thrust_cmd is None
     model, windows, start = rollouts_along(logs, vehicle, rotor_input=by_rotors)
     space = model.space
-    indices = [k for k, entry in enumerate(space.entries) if entry.effect == name]
+    indices, change = _change(name, values, space, start.theta)
     slope = model.linearise(start, windows, indices).slope
-    change = _array_of(name, values, [space.entries[k] for k in indices]) - start.theta[indices]
     size = rollout_size(slope @ change, windows)
     shares = [(s or 0.0) / limit for s, limit in zip(size, THRESHOLDS.relevance, strict=True)]
     theta = start.theta.copy()
@@ -156,17 +155,19 @@ def in_deviations(name: str, values: Any, diagnosis: Diagnosis) -> float:
     Other effects count as known, so it is an upper limit.
     """
     evaluation = diagnosis.main.source.begin
-    space, start = evaluation.evidence.space, evaluation.at.theta
-    indices = [k for k, entry in enumerate(space.entries) if entry.effect == name]
-    change = _array_of(name, values, [space.entries[k] for k in indices]) - start[indices]
+    indices, change = _change(name, values, evaluation.evidence.space, evaluation.at.theta)
     information, _ = evaluation.block.equations.take(indices).sums()
     return float(np.sqrt(change @ information @ change))
 
 
-def _array_of(name: str, values: Any, entries: Sequence[FittedNumber]) -> np.ndarray:
-    """Return the numbers of an effect's `values` that belong to `entries`."""
-    columns = (Column(name, entry.parameter, entry.component or 0) for entry in entries)
-    return np.array([column.value(values) for column in columns])
+def _change(
+    name: str, values: Any, space: ParameterSpace, theta: np.ndarray
+) -> tuple[list[int], np.ndarray]:
+    """Return the places of an effect's K parameters, and its `values` minus those of `theta`."""
+    entries = {k: entry for k, entry in enumerate(space.entries) if entry.effect == name}
+    columns = (Column(name, one.parameter, one.component or 0) for one in entries.values())
+    target = np.array([column.value(values) for column in columns])
+    return list(entries), target - theta[list(entries)]
 
 
 def main(

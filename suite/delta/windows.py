@@ -9,7 +9,6 @@ gates.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -18,6 +17,7 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from policies.networks import delta_network
+from suite.delta.log_rows import take_rows
 from tracks.geometry.rotation import quat_to_rot, to_local
 from tracks.geometry.scene import Array
 
@@ -134,18 +134,16 @@ def on_state_rows(log: FlightLog) -> FlightLog:
     state = np.concatenate([log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b], axis=1)
     has_state = np.isfinite(state).all(axis=1)
     command = log.command
-    if has_state.all() or command is None or not np.isfinite(command).all(axis=1).any():
+    if has_state.all() or command is None:
         return log
-    rows = np.flatnonzero(has_state)
+    rows, sent = np.flatnonzero(has_state), np.flatnonzero(np.isfinite(command).all(axis=1))
+    if not len(sent):
+        return log
     # Places in `sent` of the first command from each state on, and of the last one before the next.
-    sent = np.flatnonzero(np.isfinite(command).all(axis=1))
     last = np.searchsorted(sent, np.append(rows[1:], len(command))) - 1
     place = np.minimum(np.searchsorted(sent, rows), last)
     moved = np.where(place[:, None] >= 0, command[sent[place]], np.nan)
-    arrays = {f.name: v for f in fields(log) if isinstance(v := getattr(log, f.name), np.ndarray)}
-    taken: dict[str, Any] = {name: values[rows] for name, values in arrays.items()}
-    taken |= {"thrust_cmd": moved[:, 0], "rate_cmd_b": moved[:, 1:]}
-    return replace(log, **taken, extra={name: v[rows] for name, v in log.extra.items()})
+    return take_rows(log, rows, thrust_cmd=moved[:, 0], rate_cmd_b=moved[:, 1:])
 
 
 def log_decisions(log: FlightLog) -> tuple[np.ndarray, np.ndarray]:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from eval.logs.flight_log import FlightLog, read_flights, write_flight
+from suite.delta.log_rows import take_rows
 from suite.judging.collect import LIST
 from tracks.common.files import write_json
 from tracks.geometry.rotation import exp_rot, rot_to_quat
@@ -65,15 +66,7 @@ def add_measurement_noise(flights: Path, out: Path, seed: int) -> list[Path]:
 
 def cut_end(log: FlightLog, margin_s: float) -> FlightLog:
     """Return a log without the last `margin_s` [s]."""
-    # Arrays with one value per row are cut; other fields stay.
-    selected, count = log.time_s <= log.time_s[-1] - margin_s, len(log.time_s)
-    arrays = {
-        name: value[selected]
-        for name, value in vars(log).items()
-        if isinstance(value, np.ndarray) and len(value) == count
-    }
-    extra = {name: value[selected] for name, value in log.extra.items()}
-    return replace(log, **arrays, extra=extra)
+    return take_rows(log, log.time_s <= log.time_s[-1] - margin_s)
 
 
 def noisy(log: FlightLog, rng: np.random.Generator) -> FlightLog:

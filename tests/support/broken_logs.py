@@ -121,9 +121,7 @@ def with_sent_commands(log, late_s):
     is_sent = np.arange(len(twice.time_s)) % 2 == 1
 
     def kept(chosen):
-        return lambda values: np.where(
-            chosen if values.ndim == 1 else chosen[:, None], values, np.nan
-        )
+        return lambda values: np.where(chosen, values.T, np.nan).T
 
     commands = ("thrust_cmd", "rate_cmd_b")
     parts = {name: kept(is_sent if name in commands else ~is_sent) for name in FIELDS}

@@ -202,13 +202,13 @@ def next_steps(result: Mapping[str, Any]) -> list[str]:
     if verdict == "no_gap":
         if is_change:
             return [f"Keep the vehicle file that you use. {UNTESTED}"]
-        hidden = " or ".join(_not_visible(result))
-        lacks = LACKING in result.get("warnings", ()) or result.get("driven_by") != "commands"
-        how = "log every command, and fly longer" if lacks else "fly longer"
-        smaller = [f"To see a smaller {hidden}, {how}."]
+        steps = ["Use the vehicle file as it is."]
+        if hidden := " or ".join(_not_visible(result)):
+            lacks = LACKING in result.get("warnings", ()) or result.get("driven_by") != "commands"
+            how = "log every command, and fly longer" if lacks else "fly longer"
+            steps.append(f"To see a smaller {hidden}, {how}.")
         return [
-            "Use the vehicle file as it is.",
-            *(smaller if hidden else []),
+            *steps,
             "If your task is faster than these flights, fly faster or turn harder, and repeat "
             "this.",
         ]

@@ -182,7 +182,6 @@ class RolloutSource(Source):
         """
         evidence = of_rollouts(found.last)
         equations = disturbance_equations(evidence, evidence.trusted, found.estimate)
-        visible = least_visible(equations)
         structure, wind = self._structure(found, equations, seed)
         details = {
             "shapes": [
@@ -192,24 +191,24 @@ class RolloutSource(Source):
             "coloured": structure.coloured,
         }
         share = remaining_share(*gaps) if found.named else 0.0
+        noise = Remaining(False, share, visible=least_visible(equations), details=details)
         if not (structure.size.relevant(self.limits) or self.is_relevant(gaps[1])):
-            return Remaining(False, share, reason=TOO_SMALL, visible=visible, details=details)
+            return noise._replace(reason=TOO_SMALL)
         # Slow errors are those that a low polynomial over a window describes: noise has few.
-        slow = of_rollouts(found.last).slow_errors(found.last.block)
+        slow = evidence.slow_errors(found.last.block)
         has_error = self.held.input_error is not None
         is_uncertain = self.rotor_input or self.coarser is not None or has_error
         where = structure_where(slow, structure, is_uncertain, self.limits)
         swing = self._swing(found.estimate.theta) if wind or where else None
         # Wind explains the structure, unless the force oscillates regularly.
         if wind and not swing:
-            share, reason = remaining_share(*gaps), "by the random course of the wind"
-            return Remaining(
-                False, share, None, reason, wind=wind, visible=visible, details=details
-            )
+            reason = "by the random course of the wind"
+            return noise._replace(share=remaining_share(*gaps), reason=reason, wind=wind)
         if (where or swing) and not found.named:
             share = 1.0
-        is_structured = bool(where or swing)
-        return Remaining(is_structured, share, where, swing=swing, visible=visible, details=details)
+        return noise._replace(
+            structured=bool(where or swing), share=share, where=where, swing=swing
+        )
 
     def _structure(
         self, found: SearchResult, equations: DisturbanceEquations, seed: int
