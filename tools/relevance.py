@@ -142,7 +142,7 @@ def at_threshold(
     space = model.space
     indices, change = _change(name, values, space, start.theta)
     slope = model.linearise(start, windows, indices).slope
-    size = rollout_size(slope @ change, windows)
+    size = rollout_size(slope @ change, windows, by_rotors)
     shares = [(s or 0.0) / limit for s, limit in zip(size, THRESHOLDS.relevance, strict=True)]
     theta = start.theta.copy()
     theta[indices] += times * change / max(shares)

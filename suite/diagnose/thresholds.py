@@ -74,9 +74,6 @@ class Thresholds:
     lacking_share: float = 0.05
     """Share above which commands are lacking (lower end of its interval): 0 if each logged command
     acts until the next, 1 if others act half-way."""
-    lacking_misfit: float = 1.1
-    """Error of the simulation with held commands, over the noise, above which a smaller share than
-    that is evidence, too. Of logs with all commands it is 1.0."""
     held_share: float = 0.4
     """Share up to which each command certainly acts until the next (upper end of its interval)."""
 

@@ -24,6 +24,8 @@ from suite.diagnose.thresholds import Thresholds
 
 WIDE = 100.0
 """Standard deviation of an unknown thrust [m/s^2] and torque [rad/s^2] that data determine."""
+FORCE, COMMANDED = slice(0, 3), slice(2, 6)
+"""Axes of `push_slopes`: those of a force, and those of the thrust and torque by commands."""
 LEAST_PUSH = 1e-3
 """Lower limit of the error of thrust [m/s^2] and torque [rad/s^2]."""
 
@@ -48,33 +50,30 @@ class Share(NamedTuple):
     value: float
     error: float
     """Standard error of `value`, which includes the misfit."""
-    misfit: float
-    """RMS of what no share and no parameter explains, over the noise."""
 
     def are_lacking(self, limits: Thresholds) -> bool:
-        """Return whether logs lack commands.
-
-        Where nothing else explains the flights, less evidence suffices: a policy that decides less
-        often than the rows gives most of its commands at a row.
-        """
-        is_sure = self.value - 3.0 * self.error > limits.lacking_share
-        return is_sure or (self.misfit > limits.lacking_misfit and self.value > 2.0 * self.error)
+        """Return whether logs certainly lack commands."""
+        return self.value - 3.0 * self.error > limits.lacking_share
 
     def are_complete(self, limits: Thresholds) -> bool:
         """Return whether logs certainly have every command."""
         return self.value + 3.0 * self.error <= limits.held_share
 
 
-def share_between(linear: Linearisation, difference: np.ndarray, limits: Thresholds) -> Share:
+def share_between(
+    linear: Linearisation, difference: np.ndarray, force: np.ndarray, limits: Thresholds
+) -> Share:
     """Return the share of commands between the rows.
 
     The share is 0 if each command holds until the next row, and 1 if the mean of two commands acts
     half-way, as it does on average if the drone received others in between. This changes the
     residuals by the `difference` (W, N, 19). The share is fitted together with all parameters,
-    since a delay or a shifted clock moves commands in time as well. `linear` has slopes along all
-    parameters and start numbers.
+    since a delay or a shifted clock moves commands in time as well; and with a force of any course
+    over the knots, along whose slopes `force` (W, N, 19, KNOTS, 3) are: it stands for forces that
+    no parameter describes. `linear` has slopes along all parameters and start numbers.
     """
     noise = measured_noise(linear, limits)
+    linear = linear._replace(windows=with_input_error(linear.windows, force, WIDE))
     toward = -_zeroed(difference)[0][..., None]
     whitening = make_whitening(linear, noise, limits)
     # Along all parameters and the share; slopes along start numbers are not needed any more.
@@ -87,24 +86,37 @@ def share_between(linear: Linearisation, difference: np.ndarray, limits: Thresho
     inverse = np.linalg.pinv(slope.T @ slope, rcond=1e-9, hermitian=True)
     best = inverse @ (slope.T @ residual)
     # What remains may be more than noise.
-    freedom = int(np.asarray(linear.windows.valid).sum()) - linear.offset.size - len(best)
+    free = linear.offset.size + force[:, 0, 0].size + len(best)
+    freedom = int(np.asarray(linear.windows.valid).sum()) - free
     chi2 = float(((residual - slope @ best) ** 2).sum())
     scale = np.sqrt(max(chi2 / max(freedom, 1), 1.0))
     error = scale * np.sqrt(inverse[0, 0]) / size[0]
-    return Share(float(best[0] / size[0]), float(error), float(scale))
+    return Share(float(best[0] / size[0]), float(error))
 
 
-def push_slopes(model: RolloutModel, linear: Linearisation) -> np.ndarray:
-    """Return slopes (W, N, 19, KNOTS, 4) along a thrust [m/s^2] and torque [rad/s^2] at a knot."""
+def push_slopes(model: RolloutModel, linear: Linearisation, axes: slice) -> np.ndarray:
+    """Return slopes (W, N, 19, KNOTS, K) along a force [m/s^2] and torque [rad/s^2] at a knot.
+
+    `axes` are K of the six: `FORCE` or `COMMANDED`.
+    """
     at = Estimate(model.space.array("start"), linear.offset)
     slope = model.respond(at, linear.windows)[0].slope
-    return slope.reshape(*slope.shape[:3], KNOTS, 6)[..., 2:]
+    return slope.reshape(*slope.shape[:3], KNOTS, 6)[..., axes]
 
 
-def with_input_error(windows: FlightWindows, push: np.ndarray, error: np.ndarray) -> FlightWindows:
-    """Return `windows` whose commands have the `error` (W, 4) or (4,); for `push` see above."""
-    columns = push * np.broadcast_to(error, (len(push), 4))[:, None, None, None]
-    return windows._replace(input_error=columns.reshape(*push.shape[:3], -1))
+def with_input_error(
+    windows: FlightWindows, push: np.ndarray, error: np.ndarray | float
+) -> FlightWindows:
+    """Return `windows` with further errors of the input, of the size `error` (W, K), (K,) or ().
+
+    For `push` (W, N, 19, KNOTS, K) see above.
+    """
+    count, *_, width = push.shape
+    columns = push * np.broadcast_to(error, (count, width))[:, None, None, None]
+    columns = columns.reshape(*push.shape[:3], -1)
+    if windows.input_error is not None:
+        columns = np.concatenate([windows.input_error, columns], axis=-1)
+    return windows._replace(input_error=columns)
 
 
 def unknown_commands(
@@ -113,7 +125,7 @@ def unknown_commands(
     """Return the error (W, 4) of thrust and torque by unknown commands, and limits with its noise.
 
     Other commands, which are as likely, change the residuals by the `difference` (W, N, 19). For
-    `push` see `push_slopes`.
+    `push` see `push_slopes`; its axes are `COMMANDED`.
     """
     noise = measured_noise(linear, limits)
     difference, _ = _zeroed(difference)

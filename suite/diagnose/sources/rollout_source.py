@@ -173,7 +173,8 @@ class RolloutSource(Source):
             scale, most = self.space.array("step")[list(indices)], np.full(len(indices), np.inf)
             change = solve(*equations.sums(), -most, most, scale)
             model_error = self.coarser_share * np.abs(change)
-        return sizes_by_effect(found, slope, partial(rollout_size, windows=windows), model_error)
+        size_of = partial(rollout_size, windows=windows, rotor_input=self.rotor_input)
+        return sizes_by_effect(found, slope, size_of, model_error)
 
     def remaining(self, found: SearchResult, gaps: tuple[Gap, Gap], seed: int) -> Remaining:
         """Return the structure in the error that remains after `found`, see `Source`.

@@ -20,6 +20,8 @@ from suite.diagnose.data.windows import FlightWindows, command_jitter_s, cut, ta
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.sources.input_error import (
+    COMMANDED,
+    FORCE,
     push_slopes,
     share_between,
     unknown_commands,
@@ -70,7 +72,8 @@ class Stretches:
         linear = self.model.linearise(start_estimate(self.model, windows), windows, [])
         if self.push_error is not None:
             error = np.sqrt((self.push_error**2).mean(axis=0))
-            windows = with_input_error(windows, push_slopes(self.model, linear), error)
+            push = push_slopes(self.model, linear, COMMANDED)
+            windows = with_input_error(windows, push, error)
         flies = _finite(linear, self.limits)
         return take(windows, flies), int((~flies).sum())
 
@@ -121,7 +124,8 @@ def simulated_stretches(
         return made, warnings
     # The drone may have received commands between the rows.
     between = take(windows_of(between=True)[0], is_finite)
-    share = share_between(made.linear, _difference(model, linear, between), made.limits)
+    difference, force = _difference(model, linear, between), push_slopes(model, linear, FORCE)
+    share = share_between(made.linear, difference, force, made.limits)
     if share.are_lacking(limits):
         return _with_unknown_commands(made), [*warnings, LACKING]
     if not share.are_complete(limits):  # effects must be larger than what it changes
@@ -150,7 +154,7 @@ def _with_unknown(made: Stretches, other: FlightWindows) -> tuple[Stretches, Fli
 
     Those are the same windows with commands that are as likely.
     """
-    push = push_slopes(made.model, made.linear)
+    push = push_slopes(made.model, made.linear, COMMANDED)
     difference = _difference(made.model, made.linear, other)
     error, limits = unknown_commands(made.linear, push, difference, made.limits)
     windows, other = (with_input_error(w, push, error) for w in (made.linear.windows, other))

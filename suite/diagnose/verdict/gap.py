@@ -36,6 +36,9 @@ DRAWS = 1000
 FORCE_S, TORQUE_S = 0.5, 0.1
 """Times over which an effect's mean linear and angular accelerations are computed [s]. The time for
 the angular one is short, as the rate loop soon counteracts a rotation."""
+OPEN_FORCE_S = 0.2
+"""The time for the linear one if measured rotor speeds drive the simulation [s]. No rate loop stops
+a rotation then: it tilts the thrust, and soon moves the drone more than the effect's own force."""
 
 
 def rms_length(vectors: np.ndarray, z: float = 0.0) -> float:
@@ -209,7 +212,7 @@ class EffectSize(NamedTuple):
     torque: float
     """Change of the angular acceleration [rad/s^2]."""
     drift: float | None
-    """Change of the position after a second [m]; None where no rollout was simulated."""
+    """Change of the position after a second [m]; None where commands drove no rollout."""
 
     def relevant(self, limits: Thresholds) -> bool:
         """Return whether the size reaches one of the thresholds of relevance."""
@@ -224,30 +227,40 @@ class EffectSize(NamedTuple):
         return " and ".join([*([", ".join(parts[:-1])] if parts[1:] else []), parts[-1]])
 
 
-def rollout_size(shift: np.ndarray, windows: FlightWindows, z: float = 0.0) -> EffectSize:
+def rollout_size(
+    shift: np.ndarray, windows: FlightWindows, rotor_input: bool, z: float = 0.0
+) -> EffectSize:
     """Return the size of an effect that shifts the values of `windows` by `shift` (W, N, 19).
 
-    A fault of the log gets that of the motion with the same shift. For `z` see `rms_length`.
+    A fault of the log gets that of the motion with the same shift. With `rotor_input`, rollouts
+    have no rate loop, and a torque moves them much further than the drone: there is no drift. For
+    `z` see `rms_length`.
     """
     row_s, valid = np.asarray(windows.row_s), np.asarray(windows.valid)
 
     def growth(group: str, horizon_s: float, power: int) -> float:
-        """Return the RMS shift of a group at its last row in the horizon, over time^power."""
-        in_time = (row_s <= horizon_s + 1e-6) & (row_s > 0.0)
-        usable = valid[..., SLICES[group]].all(axis=-1) & in_time
-        last_row = np.where(usable, row_s, 0.0).argmax(axis=1)
+        """Return the RMS shift of a group, over time^power.
+
+        It is that at its last row in the horizon, or at its first row if that is later.
+        """
+        usable = valid[..., SLICES[group]].all(axis=-1) & (row_s > 0.0)
+        in_time = usable & (row_s <= horizon_s + 1e-6)
+        last_row = np.where(in_time, row_s, 0.0).argmax(axis=1)
+        chosen = np.where(in_time.any(axis=1), last_row, usable.argmax(axis=1))
         stretch = np.flatnonzero(usable.any(axis=1))
         if not len(stretch):
             return 0.0
-        row = (stretch, last_row[stretch])
+        row = (stretch, chosen[stretch])
         return rms_length(shift[row][:, SLICES[group]] / row_s[row][:, None] ** power, z)
 
+    force_s = OPEN_FORCE_S if rotor_input else FORCE_S
     # The velocity grows with the acceleration times t, the position with half of it times t^2.
-    force = growth("velocity", FORCE_S, 1) or 2.0 * growth("position", FORCE_S, 2)
+    force = growth("velocity", force_s, 1) or 2.0 * growth("position", force_s, 2)
     has_acc = valid[..., SLICES["accelerometer"]].all(axis=-1)
     if has_acc.any():
         force = max(force, rms_length(shift[has_acc][:, SLICES["accelerometer"]], z))
-    return EffectSize(force, growth("rates", TORQUE_S, 1), growth("position", 1.0, 2))
+    drift = None if rotor_input else growth("position", 1.0, 2)
+    return EffectSize(force, growth("rates", TORQUE_S, 1), drift)
 
 
 def upper_size(

@@ -322,9 +322,16 @@ def test_the_noise_counts_as_certain_only_if_no_command_is_lacking(monkeypatch):
     assert source.held.input_error.any(axis=(1, 2)).all() and source.cut.keywords["between"]
     source, lacks = source_of(complete)
     assert not lacks and source.coarser is None and source.limits == limits
+
+    def lift(motion, t):
+        """No effect of the catalogue gives this acceleration."""
+        return np.array([0.0, 0.0, 0.03 * float(motion.vel_w[:2] @ motion.vel_w[:2])])
+
     shifted = with_effects(LAGGED, clock_offset=(-0.004,))
-    sparse, complete = slow_and_complete(monkeypatch, shifted, count=2, duration_s=6.0)
-    assert source_of(sparse)[1] and not source_of(complete)[1]
+    for vehicle, extras in ((shifted, None), (LAGGED, [lift] * 2)):
+        options = {"count": 2, "duration_s": 6.0, "extras": extras}
+        sparse, complete = slow_and_complete(monkeypatch, vehicle, **options)
+        assert source_of(sparse)[1] and not source_of(complete)[1]
 
 
 @pytest.mark.extended
