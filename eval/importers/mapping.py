@@ -224,8 +224,12 @@ def _per_mass(signals: dict[str, Signal], file_mass: Any, options: ImportOptions
     if mass is None:
         text = "is in N, and the mass is unknown: kept as cmd_force; give --mass or --vehicle"
         return [Finding("doubt", "thrust", text)]
+    status = "note"
+    if options.mass is None and isinstance(file_mass, float) and abs(file_mass / mass - 1) > 0.02:
+        status = "doubt"
+        mass_source += f"; its text file has {file_mass:g} kg: give the right one as --mass"
     signals["cmd_thrust"] = Signal(thrust.time_s, thrust.value / mass)
-    return [Finding("note", "thrust", f"in N; divided by a mass of {mass:g} kg, {mass_source}")]
+    return [Finding(status, "thrust", f"in N; divided by a mass of {mass:g} kg, {mass_source}")]
 
 
 def _text_file(path: Path, mapping: LogMap) -> tuple[dict[str, Any], list[Finding]]:

@@ -172,13 +172,13 @@ def motor_side_of(frames: Table) -> tuple[tuple[float, float], ...] | None:
     """Return the positions of the file's motors 1 to 4 from the table `[frames]`; None if absent.
 
     Raises:
-        ValueError: where the entry is not four points apart from the centre.
+        ValueError: where the entry is not four different points apart from the centre.
     """
     if not frames.has("motors"):
         return None
     points = frames.points("motors", 2, 4)
-    if not all(np.hypot(x, y) > 0.0 for x, y in points):
-        raise frames.error("motors", [list(p) for p in points], "four points off the middle")
+    if len(np.unique(points[:4], axis=0)) < 4 or not points.any(axis=1).all():
+        raise frames.error("motors", points.tolist(), "four different points off the middle")
     return tuple((float(x), float(y)) for x, y in points)[:4]
 
 
@@ -214,6 +214,8 @@ def _column(signal: str, table: Table) -> Column:
     names = [table.text("column")] if is_list_column else table.texts("columns")
     if not is_list_column and len(names) != width:
         raise table.error("columns", names, f"{width} column names")
+    if len({*names}) < len(names):
+        raise table.error("columns", names, f"{width} different column names")
     unit = table.choice("unit", tuple(UNITS[signal]))
     sign = table.vector("sign", width, [1.0] * width)
     if not np.all(np.abs(sign) == 1.0):

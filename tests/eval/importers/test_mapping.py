@@ -92,6 +92,8 @@ about = {{file = "info{{number}}.yaml", mass = "mass"}}
     near(log.thrust_cmd, truth.thrust, 1e-9)
     near(log.torque_cmd_b, truth.rate * 1e-3, 1e-12)
     assert log.about["beside"] == {"motors": "standard", "mass": 0.5} and log.about["mass"] == 0.5
+    _, findings = imported(tmp_path, mapping, columns, vehicle=PLAIN)
+    assert "doubt" in (f.status for f in findings if "text file has 0.5 kg" in f.evidence)
     (tmp_path / "info7.yaml").write_text("integrator: euler\npartial: no\nmass: 0\n")
     with pytest.raises(FlightLogError, match="the mass is unknown"):
         imported(tmp_path, mapping, columns)
@@ -212,6 +214,8 @@ def test_every_shipped_mapping_is_read_by_its_name():
         ('[vel]\ncolumn = "a"\naxis = "body"', "Did you mean 'axes'"),
         ("[time", "is not TOML"),
         ('[pwm]\ncolumns = ["a", "b", "c"]', "pwm.columns .* 4 column names"),
+        ('[rate]\ncolumns = ["a", "b", "b"]', "rate.columns .* 3 different column names"),
+        ("[frames]\nmotors = [[1, 1], [1, 1], [1, -1], [-1, -1]]", r"\[\[1.0, .*different points"),
         ('[pwm]\ncolumn = "a"\nmixer = "x"', "pwm.mixer is 'x', allowed is 'crazyflie'"),
         ('[pos]\ncolumn = "a"\nscale = -1.0', "pos.scale is -1.0"),
         ("[frames]\nmotors = [[1, 1]]", "frames.motors"),
