@@ -152,8 +152,9 @@ def score_set(out: Path) -> list[Verdict]:
     Raises:
         ValueError: if a file of the set has changed, or no case was diagnosed.
     """
-    verdicts, in_rotorpy = [], simulator_of(out) == ROTORPY
-    for name, answer in open_answers(out).items():
+    answers, verdicts = open_answers(out), []
+    in_rotorpy = simulator_of(out) == ROTORPY
+    for name, answer in answers.items():
         folder = out / RESULTS / name
         if not any((folder / mark).is_file() for mark in (TIMED, FAILED)):
             continue

@@ -114,8 +114,9 @@ def _plan(config: Config, console: Console) -> dict[str, Any]:
     from suite.diagnose.plan import plan_for, separations_of
 
     names = [EFFECTS.find(name).name for name in config.effects]
-    if len(names) < 2:
-        raise ValueError(f"--effects {names}: give at least two names of effects to separate")
+    if len({*names}) < 2:
+        given = ", ".join(names) or "empty"
+        raise ValueError(f"--effects is {given}; give at least two different names of effects")
     for entry in separations_of(names):
         console.say(f"{' or '.join(entry.pair)}: {entry.words}")
     flights = plan_for(names)

@@ -105,7 +105,10 @@ def test_effects_command_lists_and_describes(capfd):
 def test_the_command_says_which_flights_separate(capsys):
     flights = answer(capsys, "blind plan --effects linear_drag rotor_drag")["flights"]
     assert {flight["kind"] for flight in flights} == {"punches", "figure_eight"}
-    assert run("blind plan") == run("blind score --out /no/such/set") == 2
+    for names in ("", "--effects inflow inflow"):
+        assert "two different names" in refused(capsys, f"blind plan {names}")
+    for work in ("run", "score"):
+        assert "make the set first" in refused(capsys, f"blind {work} --out /no/such/set")
 
 
 def test_an_option_of_another_work_is_refused(tmp_path, monkeypatch, capsys):
