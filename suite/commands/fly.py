@@ -71,6 +71,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             "--time-limit-s ends simulated flights only; leave it out with --link: a real flight "
             "ends at the last gate, at a limit of docs/fly.md, or with Ctrl-C"
         )
+    if config.confirm and not config.link:
+        raise ValueError(
+            "--confirm needs --link, the vehicle's address; leave it out to simulate a vehicle"
+        )
     if config.signing_key and not config.link:
         raise ValueError("--signing-key needs --link: only a real link is signed")
     return fly_over_link(

@@ -374,3 +374,4 @@ def test_a_key_is_of_a_file_with_a_phrase_and_of_a_real_link(tmp_path, capsys, m
     with pytest.raises(ValueError, match="cannot be read"):
         signing_key(Path("nowhere"))
     assert "--signing-key needs --link" in refused(capsys, "fly --signing-key empty")
+    assert "--confirm needs --link" in refused(capsys, "fly --confirm")
