@@ -106,7 +106,7 @@ def check_flight_files(
             finding for finding, flight in all_findings if flight == name and finding.status != "ok"
         ]
         for text in finding_lines(problems):
-            console.say((f"{Path(name).name}: " if len(logs) > 1 and name else "") + text)
+            console.say((f"{name}: " if len(logs) > 1 and name else "") + text)
     unseen = not_identifiable([finding for finding, _ in all_findings])
     for manoeuvre in dict.fromkeys(one["manoeuvre"] for one in unseen):
         faults = [one["fault"] for one in unseen if one["manoeuvre"] == manoeuvre]

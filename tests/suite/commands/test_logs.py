@@ -117,6 +117,8 @@ def test_what_an_import_left_open_is_repeated_and_invalid_records_are_left_out(
 def test_logs_of_several_vehicles_are_named(tmp_path, capsys, flight):
     flight(1.0, about={"vehicle": "a"}).rename(tmp_path / "first.parquet")
     flight(1.0, about={"vehicle": "b"})
+    assert run("check", tmp_path) == 0
+    assert f"{tmp_path / 'flight.parquet'}: doubt" in capsys.readouterr().out
     found = answer(capsys, "check", tmp_path)["findings"]
     (mixed,) = (one for one in found if one["fault"] == "vehicle_mixed")
     assert mixed["flight"].endswith("flight.parquet") and "of vehicle 'b'" in mixed["evidence"]
