@@ -68,7 +68,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
     refuse_equal_names({trial.track for trial in chosen.trials})
     count = len(chosen.trials)
-    console.note(f"flying {counted(count, 'trial')} of {chosen.label} again")
+    console.note(f"flying {counted(count, 'trial')} of {chosen.label}")
     rollouts, drone = fly_again(chosen.evaluation, chosen.trials, judged=chosen.digests)
     write_recording(recording, rollouts, drone)
     written = [recording]

@@ -110,7 +110,8 @@ def collect(
     if len(logs) < len(rows):
         short = sum(row["time_s"] < DURATION_MIN for row in rows.values())
         console.say(
-            f"{len(rows) - len(logs)} without a log, {short} of them under {DURATION_MIN:g} s"
+            f"{len(rows) - len(logs)} without a log, {short} of them under {DURATION_MIN:g} s; "
+            f"{LIST} has how each ended"
         )
     if as_flown:
         console.say(
@@ -175,8 +176,9 @@ def _fly_missing(
     rows, console = logs.rows, logs.console
     missing = [trial for trial in trial_set.trials if trial not in rows]
     workers = workers_for(len(missing), workers, collection.simulator)
-    title = f"{counted(len(missing), 'flight')} in {collection.simulator}"
-    announce(console, title, flying_estimate(len(missing), workers, collection.simulator))
+    if missing:
+        title = f"{counted(len(missing), 'flight')} in {collection.simulator}"
+        announce(console, title, flying_estimate(len(missing), workers, collection.simulator))
     with console.progress("flights", len(trial_set.trials), begun=len(rows)) as update:
 
         def keep(result: TrialResult, flight: Flight | None) -> None:

@@ -85,7 +85,7 @@ def test_flights_of_another_course_or_code_are_not_taken_for_its_own(
 
 
 def test_flights_are_the_same_where_policy_and_vehicle_were_moved(
-    pilots, tmp_path, monkeypatch, root
+    pilots, tmp_path, monkeypatch, root, capfd
 ):
     vehicle, out = tmp_path / "mine.toml", tmp_path / "flights"
     shutil.copy(root / "eval" / "vehicles" / "racer5.toml", vehicle)
@@ -97,7 +97,9 @@ def test_flights_are_the_same_where_policy_and_vehicle_were_moved(
     (row,) = json.loads((out / "flights.json").read_text())["flights"]
     assert row["file"] is None and row["time_s"] < 1, "a flight of under a second is no log"
     assert not list(out.glob("*.parquet"))
+    capfd.readouterr()
     assert run(*args, moved) == 0, "nothing is flown again"
+    assert "0 flights in mujoco" not in capfd.readouterr().err
     moved.write_text(moved.read_text().replace("mass = 0.75", "mass = 0.76"))
     assert run(*args, moved) == 2
 
@@ -183,7 +185,7 @@ def test_a_flight_whose_log_is_refused_does_not_stop_the_others(
     assert not log.exists(), "a diagnosis of the folder would use it"
     said = capfd.readouterr()
     assert "zigzag-0-7.parquet: column rate_x, row 5: 300" in said.err
-    assert "1 without a log, 0 of them under 1 s" in said.out
+    assert "1 without a log, 0 of them under 1 s; flights.json has how" in said.out
 
 
 def test_what_cannot_be_recorded_is_refused(pilots, tmp_path, capfd):

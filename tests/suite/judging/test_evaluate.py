@@ -247,7 +247,7 @@ def test_view_finds_the_trials_of_every_policy_of_a_run(pilots, tmp_path, capfd)
     assert evaluate(out, "--trials 1 --track zigzag --time-limit-s 20", *policies) == 0
     assert run(*again, "--pick", "failed") == 0
     said = capfd.readouterr().err
-    assert f"flying 1 trial of {pilots['diver']} again" in said
+    assert f"flying 1 trial of {pilots['diver']}" in said
     assert f"--policy selects another of: {pilots['diver2']}" in said
     shown = answer(capfd, *again, "--policy", pilots["diver2"])["trials"]
     assert shown[0]["pos_x"] == read_trials(out / "trials.parquet")[2].pos_x
