@@ -88,7 +88,7 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
         reason = (
             "no on-board estimate: no columns est_pos_x, est_vel_x or est_quat_w. suite import "
             'keeps them where the mapping file has [[pos]] of source = "mocap" and of source = '
-            '"estimate", as nanobench has'
+            '"estimate", as nanobench has, and --source estimate is left out'
         )
         raise FlightLogError(log.name, reason)
     for group, values in (("pos", log.pos_w), ("quat", log.quat_wxyz)):

@@ -190,7 +190,7 @@ def test_a_log_without_an_estimate_or_a_reference_is_refused(tmp_path):
     bare = replace(log, extra={})
     lost = replace(log, pos_w=np.full_like(log.pos_w, np.nan), about={"partial": ["pos"]})
     for one, words in (
-        (bare, r"bare.parquet: no on-board estimate.*est_vel_x"),
+        (bare, r"bare.parquet: no on-board estimate.*est_vel_x.*--source estimate is left out"),
         (lost, "column pos_x: no reference for the estimate"),
     ):
         write_flight(tmp_path / "bare.parquet", one)
