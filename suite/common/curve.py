@@ -68,7 +68,8 @@ def read(folder: Path, name: str = CURVE) -> list[dict[str, Any]]:
     path = folder / name
     if not path.exists():
         return []
-    rows, lines = [], path.read_text(encoding="utf-8").splitlines()
+    # Bytes that are no text make their line invalid.
+    rows, lines = [], path.read_text(encoding="utf-8", errors="replace").splitlines()
     for number, line in enumerate(lines, start=1):
         try:
             row = json.loads(line)

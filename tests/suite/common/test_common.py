@@ -136,6 +136,9 @@ def test_a_cut_last_line_of_a_curve_is_left_out_and_another_damage_is_refused(tm
     path.write_text(text.replace('"iteration": 1}', "garbage"))
     with pytest.raises(ValueError, match=r"metrics\.jsonl: line 2 is damaged"):
         curve.read(tmp_path)
+    (tmp_path / curve.CURVE).write_bytes(b'{"iteration": 0}\n\xff\n{"iteration": 1}\n')
+    with pytest.raises(ValueError, match=r"metrics\.jsonl: line 2 is damaged"):
+        curve.read(tmp_path)
 
 
 def test_numpys_value_error_is_a_bug_and_one_raised_on_purpose_in_a_worker_process_a_message():
