@@ -94,9 +94,14 @@ class FlightLogError(ValueError):
         return type(self), (self.name, self.reason, self.column, self.row)
 
 
-def quoted(error: Exception) -> str:
-    """Return a reader's error in one line, without unprintable bytes of the damaged file."""
-    return f"{type(error).__name__}: {printable(str(error), keep='')}"
+def damaged(path: Path, kind: str, error: Exception) -> FlightLogError:
+    """Return the refusal of a file of a `kind` ("a ULog file") whose reader raised `error`.
+
+    It is one line, without unprintable bytes of the file.
+    """
+    reason = f"{type(error).__name__}: {printable(str(error), keep='')}"
+    text = f"{kind} that cannot be read ({reason}); copy it from the vehicle again"
+    return FlightLogError(path, text)
 
 
 def check_columns(

@@ -35,7 +35,7 @@ from eval.importers.formats.px4 import QUAD_X
 from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, from_euler
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Part, Recording, collect
-from eval.logs.columns import FlightLogError, quoted
+from eval.logs.columns import FlightLogError, damaged
 from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import CUT, Finding
 from eval.logs.faults.reading import DEG, RPM
@@ -165,8 +165,7 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
         texts = [str(row["Message"]) for row in table.pop("MSG")]
         messages = {name: _columns(rows, name) for name, rows in table.items() if rows}
     except Exception as error:  # a damaged file can cause any exception in the reader
-        reason = f"an ArduPilot log that cannot be read ({quoted(error)})"
-        raise FlightLogError(path, reason) from None
+        raise damaged(path, "an ArduPilot log", error) from None
     parameters = {name: value for name, value in parameters.items() if np.isfinite(value)}
     return messages, parameters, {"firmware": texts[0]} if texts else {}, findings
 

@@ -24,7 +24,7 @@ from eval.effects.interface import GRAVITY
 from eval.importers.formats.table import numbers
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
-from eval.logs.columns import FlightLogError, quoted
+from eval.logs.columns import FlightLogError, damaged
 from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.reading import DEG
@@ -268,15 +268,14 @@ def decode(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], list[Find
         if len(sessions) > 1:
             text = f"holds {len(sessions)} logs; the longest, number {number}, is read"
             findings.append(Finding("note", "file", text))
-        if damaged := int(parser.stats["total_corrupt_frames"]):
-            text = f"{damaged} frames are damaged (a slow memory card?) and left out"
+        if frames := int(parser.stats["total_corrupt_frames"]):
+            text = f"{frames} frames are damaged (a slow memory card?) and left out"
             findings.append(Finding("note", "file", text))
         table = np.array(parser.main_frames, dtype=np.float64).T
         columns = dict(zip(parser.main_field_names, table, strict=True))
         return _in_units(columns, parser.sys_config), parser.sys_config, findings
     except Exception as error:  # a damaged file can cause any exception in the decoder
-        reason = f"a Blackbox log that cannot be decoded ({quoted(error)})"
-        raise FlightLogError(path, reason) from None
+        raise damaged(path, "a Blackbox log", error) from None
 
 
 def _in_units(columns: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, np.ndarray]:

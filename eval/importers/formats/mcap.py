@@ -27,7 +27,7 @@ from eval.importers.mapping_file import map_file, motor_side_of
 from eval.importers.options import ImportOptions
 from eval.importers.rows import turn_axes
 from eval.importers.signals import Part, Recording, collect
-from eval.logs.columns import FlightLogError, quoted
+from eval.logs.columns import FlightLogError, damaged
 from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import Finding
 from eval.logs.files import read_head
@@ -134,7 +134,7 @@ def _messages(path: Path) -> dict[tuple[str, str], list[Stamped]]:
                 stamps = (_stamp(decoded), message.log_time)
                 recorded.setdefault((kind, channel.topic), []).append((*stamps, decoded))
     except Exception as error:
-        raise FlightLogError(path, f"an MCAP file that cannot be read ({quoted(error)})") from None
+        raise damaged(path, "an MCAP file", error) from None
     if not recorded:
         types = ", ".join(kind_of)
         raise FlightLogError(path, f"holds no ROS 2 message of {types}")

@@ -19,7 +19,7 @@ import numpy as np
 from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, rotate
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Part, Recording, collect
-from eval.logs.columns import FlightLogError, quoted
+from eval.logs.columns import FlightLogError, damaged
 from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import CUT, Finding
 from eval.logs.faults.reading import RPM
@@ -136,7 +136,7 @@ def _load(path: Path) -> Any:
             log.is_cut = file.is_cut
             return log
     except Exception as error:
-        raise FlightLogError(path, f"a ULog file that cannot be read ({quoted(error)})") from None
+        raise damaged(path, "a ULog file", error) from None
 
 
 def _columns(topic: Topic, names: str) -> np.ndarray | None:

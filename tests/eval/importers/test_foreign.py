@@ -295,7 +295,7 @@ def test_the_longest_log_of_a_raw_file_is_read(tmp_path, monkeypatch):
         import_log(both, None, PARTIAL)
     monkeypatch.undo()
     both.write_bytes(short.read_bytes()[:600])
-    with pytest.raises(FlightLogError, match="cannot be decoded"):
+    with pytest.raises(FlightLogError, match="a Blackbox log that cannot be read .*; copy it"):
         import_log(both, None, PARTIAL)
 
 
