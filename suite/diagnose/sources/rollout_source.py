@@ -183,7 +183,10 @@ class RolloutSource(Source):
         """
         evidence = of_rollouts(found.last)
         equations = disturbance_equations(evidence, evidence.trusted, found.estimate)
-        structure, wind = self._structure(found, equations, seed)
+        coarse = None
+        if self.coarser is not None:
+            coarse = disturbance_equations(evidence, self.coarser, found.estimate)
+        structure, wind = self._structure(found, equations, coarse, seed)
         details = {
             "shapes": [
                 {"label": shape.candidate.label, "gain": shape.gain, "p_value": shape.p_value}
@@ -192,7 +195,8 @@ class RolloutSource(Source):
             "coloured": structure.coloured,
         }
         share = remaining_share(*gaps) if found.named else 0.0
-        noise = Remaining(False, share, visible=least_visible(equations), details=details)
+        visible = least_visible(equations, coarse, self.coarser_share)
+        noise = Remaining(False, share, visible=visible, details=details)
         if not (structure.size.relevant(self.limits) or self.is_relevant(gaps[1])):
             return noise._replace(reason=TOO_SMALL)
         # Slow errors are those that a low polynomial over a window describes: noise has few.
@@ -212,15 +216,20 @@ class RolloutSource(Source):
         )
 
     def _structure(
-        self, found: SearchResult, equations: DisturbanceEquations, seed: int
+        self,
+        found: SearchResult,
+        equations: DisturbanceEquations,
+        coarse: DisturbanceEquations | None,
+        seed: int,
     ) -> tuple[ResidualStructure, TestedEffect | None]:
-        """Return the structure in the remaining error, and the wind that may cause it."""
+        """Return the structure in the remaining error, and the wind that may cause it.
+
+        `coarse` is that with coarser inputs, if any.
+        """
         evidence = of_rollouts(found.last)
         residual = residual_structure(equations, evidence.folds(found.last.block), seed)
         wind = self._wind(found, equations, residual)
-        is_significant = any(s.p_value <= self.limits.shape_p_value for s in residual.shapes)
-        if self.coarser is not None and is_significant:
-            coarse = disturbance_equations(evidence, self.coarser, found.estimate)
+        if coarse is not None:
             residual = beyond_model_error(residual, equations, coarse, self.coarser_share)
         return residual, wind
 

@@ -119,17 +119,28 @@ def beyond_model_error(
     return structure._replace(shapes=shapes, size=_size(equations, shapes, error_of))
 
 
-def least_visible(equations: DisturbanceEquations) -> EffectSize:
+def least_visible(
+    equations: DisturbanceEquations, coarse: DisturbanceEquations | None, share: float
+) -> EffectSize:
     """Return the smallest constant force and torque that the windows show, along the worst axis.
 
-    It is `Thresholds.visible_sigma` standard errors, if nothing else is fitted. The model's own
-    error comes on top. The drift is not computed.
+    It is `Thresholds.visible_sigma` standard errors, if nothing else is fitted, and the model's own
+    error (see `beyond_model_error`; none if `coarse` is None). The drift is not computed.
     """
     each_axis = np.tile(np.eye(6), (KNOTS, 1))
-    hessian, _ = _along(equations, np.broadcast_to(each_axis, (len(equations.unit), 6 * KNOTS, 6)))
-    variance = np.diag(np.linalg.inv(hessian.sum(axis=0) + 1e-9 * np.eye(6)))
-    size = equations.limits.visible_sigma * np.sqrt(variance).reshape(2, 3).max(axis=1)
-    return EffectSize(float(size[0]), float(size[1]), None)
+
+    def fitted(one: DisturbanceEquations) -> tuple[np.ndarray, np.ndarray]:
+        unit = np.broadcast_to(each_axis, (len(one.unit), 6 * KNOTS, 6))
+        hessian, gradient = _along(one, unit)
+        covariance = np.linalg.inv(hessian.sum(axis=0) + 1e-9 * np.eye(6))
+        return covariance @ gradient.sum(axis=0), np.sqrt(np.diag(covariance))
+
+    value, error = fitted(equations)
+    size = equations.limits.visible_sigma * error
+    if coarse is not None:
+        size += share * np.abs(fitted(coarse)[0] - value)
+    force, torque = size.reshape(2, 3).max(axis=1).tolist()
+    return EffectSize(force, torque, None)
 
 
 def _fit(equations: DisturbanceEquations, columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
