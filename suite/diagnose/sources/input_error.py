@@ -25,7 +25,7 @@ from suite.diagnose.thresholds import Thresholds
 WIDE = 100.0
 """Standard deviation of an unknown thrust [m/s^2] and torque [rad/s^2] that data determine."""
 FORCE, COMMANDED = slice(0, 3), slice(2, 6)
-"""Axes of `push_slopes`: those of a force, and those of the thrust and torque by commands."""
+"""Axes of a push: those of a force, and those of the thrust and torque by commands."""
 LEAST_PUSH = 1e-3
 """Lower limit of the error of thrust [m/s^2] and torque [rad/s^2]."""
 
@@ -61,23 +61,34 @@ class Share(NamedTuple):
 
 
 def share_between(
-    linear: Linearisation, difference: np.ndarray, force: np.ndarray, limits: Thresholds
+    linear: Linearisation, difference: np.ndarray, push: np.ndarray, limits: Thresholds
 ) -> Share:
     """Return the share of commands between the rows.
 
     The share is 0 if each command holds until the next row, and 1 if the mean of two commands acts
     half-way, as it does on average if the drone received others in between. This changes the
     residuals by the `difference` (W, N, 19). The share is fitted together with all parameters,
-    since a delay or a shifted clock moves commands in time as well; and with a force of any course
-    over the knots, along whose slopes `force` (W, N, 19, KNOTS, 3) are: it stands for forces that
-    no parameter describes. `linear` has slopes along all parameters and start numbers.
+    since a delay or a shifted clock moves commands in time as well; and with a force and a torque
+    of any course over the knots, since commands in between differ from the mean, and something may
+    act that no parameter describes. If the share is uncertain then, the torque is left out.
+    `linear` has slopes along all parameters and start numbers; for `push` see `push_slopes`.
     """
     noise = measured_noise(linear, limits)
-    linear = linear._replace(windows=with_input_error(linear.windows, force, WIDE))
     toward = -_zeroed(difference)[0][..., None]
-    whitening = make_whitening(linear, noise, limits)
     # Along all parameters and the share; slopes along start numbers are not needed any more.
     slope = np.concatenate([toward, linear.slope[..., : -linear.offset.shape[1]]], axis=-1)
+    share = _share(linear, slope, push, noise, limits)
+    if 3.0 * share.error > limits.held_share:
+        share = _share(linear, slope, push[..., FORCE], noise, limits)
+    return share
+
+
+def _share(
+    linear: Linearisation, slope: np.ndarray, push: np.ndarray, noise: Noise, limits: Thresholds
+) -> Share:
+    """Return the share; `slope` (W, N, 19, 1 + K) is along it and K parameters."""
+    linear = linear._replace(windows=with_input_error(linear.windows, push, WIDE))
+    whitening = make_whitening(linear, noise, limits)
     rows, _ = project_out(whitening, linear._replace(slope=slope), slope.shape[-1])
     rows = rows.reshape(-1, rows.shape[-1])
     rows = rows[:, np.r_[True, True, (rows[:, 2:] ** 2).sum(axis=0) > 0.0]]
@@ -86,7 +97,7 @@ def share_between(
     inverse = np.linalg.pinv(slope.T @ slope, rcond=1e-9, hermitian=True)
     best = inverse @ (slope.T @ residual)
     # What remains may be more than noise.
-    free = linear.offset.size + force[:, 0, 0].size + len(best)
+    free = linear.offset.size + push[:, 0, 0].size + len(best)
     freedom = int(np.asarray(linear.windows.valid).sum()) - free
     chi2 = float(((residual - slope @ best) ** 2).sum())
     scale = np.sqrt(max(chi2 / max(freedom, 1), 1.0))
@@ -94,14 +105,14 @@ def share_between(
     return Share(float(best[0] / size[0]), float(error))
 
 
-def push_slopes(model: RolloutModel, linear: Linearisation, axes: slice) -> np.ndarray:
-    """Return slopes (W, N, 19, KNOTS, K) along a force [m/s^2] and torque [rad/s^2] at a knot.
+def push_slopes(model: RolloutModel, linear: Linearisation) -> np.ndarray:
+    """Return slopes (W, N, 19, KNOTS, 6) along a push at a knot: force [m/s^2], torque [rad/s^2].
 
-    `axes` are K of the six: `FORCE` or `COMMANDED`.
+    `FORCE` and `COMMANDED` are parts of its axes.
     """
     at = Estimate(model.space.array("start"), linear.offset)
     slope = model.respond(at, linear.windows)[0].slope
-    return slope.reshape(*slope.shape[:3], KNOTS, 6)[..., axes]
+    return slope.reshape(*slope.shape[:3], KNOTS, 6)
 
 
 def with_input_error(

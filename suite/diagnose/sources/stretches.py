@@ -21,7 +21,6 @@ from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.sources.input_error import (
     COMMANDED,
-    FORCE,
     push_slopes,
     share_between,
     unknown_commands,
@@ -72,7 +71,7 @@ class Stretches:
         linear = self.model.linearise(start_estimate(self.model, windows), windows, [])
         if self.push_error is not None:
             error = np.sqrt((self.push_error**2).mean(axis=0))
-            push = push_slopes(self.model, linear, COMMANDED)
+            push = push_slopes(self.model, linear)[..., COMMANDED]
             windows = with_input_error(windows, push, error)
         flies = _finite(linear, self.limits)
         return take(windows, flies), int((~flies).sum())
@@ -124,8 +123,8 @@ def simulated_stretches(
         return made, warnings
     # The drone may have received commands between the rows.
     between = take(windows_of(between=True)[0], is_finite)
-    difference, force = _difference(model, linear, between), push_slopes(model, linear, FORCE)
-    share = share_between(made.linear, difference, force, made.limits)
+    difference, push = _difference(model, linear, between), push_slopes(model, linear)
+    share = share_between(made.linear, difference, push, made.limits)
     if share.are_lacking(limits):
         return _with_unknown_commands(made), [*warnings, LACKING]
     if not share.are_complete(limits):  # effects must be larger than what it changes
@@ -154,7 +153,7 @@ def _with_unknown(made: Stretches, other: FlightWindows) -> tuple[Stretches, Fli
 
     Those are the same windows with commands that are as likely.
     """
-    push = push_slopes(made.model, made.linear, COMMANDED)
+    push = push_slopes(made.model, made.linear)[..., COMMANDED]
     difference = _difference(made.model, made.linear, other)
     error, limits = unknown_commands(made.linear, push, difference, made.limits)
     windows, other = (with_input_error(w, push, error) for w in (made.linear.windows, other))

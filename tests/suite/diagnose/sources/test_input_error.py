@@ -39,8 +39,17 @@ def linearisation(rng, parameters):
     return Linearisation(residual, slope, np.zeros((WINDOWS, STARTS)), windows)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
-def test_the_share_of_commands_between_rows_is_fitted_next_to_effects_that_resemble_it(share):
+def slow_push(rng, axes):
+    """Return slopes along a push that changes slowly, and what one along some axes changes."""
+    course = rng.standard_normal((WINDOWS, CHANNELS, KNOTS, 6, 4))
+    slope = np.einsum("wckjp,np->wnckj", course, np.linspace(0, 1, ROWS)[:, None] ** range(4))
+    values = np.zeros((WINDOWS, KNOTS, 6))
+    values[..., axes] = 0.05 * rng.standard_normal(values[..., axes].shape)
+    return slope, np.einsum("wnckj,wkj->wnc", slope, values)
+
+
+@pytest.mark.parametrize(("share", "axes"), [(0.0, 3), (0.4, 3), (0.4, 6), (1.0, 6)])
+def test_the_share_of_commands_between_rows_is_fitted_next_to_what_resembles_it(share, axes):
     covered = []
     for seed in range(20):
         rng = np.random.default_rng([4, seed])
@@ -50,17 +59,25 @@ def test_the_share_of_commands_between_rows_is_fitted_next_to_effects_that_resem
             linear.slope[..., 0] + 0.3 * rng.standard_normal(linear.residual.shape)
         )
         effect = 0.05 * linear.slope[..., 0]
-        # A slow force that no parameter describes, and the commands also change the force.
-        course = rng.standard_normal((WINDOWS, CHANNELS, KNOTS, 3, 4))
-        force = np.einsum("wckjp,np->wnckj", course, np.linspace(0, 1, ROWS)[:, None] ** range(4))
-        other = np.einsum("wnckj,wkj->wnc", force, 0.05 * rng.standard_normal((WINDOWS, KNOTS, 3)))
+        # A slow force that no parameter describes, or a torque, too; commands also change these.
+        push, other = slow_push(rng, slice(axes))
         difference = difference + other
         residual = linear.residual - share * difference + effect + other
         linear = linear._replace(residual=residual)
-        found = share_between(linear, difference, force, THRESHOLDS)
+        found = share_between(linear, difference, push, THRESHOLDS)
         assert 0.0 < found.error < 0.17
         covered.append(abs(found.value - share) < 3.0 * found.error)
     assert sum(covered) >= 19
+
+
+def test_where_fast_changes_are_within_the_noise_slow_torques_show_the_share():
+    rng = np.random.default_rng(7)
+    linear = linearisation(rng, parameters=1)
+    push, torque = slow_push(rng, slice(3, 6))
+    difference = torque + 0.001 * rng.standard_normal(torque.shape)
+    linear = linear._replace(residual=linear.residual - 0.6 * difference)
+    found = share_between(linear, difference, push, THRESHOLDS)
+    assert found.error < 0.05 and abs(found.value - 0.6) < 3.0 * found.error
 
 
 def test_a_misfit_widens_the_interval_of_the_share():
@@ -70,8 +87,8 @@ def test_a_misfit_widens_the_interval_of_the_share():
     difference = 0.1 * rng.standard_normal(linear.residual.shape)
     time_s = linear.windows.row_s[..., None]
     drift = linear._replace(residual=linear.residual + 5.0 * time_s**2)
-    force = np.zeros((*difference.shape, KNOTS, 3))
-    known, unclear = (share_between(one, difference, force, THRESHOLDS) for one in (linear, drift))
+    push = np.zeros((*difference.shape, KNOTS, 6))
+    known, unclear = (share_between(one, difference, push, THRESHOLDS) for one in (linear, drift))
     assert unclear.error > 3.0 * known.error
 
 
