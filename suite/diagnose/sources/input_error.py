@@ -142,11 +142,11 @@ def unknown_commands(
     difference, _ = _zeroed(difference)
     linear = linear._replace(residual=difference)
 
-    def with_error(error: np.ndarray) -> tuple[Linearisation, Whitening]:
+    def with_error(error: np.ndarray | float) -> tuple[Linearisation, Whitening]:
         wide = linear._replace(windows=with_input_error(linear.windows, push, error))
         return wide, make_whitening(wide, noise, limits)
 
-    wide, whitening = with_error(np.full(4, WIDE))
+    wide, whitening = with_error(WIDE)
     _, change = project_out(whitening, wide)
     values = WIDE * change[:, -KNOTS * 4 :, 0].reshape(-1, KNOTS, 4)
     power = (values**2).mean(axis=1)

@@ -114,6 +114,11 @@ def test_the_error_of_unknown_commands_is_that_of_the_thrust_and_torque_which_th
     np.testing.assert_allclose(np.sqrt((error[1:] ** 2).mean(axis=0)), sizes, rtol=0.2)
     # What is faster than the knots is noise.
     np.testing.assert_allclose(limits.least_noise, 0.3, rtol=0.3)
-    columns = with_input_error(linear.windows, push, sizes).input_error
+    known = with_input_error(linear.windows, push, sizes)
+    columns = known.input_error
     np.testing.assert_allclose(columns[..., 5], 5.0 * push[..., 1, 1])
+    # Further errors come on top of known ones, such as those of uncertain times.
+    both = with_input_error(known, push[..., :3], WIDE).input_error
+    np.testing.assert_array_equal(both[..., : columns.shape[-1]], columns)
+    np.testing.assert_allclose(both[..., -1], WIDE * push[..., -1, 2])
     assert (error < WIDE).all()
