@@ -22,6 +22,7 @@ from suite.diagnose.report.charts import write_rollouts
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.sources.rollout_source import rollouts_of
+from suite.diagnose.sources.stretches import LACKING
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict.actuators import actuator_mismatches
 from tracks.common.files import check_no_input, plain, write_json, write_text
@@ -39,12 +40,6 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     """
     out = config.out
     refuse_other_run(out, config)
-    # A diagnosis is quick to repeat, and often repeated with one option more: no refusal.
-    if changes := changed_options(out, config):
-        console.note(
-            f"{out} holds a diagnosis with other options ({first_changes(changes)}), which will be "
-            "overwritten; give another --out to keep it"
-        )
     check_no_input(out / "vehicle.toml", [config.vehicle])
     vehicle = load_vehicle(config.vehicle)
     refuse_own_motion(vehicle)
@@ -52,6 +47,12 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     flights = read_checked(
         config.flights, CheckContext(vehicle), config.accept, config.reference, partial=True
     )
+    # A diagnosis is quick to repeat, and often repeated with one option more: no refusal.
+    if changes := changed_options(out, config):
+        console.note(
+            f"{out} holds a diagnosis with other options ({first_changes(changes)}), which will be "
+            "overwritten; give another --out to keep it"
+        )
     logs, slow = without_slow_rotors(flights.logs)
     before, slow_before = without_slow_rotors(flights.earlier)
     warnings = [*flights.warnings, *slow, *slow_before]
@@ -78,8 +79,9 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
         warnings += [f"{flag} needs rollouts, which these flights do not allow" for flag in unused]
     result["warnings"] = [*warnings, *result["warnings"]]
     if flown and rollouts:
-        mismatches = actuator_mismatches(flown.logs, flown.vehicle, flown.limits)
-        result["actuators"] = [mismatch._asdict() for mismatch in mismatches]
+        if LACKING not in result["warnings"]:  # rotor speeds follow all commands
+            mismatches = actuator_mismatches(flown.logs, flown.vehicle, flown.limits)
+            result["actuators"] = [mismatch._asdict() for mismatch in mismatches]
         if not config.no_recording:
             write_rollouts(out / "recording.rrd", flown, rollouts)
             files.add("recording.rrd")

@@ -23,6 +23,7 @@ from eval.worlds import nearest
 from eval.worlds.trial import TrialResult, TrialSpec
 from policies.policy import Policy
 from suite.common.console import Console, counted
+from suite.common.errors import WorkFailed
 from suite.common.provenance import engines, refuse_other_run, write_run_record
 from suite.common.stages import announce
 from suite.judging.content import PolicyContent
@@ -66,6 +67,7 @@ def collect(
 
     Raises:
         ValueError: if a setting of `collection` cannot be used, or `out` holds other flights.
+        WorkFailed: if no flight has a log; the list is written.
     """
     trial_set, manner = read_trial_set(collection), Manner(speed=collection.speed)
     refuse_equal_names({trial.track for trial in trial_set.trials})
@@ -117,6 +119,11 @@ def collect(
         console.say(
             f"{out / as_flown} describes these flights: give it to suite diagnose (--vehicle), "
             "which otherwise names the simulator's own effects"
+        )
+    if not logs:
+        raise WorkFailed(
+            f"no flight has a log; {out / LIST} tells how each ended: give another --policy, or a "
+            "lower --difficulty"
         )
     return {**listing, "out": str(out)}
 

@@ -13,6 +13,7 @@ import suite.judging.collect
 from eval.logs.flight_log import read_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.worlds import nearest
+from suite.common.errors import FAILED
 from tests.support.commands import answer, refused, run
 from tests.support.engines import STAND_IN
 from tests.support.judged_cells import cut_short
@@ -70,7 +71,7 @@ def test_flights_of_another_course_or_code_are_not_taken_for_its_own(
     args = (*args, "--sensors", sensors)
     for text in (COURSE, f"# in other words\n{COURSE}"):
         track.write_text(text)
-        assert run(*args) == 0
+        assert run(*args) == FAILED, "no log"
     with monkeypatch.context() as patch:
         patch.setattr(suite.judging.collect, "git_commit", lambda: "another")
         assert re.search("git_commit is '.*' there, 'another' here", refused(capfd, *args))
@@ -91,14 +92,15 @@ def test_flights_are_the_same_where_policy_and_vehicle_were_moved(
     shutil.copy(root / "eval" / "vehicles" / "racer5.toml", vehicle)
     line = "collect --track zigzag --difficulty 0 --trials 1 --policy"
     args = (line, pilots["diver"], "--out", out, "--vehicle")
-    assert run(*args, vehicle) == 0
+    assert run(*args, vehicle) == FAILED
     moved = vehicle.rename(tmp_path / "moved.toml")
     monkeypatch.setattr(eval.judging.judge, "fly", None)
     (row,) = json.loads((out / "flights.json").read_text())["flights"]
     assert row["file"] is None and row["time_s"] < 1, "a flight of under a second is no log"
     assert not list(out.glob("*.parquet"))
-    capfd.readouterr()
-    assert run(*args, moved) == 0, "nothing is flown again"
+    listed = out / "flights.json"
+    assert f"no flight has a log; {listed} tells how each ended" in capfd.readouterr().err
+    assert run(*args, moved) == FAILED, "nothing is flown again"
     assert "0 flights in mujoco" not in capfd.readouterr().err
     moved.write_text(moved.read_text().replace("mass = 0.75", "mass = 0.76"))
     assert run(*args, moved) == 2
@@ -112,7 +114,7 @@ def test_a_simulator_that_differs_from_the_vehicle_file_writes_the_file_that_des
     for simulator in ("rotorpy", "mujoco"):
         out = tmp_path / simulator
         line = "collect --track zigzag --difficulty 0 --trials 1 --simulator", simulator
-        assert run(*line, "--policy", pilots["diver"], "--out", out) == 0
+        assert run(*line, "--policy", pilots["diver"], "--out", out) == FAILED
         listed = json.loads((out / "flights.json").read_text())["as_flown"]
         path, said = out / "vehicle_as_flown.toml", capfd.readouterr().out
         assert path.exists() == (f"{path} describes these flights" in said) == bool(listed)
@@ -128,7 +130,7 @@ def test_a_simulator_that_differs_from_the_vehicle_file_writes_the_file_that_des
     assert log.about["vehicle"] == flown.name, "a diagnosis by this file has nothing to warn of"
     beyond = with_effects(flown, rotor_drag=(1.0,))
     monkeypatch.setattr("suite.judging.collect.nearest", lambda *_: beyond)
-    assert run(*line, "--policy", pilots["diver"], "--out", tmp_path / "beyond") == 0
+    assert run(*line, "--policy", pilots["diver"], "--out", tmp_path / "beyond") == FAILED
     assert "no vehicle file describes these flights: effects.rotor_drag" in capfd.readouterr().err
 
 
