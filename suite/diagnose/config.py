@@ -30,8 +30,8 @@ class Config(Command):
     """Input of the model: logged commands or measured rotor speeds. auto takes the
     commands, but measured speeds where the rate loop does not reproduce them or is a firmware's."""
     integrator: Advanced[Literal["auto", "continuous", "euler"]] = "auto"
-    """How the flights were made: continuous (every real flight) or euler (MuJoCo's steps of the
-    rate loop's period); auto reads it from the logs."""
+    """How the flights were made: continuous (every real flight) or euler (MuJoCo's steps, as long
+    as the logs state, else the rate loop's period); auto reads it from the logs."""
     relevance: Advanced[Annotated[tuple[float, float, float], Range(0.0, 1e6)]] = (
         THRESHOLDS.relevance
     )

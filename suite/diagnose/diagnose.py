@@ -56,7 +56,7 @@ def diagnose(
         by: the source of evidence, one of `SOURCES`, or "auto" for all that the logs allow.
         drive: what drives the model: "commands", "motors" (measured rotor speeds), or "auto".
         integrator: integration of the flights' bodies: "continuous" for real ones, "euler" for
-            MuJoCo's steps of the rate loop's period, or "auto" for the one that the logs state.
+            MuJoCo's steps, or "auto" for the one that the logs state.
         say: receives a line of progress for people.
         seed: seed of all random draws.
         limits: thresholds of every step.

@@ -30,10 +30,9 @@ MISFIT_TIMES_S = tuple(np.geomspace(0.03, 1.0, 6).tolist())
 """Tested correlation times if the whole residual counts as noise [s]."""
 DRIFTS = (0.0, *np.logspace(-3.0, 5.0, 17).tolist())
 """Tested sizes of the model's error: its variance after a second over the variance of the noise."""
-ESTIMATED = ("position", "attitude", "velocity")
-"""Groups of channels of one state estimator, which have the same T; other noise is white."""
 INTEGRATED = {"position": 2, "attitude": 2, "velocity": 1}
-"""Group of channels -> how many times a force or torque is integrated to give it; others: 0."""
+"""Group of channels -> how many times a force or torque is integrated to give it; others: 0. These
+are of one state estimator, so their noise has the same T; other noise is white."""
 LEAST_ROWS = 30
 """Smallest number of rows of a window from which T is estimated."""
 
@@ -90,7 +89,7 @@ def measured_noise(linear: Linearisation, limits: Thresholds = THRESHOLDS) -> No
     """Estimate the measurement noise from the residuals of windows."""
     linear, _ = _without_start(linear, limits)
     sigma = noise_of(linear.residual, linear.windows, limits=limits)
-    groups = _stretches(linear, sigma, ESTIMATED, limits)
+    groups = _stretches(linear, sigma, INTEGRATED, limits)
     fits = {name: _fit_by_time(stretches, limits) for name, stretches in groups.items()}
     gains = np.sum([[gain for _, gain in by_time] for by_time in fits.values()], axis=0)
     coloured = {}

@@ -156,7 +156,8 @@ def cut(
         only: numbers of the flights that are cut; all if not given.
         since_s: earliest start of a window after its log's start [s].
         like: windows of an earlier call, to whose size these are padded.
-        stride: factor on the length of the steps; only every `stride`-th rotor speed is used.
+        stride: factor on the length of the steps, but of Euler's; only every `stride`-th rotor
+            speed is used.
         between: half-way from one command to the next, their mean acts as another command.
         jitter: the time of each command is shifted by chance, by the logs' `command_jitter_s`.
     """
@@ -206,6 +207,11 @@ def command_jitter_s(log: FlightLog) -> float:
     if isinstance(stated, bool) or not isinstance(stated, int | float) or not stated > 0.0:
         return 0.0
     return float(stated)
+
+
+def has_times_of_commands(log: FlightLog) -> bool:
+    """Return whether `log` has every command at the time at which it was sent, as it states."""
+    return "command_jitter_s" in log.about
 
 
 def take(data: Any, chosen: Array) -> Any:
@@ -276,7 +282,7 @@ def _input_of(
     first_s, last_s = begin_s - BURN_IN_S - HISTORY_S - 1e-9, begin_s + length_s + 1e-9
     used = slice(max(np.searchsorted(time_s, first_s) - 1, 0), np.searchsorted(time_s, last_s) + 1)
     time_s, command = time_s[used] - begin_s, command[used]
-    if "command_jitter_s" not in log.about:  # else each command has the time at which it was sent
+    if not has_times_of_commands(log):
         time_s, command = with_lost_rows(time_s, command)
     if between:
         time_s, command = (np.repeat(values, 2, axis=0)[:-1] for values in (time_s, command))

@@ -155,3 +155,15 @@ def without_nuisance(
     free, free_slope = np.zeros((count, 0)), np.zeros((count, 0, slope.shape[2]))
     residual, slope = arranged(residual), arranged(slope)
     return Block(residual, slope, tuple(along), flight, start_s, free, free_slope)
+
+
+def less_nuisance(nuisance: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return `values` (N, C, K) with independent noise again, to which nuisance parameters add.
+
+    Nuisance parameters of unit variance change values of unit noise by `nuisance` (N, C, L), so
+    their covariance is `1 + nuisance nuisance'`. Returned is its inverse root times the values.
+    """
+    flat, width = values.reshape(-1, values.shape[-1]), nuisance.shape[-1]
+    basis, size, _ = np.linalg.svd(nuisance.reshape(-1, width), full_matrices=False)
+    shrinkage = 1.0 / np.sqrt(1.0 + size**2) - 1.0
+    return (flat + basis @ (shrinkage[:, None] * (basis.T @ flat))).reshape(values.shape)

@@ -163,6 +163,6 @@ def corrected_p_values(
 
 
 def _orthonormal_basis(columns: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (M, R) of `columns` (M, K), each of unit length or 0."""
+    """Return an orthonormal basis (M, R) of `columns` (M, K), each of unit length at most."""
     directions, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     return directions[:, sizes > 1e-6]

@@ -158,10 +158,6 @@ class Evaluation(NamedTuple):
         equations = self.block.equations.along_numbers(indices)
         return intervals95(equations, float(self.evidence.misfit_is_noise))
 
-    def half_widths(self, indices: Sequence[int]) -> np.ndarray:
-        """Return the half-widths (K,) of the 95 % intervals of the parameters at `indices`."""
-        return self.intervals(indices).half_width
-
 
 def validation_groups(flight: np.ndarray) -> np.ndarray:
     """Return the cross-validation group (M,) of each row: its flight, or third of a single one."""

@@ -183,7 +183,7 @@ def rollout_evidence(
     noise: Noise | None = None,
     along: Sequence[int] | None = None,
 ) -> tuple[RolloutEvidence, Block]:
-    """Return the evidence of `windows`, and its block where it was linearised.
+    """Return the evidence of linearised windows, and its block there.
 
     The slopes of `linear` are along the parameters `along` (default: all), then along the start
     numbers. If no `noise` is given, it is estimated from `linear`.

@@ -26,7 +26,7 @@ from eval.quadrotor.rotors import steady
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.steps import LONGEST_S
 from suite.diagnose.data.view import FlightRows
-from suite.diagnose.estimate.block import Block, without_nuisance
+from suite.diagnose.estimate.block import Block, less_nuisance, without_nuisance
 from suite.diagnose.estimate.gauss_newton import intervals95
 from suite.diagnose.estimate.parameters import ParameterLayout, effects_at, make_space
 from suite.diagnose.evidence.linearise import VehicleArrays, arrays_of, linearised, slopes_along
@@ -152,53 +152,28 @@ def weights_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> Weights:
 
 def whitened(data: ViewData, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
     """Return residual (M, 3) and slope (M, 3, P) of `data` in units of independent noise."""
-    residual, slope = data.residual.copy(), data.slope.copy()
     # Standard deviation of independent noise with the same effect as the autocorrelated one.
     unit = weights.scatter * np.sqrt(weights.memory)
+    residual, slope = data.residual / unit, data.slope / unit[:, None]
     # Subtract a share of each flight's mean, since its trim is random.
     for number in np.unique(data.flight):
         rows = data.flight == number
-        variance = weights.scatter**2 * weights.memory / rows.sum()
+        variance = unit**2 / rows.sum()
         share = 1.0 - np.sqrt(variance / (variance + weights.trim**2))
-        residual[rows] -= share * residual[rows].mean(axis=0)
-        slope[rows] -= share[:, None] * slope[rows].mean(axis=0)
+        values = np.concatenate([residual[rows, :, None], slope[rows]], axis=2)
+        values -= share[:, None] * values.mean(axis=0)
         if data.pose_slope.any():
-            pose_slope = data.pose_slope[rows]
-            pose_slope = pose_slope - share[:, None] * pose_slope.mean(axis=0)
-            residual[rows], slope[rows] = _pose_whitened(
-                residual[rows], slope[rows], pose_slope, unit
-            )
+            pose_slope = data.pose_slope[rows] / unit[:, None]
+            values = less_nuisance(pose_slope - share[:, None] * pose_slope.mean(axis=0), values)
+        residual[rows], slope[rows] = values[..., 0], values[..., 1:]
     if weights.base is not None:
         # Subtract a share of the mean of all flights. Where the trim is infinite the share is 0, as
         # the flights' means hold no information.
-        variance = weights.scatter**2 * weights.memory + weights.trim**2
+        variance = unit**2 + weights.trim**2
         share = 1.0 - 1.0 / np.sqrt(1.0 + len(residual) * weights.base**2 / variance)
         residual -= share * residual.mean(axis=0)
         slope -= share[:, None] * slope.mean(axis=0)
-    return residual / unit, slope / unit[:, None]
-
-
-def _pose_whitened(
-    residual: np.ndarray, slope: np.ndarray, pose_slope: np.ndarray, unit: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return residual (M, 3) and slope (M, 3, P) of one flight, whitened by errors of its pose.
-
-    These add the covariance `pose_slope pose_slope'` (M, 3, L) to the noise. So the values are
-    multiplied by the inverse root of `1 + pose_slope pose_slope'`, in units of the noise (3,).
-    """
-    count = residual.size
-    basis, size, _ = np.linalg.svd(
-        (pose_slope / unit[:, None]).reshape(count, -1), full_matrices=False
-    )
-    shrinkage = 1.0 / np.sqrt(1.0 + size**2) - 1.0
-
-    def shrunk(values: np.ndarray) -> np.ndarray:
-        scale = unit.reshape(3, *[1] * (values.ndim - 2))
-        flat = (values / scale).reshape(count, -1)
-        flat = flat + basis @ (shrinkage[:, None] * (basis.T @ flat))
-        return flat.reshape(values.shape) * scale
-
-    return shrunk(residual), shrunk(slope)
+    return residual, slope
 
 
 def block_of(

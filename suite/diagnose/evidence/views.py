@@ -173,8 +173,7 @@ def view_candidates(among: Sequence[Candidate], block: Block) -> list[Candidate]
         effect = EFFECTS[candidate.name]
         return (
             (bool(acts[list(candidate.indices)].any()) or candidate in acting_through_others)
-            and effect.measure is None
-            and effect.late is None
+            and effect.in_flight
             and "command" not in effect.needs
         )
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from suite.diagnose.data.steps import torque_between_rows
 from suite.diagnose.data.view import FlightRows, WeakForm
+from suite.diagnose.estimate.block import less_nuisance
 from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.identify.drive import DRIVES, Accelerations, DrivenVehicle
 from suite.diagnose.identify.fit import (
@@ -30,7 +31,6 @@ from suite.diagnose.identify.fit import (
     Unknown,
     fit,
     rms_of,
-    unexplained,
 )
 from suite.diagnose.identify.grid import (
     IMU_ACC,
@@ -185,7 +185,7 @@ def _without_motion(flights: Sequence[Windows]) -> list[str]:
         signals = (one.rows.vel_b, one.flight.signals[VELOCITY_NOISE])
         values = np.concatenate([one.means(signal) for signal in signals], axis=2)
         values, slopes = ((v - v.mean(axis=0))[:, :2] for v in (values, one.nuisance))
-        values = unexplained(slopes, values, np.full(values.shape[:2], FORCE_ERROR**-2))
+        values = less_nuisance(slopes / FORCE_ERROR, values)
         total += (values[..., 0] ** 2).sum(axis=0)
         error += (values[..., 1:] ** 2).mean(axis=-1).sum(axis=0)
     return [f"drag_{axis}" for k, axis in enumerate("xy") if error[k] > MOST_ERROR * total[k]]

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eval.judging.statistics import Interval
-from suite.diagnose.estimate.block import Block, Estimate, without_nuisance
+from suite.diagnose.estimate.block import Block, Estimate, less_nuisance, without_nuisance
 from suite.diagnose.estimate.gauss_newton import Z95, intervals95
 from suite.diagnose.estimate.parameters import FittedNumber, ParameterSpace
 from suite.diagnose.evidence.evidence import Evaluation, Evidence
@@ -209,10 +209,11 @@ class ResidualEvidence(Evidence):
             columns = [row.value, *(-difference[flight] for difference in differences)]
             table = np.nan_to_num(np.stack(columns, axis=-1))
             centred = _without_mean(table, weight, row.offset)
+            root = np.sqrt(weight)[..., None]
+            white = root * centred
             if row.nuisance is not None:
-                slopes_of_it = _without_mean(row.nuisance, weight, row.offset)
-                centred = unexplained(slopes_of_it, centred, weight)
-            white = np.sqrt(weight)[..., None] * centred
+                nuisance = root * _without_mean(row.nuisance, weight, row.offset)
+                white = less_nuisance(nuisance, white)
             values.append(white[..., 0])
             slopes.append(white[..., 1:])
             blocks.append(np.stack([np.full(len(row.block), flight), row.block]))
@@ -300,19 +301,6 @@ def _without_mean(values: np.ndarray, weight: np.ndarray, offset: np.ndarray) ->
     total = np.maximum(weight.sum(axis=0), LEAST_WEIGHT)[:, None]
     mean = (weight[..., None] * values).sum(axis=0) / total
     return values - np.where(offset[:, None], mean, 0.0)
-
-
-def unexplained(nuisance: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return values (N, C, K) minus what nuisance parameters (N, C, L) of unit variance explain.
-
-    `weight` (N, C) is the inverse of the residuals' variance.
-    """
-    root = np.sqrt(weight)[..., None]
-    design = (root * nuisance).reshape(-1, nuisance.shape[2])
-    target = (root * values).reshape(-1, values.shape[2])
-    normal = design.T @ design + np.eye(design.shape[1])
-    explained = np.linalg.solve(normal, design.T @ target)
-    return values - np.tensordot(nuisance, explained, axes=1)
 
 
 def _covariance(

@@ -113,12 +113,12 @@ def answer(result: Mapping[str, Any]) -> str:
         words.append(other)
         verdict = {"named": "no_gap", "partly": "unknown"}[verdict]
     sentence, rest = (CHANGES if is_change else VERDICTS)[verdict], remaining_words(result)
-    sentence = ONLY_VIEWS if _is_far(result, verdict) else sentence
+    is_far = FAR in result.get("warnings", ())
+    sentence = ONLY_VIEWS if is_far and verdict == "no_gap" else sentence
     if rest and (verdict == "named" or (verdict == "no_gap" and not is_change)):
         agreed = sentence.removesuffix(".").removesuffix(" within the measurement noise")
         sentence = f"{agreed}, except for {rest}."
-    is_far = verdict in ("no_gap", "named") and FAR in result.get("warnings", ())
-    words += [sentence, *([STAYS_FAR] if is_far else [])]
+    words += [sentence, *([STAYS_FAR] if is_far and verdict in ("no_gap", "named") else [])]
     for is_large, reason in NEGLIGIBLE.items() if verdict == "no_gap" else ():
         names = [one["name"] for one in result["negligible"] if one["relevant"] == is_large]
         words += [f"{reason}: {', '.join(names)}."] * bool(names)
@@ -154,11 +154,6 @@ def _explains_instead(result: Mapping[str, Any]) -> str:
         return ""
     is_lower = any(offset["after"] < offset["before"] for offset in gap["offset"].values())
     return ONLY_OFFSET if is_lower else ""
-
-
-def _is_far(result: Mapping[str, Any], verdict: str) -> bool:
-    """Return whether there is no gap in force and torque, but simulated flights diverge."""
-    return verdict == "no_gap" and FAR in result.get("warnings", ())
 
 
 def remaining_words(result: Mapping[str, Any]) -> str:
@@ -197,7 +192,7 @@ def next_steps(result: Mapping[str, Any]) -> list[str]:
     """Return advice on what to do after the verdict of a diagnosis.json, most useful first."""
     verdict, is_change = result["verdict"], bool(result["reference"])
     search_for = _search_for(result["unexplained"])
-    if _is_far(result, verdict):
+    if verdict == "no_gap" and FAR in result.get("warnings", ()):
         return [CHECK, "Then estimate the rate loop with suite identify, and repeat this."]
     if verdict == "no_gap":
         if is_change:

@@ -150,19 +150,24 @@ def rotor_gain(task: ViewEvidence) -> np.ndarray:
     return np.sqrt((slope**2).sum(axis=1))
 
 
+def deviations(flights: ViewEvidence, theta: np.ndarray) -> np.ndarray:
+    """Return the mean residual (F, 3) of each of F flights, less that of all flights."""
+    data = flights.residuals(theta)
+    means = means_of(data.residual, data.flight)
+    return means - means.mean(axis=0)
+
+
 def rotor_spread(sets: Sequence[ViewEvidence]) -> RotorSpread:
     """Return the spread of flights within each of `sets` (the reference and later flights)."""
     square: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(3))
     freedom: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(3, int))
     for task in sets:
-        data, gain = task.residuals(task.start.theta), rotor_gain(task)
-        means = means_of(data.residual, data.flight)
+        change, gain = deviations(task, task.start.theta), rotor_gain(task)
         axes = gain > task.limits.least_rotor_gain * gain.max()
         if task.view.in_world:
             axes &= np.arange(3) == 2  # rotors only push along body z
-        deviation = (means - means.mean(axis=0)) / np.where(axes, gain, np.inf)
-        square[task.view.name] += (deviation**2).sum(axis=0)
-        freedom[task.view.name] += axes * (len(means) - 1)
+        square[task.view.name] += ((change / np.where(axes, gain, np.inf)) ** 2).sum(axis=0)
+        freedom[task.view.name] += axes * (len(change) - 1)
     count = int(sum(by_axis.sum() for by_axis in freedom.values()))
     share = float(np.sqrt(sum(by_axis.sum() for by_axis in square.values()) / max(count, 1)))
     limits = sets[0].limits
@@ -287,7 +292,7 @@ def search_motion_change(
 ) -> SearchResult | None:
     """Return the candidate that has changed since `reference`; None where none is significant.
 
-    Its parameters are totals. Each set needs two flights; `views` are those that are searched.
+    Its parameters are totals. Each set needs two flights; `views` is the number that is searched.
     """
     start, limits, space = fit_balance(reference), task.limits, task.space
     sets = [within_flights(one.residuals(start, None)) for one in (reference, task)]

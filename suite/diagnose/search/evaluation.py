@@ -164,7 +164,7 @@ class SearchResult:
 
     def half_widths(self) -> np.ndarray:
         """Return the half-widths (K,) of the 95 % intervals of the named effects' parameters."""
-        return self.judged.half_widths(self.indices)
+        return self.judged.intervals(self.indices).half_width
 
     def refitted(self, named: Sequence[NamedEffect]) -> SearchResult:
         """Return this result with only the effects `named`, fitted again."""

@@ -97,14 +97,13 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
             raise FlightLogError(log.name, reason, GROUPS[group][0])
     # Times without take-off and landing. The velocity is also needed before `grid`, see `lean_w`.
     step_s = float(np.median(np.diff(log.time_s)))
+    least_s = LEAST_S + 2 * SETTLES_S
+    if log.duration_s < least_s:
+        reason = f"{log.duration_s:.1f} s of flight; allowed are {least_s:g} s or more"
+        raise FlightLogError(log.name, reason)
     from_start = np.arange(log.time_s[0], log.time_s[-1] + 0.5 * step_s, step_s)
     from_start = from_start[from_start <= from_start[-1] - SETTLES_S]
     grid = from_start[from_start >= from_start[0] + SETTLES_S]
-    if len(grid) < LEAST_S / step_s:
-        reason = (
-            f"{log.duration_s:.1f} s of flight; allowed are {LEAST_S + 2 * SETTLES_S:g} s or more"
-        )
-        raise FlightLogError(log.name, reason)
     vel_w = interpolate(from_start - late_s, log.time_s, log.vel_w, holes=True)
     rot_w = attitude_at(from_start - late_s, log.time_s, log.quat_wxyz)
     lean_w = cross(vel_w, rot_w[..., 2]) / GRAVITY
@@ -124,7 +123,8 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
             error = to_local(rot_w, error) if part == "velocity" else error
         value[:, 3 * k : 3 * k + 3] = error
     # The time derivative of the reference is velocity, acceleration and body rates.
-    acc_b = to_local(rot_w, _differentiated(vel_w, step_s))
+    acc_w = savgol_filter(vel_w, SLOPE_ROWS, 2, deriv=1, delta=step_s, axis=0, mode="nearest")
+    acc_b = to_local(rot_w, acc_w)
     rate_b = interpolate(then_s, log.time_s, log.rate_b, holes=True)
     slope = np.concatenate([vel_w, acc_b, rate_b], axis=1)
     return Errors(step_s, value, slope, to_local(rot_w, vel_w), rot_w, lean_w)
@@ -147,14 +147,6 @@ def _estimate(log: FlightLog, group: str) -> np.ndarray | None:
         return None
     values = np.stack([np.asarray(column, float) for column in columns], axis=1)
     return values if np.isfinite(values).all(axis=1).sum() > 1 else None
-
-
-def _differentiated(values: np.ndarray, step_s: float) -> np.ndarray:
-    """Return the time derivative of `values` (T, C), by parabolas; NaN near missing values."""
-    if len(values) < SLOPE_ROWS:
-        return np.full_like(values, np.nan)
-    slope = savgol_filter(values, SLOPE_ROWS, 2, deriv=1, delta=step_s, axis=0, mode="nearest")
-    return np.asarray(slope)
 
 
 class Systematic(NamedTuple):

@@ -17,6 +17,7 @@ from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.estimate.parameters import Candidate, effects_in, indices_of
 from suite.diagnose.search.evaluation import NamedEffect, SearchResult
+from suite.diagnose.search.search import settled
 from suite.diagnose.sources.source import TOGETHER, TOO_SMALL, Finding, Source
 from suite.diagnose.verdict.gap import EffectSize, Gap
 from tracks.common.figures import rounded
@@ -56,7 +57,8 @@ def examine(
     left_out = {c.name for c in found.candidates} - {c.name for c in tested.found.candidates}
     if left_out and tested.found.named and not source.names_small:
         # Without them, another candidate may explain the flights better than one of the names.
-        again = source.settled(tested.found, left_out, say, seed)
+        among = [c for c in source.candidates if not left_out & {one.name for one in c.singles}]
+        again = settled(tested.found, among, say, seed)
         tested = tested.followed_by(_tested(source, again, before), source.small_explains)
     found, after, sizes = tested.found, tested.after, tested.sizes
     warnings += tested.warnings
@@ -304,7 +306,7 @@ def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate,
             continue
         fitted = sorted({*by.indices, *indices})
         best = evidence.fitted(by.estimate, fitted)
-        half = best.half_widths(fitted)
+        half = best.intervals(fitted).half_width
         for index in indices:
             value, other = found.estimate.theta[index], best.at.theta[index]
             other_half = float(half[fitted.index(index)])

@@ -11,7 +11,7 @@ Arrays of parameters have P entries: all parameters of all effects in the catalo
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
 from suite.diagnose.evidence.evidence import Evaluation
 from suite.diagnose.search.evaluation import NamedEffect, SearchResult
-from suite.diagnose.search.search import search, settled
+from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.actuators import TestedEffect
 from suite.diagnose.verdict.disturbances import Swing
@@ -148,13 +148,6 @@ class Source(ABC):
         """Search for the effects that explain the fitted flights."""
         return search(self.begin, self.candidates, say, seed)
 
-    def settled(
-        self, found: SearchResult, left_out: Collection[str], say: Callable[[str], None], seed: int
-    ) -> SearchResult:
-        """Test the names of `found` again, without the candidates of the `left_out` effects."""
-        among = [c for c in self.candidates if not any(one.name in left_out for one in c.singles)]
-        return settled(found, among, say, seed)
-
     def is_worse(self, before: Gap, after: Gap) -> bool:
         """Return whether held-out flights contradict effects that change the gap to `after`.
 
@@ -238,7 +231,7 @@ class SourceSet:
     """The sources of evidence that flights allow."""
 
     sources: tuple[Source, ...]
-    """None if the flights allow none, for the reason in `warnings`."""
+    """Empty if the flights allow none, for the reason in `warnings`."""
     held_out: Sequence[str]
     """Names of held-out flights or stretches."""
     driven_by: str

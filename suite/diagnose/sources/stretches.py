@@ -6,17 +6,22 @@ the time steps cause an error, which is estimated by simulations with other or c
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from eval.logs.flight_log import FlightLog
 from suite.diagnose.data.noise import Linearisation
 from suite.diagnose.data.sampling import own_spacing_s
 from suite.diagnose.data.steps import rows_show_torque
-from suite.diagnose.data.windows import FlightWindows, command_jitter_s, cut, take
+from suite.diagnose.data.windows import (
+    FlightWindows,
+    command_jitter_s,
+    cut,
+    has_times_of_commands,
+    take,
+)
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.sources.input_error import (
@@ -43,10 +48,8 @@ LACKING = (
 class Stretches:
     """Stretches of flights, and their simulation with the nominal vehicle."""
 
-    logs: Sequence[FlightLog]
-    """The flights."""
     cut: partial[tuple[FlightWindows | None, list[str]]]
-    """`cut` of `data/windows.py` with these flights and the vehicle."""
+    """`cut` of `data/windows.py` with the flights and the vehicle."""
     model: RolloutModel
     linear: Linearisation
     """Linearisation along all parameters and start numbers, of stretches that do not diverge."""
@@ -102,7 +105,7 @@ def simulated_stretches(
     if not is_finite.all():
         diverged = int((~is_finite).sum())
         warnings.append(f"{diverged} stretches left out: the model's flight from there diverges")
-    made = Stretches(logs, windows_of, model, linear, limits)
+    made = Stretches(windows_of, model, linear, limits)
     # Estimate the model's numerical error from the same stretches with steps of twice the length.
     # Flights that a simulator flew with Euler steps, driven by commands, have no such error.
     if integrator != "euler" or rotor_input:
@@ -117,7 +120,11 @@ def simulated_stretches(
     if not rotor_input and any(map(command_jitter_s, logs)):
         jittered = take(windows_of(jitter=True)[0], is_finite)
         made, _ = _with_unknown(made, jittered)
-    commands = [(log.time_s, log.rate_cmd_b) for log in logs if log.rate_cmd_b is not None]
+    commands = [
+        (log.time_s, log.rate_cmd_b)
+        for log in logs
+        if log.rate_cmd_b is not None and not has_times_of_commands(log)
+    ]
     are_slow = any(own_spacing_s(*command) > limits.command_spacing_s for command in commands)
     if rotor_input or not are_slow:
         return made, warnings
@@ -137,14 +144,15 @@ def _with_unknown_commands(made: Stretches) -> Stretches:
 
     Rotor speeds follow the unknown commands, so they are not compared.
     """
-    logs = [replace(log, rotor_speed=None) for log in made.logs]
-    held_of = partial(cut, logs, *made.cut.args[1:], **made.cut.keywords)
+    logs, *options = made.cut.args
+    logs = [replace(log, rotor_speed=None) for log in logs]
+    held_of = partial(cut, logs, *options, **made.cut.keywords)
     windows_of = partial(held_of, between=True)
     windows, _ = windows_of()
     assert windows is not None  # the same flights had some before
     linear, is_finite = _simulated(made.model, windows, made.limits)
     held = take(held_of(like=windows)[0], is_finite)
-    made, held = _with_unknown(replace(made, logs=logs, cut=windows_of, linear=linear), held)
+    made, held = _with_unknown(replace(made, cut=windows_of, linear=linear), held)
     return replace(made, coarser=held, coarser_share=2.0)
 
 

@@ -21,11 +21,12 @@ from suite.diagnose.data.inertial import UNSEEN, is_inertial
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.estimate.parameters import Candidate, candidates
-from suite.diagnose.evidence.view_means import ForceModel, means_of
+from suite.diagnose.evidence.view_means import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.search.change import (
     RotorSpread,
     change_evidence,
+    deviations,
     less_reference_residual,
     rotor_spread,
     search_motion_change,
@@ -168,7 +169,7 @@ class MeansSource(ViewSource):
     def series(self, found: SearchResult) -> Series:
         """Return the means of all flights along the axis that the named effects change most."""
         start, end = found.start.theta, found.estimate.theta
-        earlier = _deviations(self.reference, start)
+        earlier = deviations(self.reference, start)
         change, left = (self.held.residuals(theta).residual for theta in (start, end))
         size = np.abs(change - left if found.named else change).mean(axis=0)
         axis = max(self.view.axes, key=lambda k: float(size[k]))
@@ -226,10 +227,10 @@ def since_reference(
     )
     means = replace(less_reference_residual(reference, theta, held.flights), means=True)
     # The floor is the standard deviation of the mean of a flight of an unchanged vehicle.
-    deviations = _deviations(reference, theta)
+    usual = deviations(reference, theta)
     shared |= {
         "measure": MEANS_MEASURE.format(about=shared["about"], unit=shared["unit"]),
-        "floor": deviations.std(axis=0, ddof=1) * np.sqrt(1.0 + 1.0 / len(deviations)),
+        "floor": usual.std(axis=0, ddof=1) * np.sqrt(1.0 + 1.0 / len(usual)),
     }
     return MeansSource(
         candidates=view_candidates(allowed, begin.block),
@@ -237,13 +238,6 @@ def since_reference(
         fallback=None if means_only else in_motion,
         **shared,
     )
-
-
-def _deviations(reference: ViewEvidence, theta: np.ndarray) -> np.ndarray:
-    """Return the mean residual (F, 3) of each of F flights, less that of all flights."""
-    data = reference.residuals(theta)
-    means = means_of(data.residual, data.flight)
-    return means - means.mean(axis=0)
 
 
 def references_of(given: DiagnosisInput, flights: ViewFlights) -> ViewFlights | None:

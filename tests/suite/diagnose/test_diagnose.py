@@ -320,6 +320,10 @@ def test_the_noise_counts_as_certain_only_if_no_command_is_lacking(monkeypatch):
     assert lacks and source.coarser is not None and source.coarser_share == 2.0
     assert sum(source.limits.least_noise) > sum(limits.least_noise)
     assert source.held.input_error.any(axis=(1, 2)).all() and source.cut.keywords["between"]
+    stated = [replace(log, about={**log.about, "command_jitter_s": 0.0}) for log in sparse]
+    with monkeypatch.context() as patch:
+        patch.setattr(stretches, "share_between", None)
+        assert not source_of(stated)[1], "a log with the times of commands has all of them"
     source, lacks = source_of(complete)
     assert not lacks and source.coarser is None and source.limits == limits
 

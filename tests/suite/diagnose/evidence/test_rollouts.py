@@ -9,7 +9,7 @@ import pytest
 
 from eval.flights.simulate import SENSORS, fly, log_of
 from suite.diagnose.data.noise import (
-    ESTIMATED,
+    INTEGRATED,
     Linearisation,
     Noise,
     colour_filter,
@@ -211,7 +211,7 @@ def test_groups_of_one_estimator_have_one_correlation_time(windows):
     pose = SLICES["position"]
     weak[..., pose] = noise_like(windows, 0.9, 0.05, rng, "position")[..., pose]
     coloured = measured(weak, windows).coloured
-    assert set(coloured) == set(ESTIMATED)
+    assert set(coloured) == set(INTEGRATED)
     assert coloured["velocity"][1] == coloured["position"][1] == pytest.approx(0.05, rel=0.4)
     assert coloured["velocity"][0] < 0.1
 

@@ -52,6 +52,20 @@ def test_intervals_hold_the_truth_nineteen_times_in_twenty():
     assert 0.90 <= np.mean(inside) <= 0.99 and max(one.half_width[0] for one in found) < 0.03
 
 
+def test_nuisance_parameters_weigh_as_in_generalised_least_squares():
+    rng, count, noise = np.random.default_rng(0), 40, 0.5
+    x, y = rng.normal(size=(2, count))
+    nuisance = rng.normal(size=(count, 1, 3))
+
+    def residuals(numbers):
+        return [Rows((y - numbers["slope"] * x)[:, None], np.arange(count), NONE, nuisance)]
+
+    found = fit(residuals, [SLOPE], noise=np.array([noise]))
+    covariance = noise**2 * np.eye(count) + nuisance[:, 0] @ nuisance[:, 0].T
+    weighted = np.linalg.solve(covariance, x)
+    assert found.value[0] == pytest.approx(weighted @ y / (weighted @ x), rel=1e-6)
+
+
 def test_what_is_known_widens_what_depends_on_it():
     """`y = (slope + other) x`: the slope is off by as much as the other, and by no less."""
     residuals = flights([2.0] * 4)

@@ -189,7 +189,9 @@ def test_a_log_without_an_estimate_or_a_reference_is_refused(tmp_path):
     log = short()[0]
     bare = replace(log, extra={})
     lost = replace(log, pos_w=np.full_like(log.pos_w, np.nan), about={"partial": ["pos"]})
+    brief = flown([1], long_s=1.5, delay_s=0.0)[0]
     for one, words in (
+        (brief, r"bare.parquet: 1.5 s of flight; allowed are 12 s or more"),
         (bare, r"bare.parquet: no on-board estimate.*est_vel_x.*--source estimate is left out"),
         (lost, "column pos_x: no reference for the estimate"),
     ):
