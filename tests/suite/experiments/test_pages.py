@@ -195,10 +195,13 @@ def test_the_complete_recipe_and_other_ways_to_learn():
     assert f"| {passed}, {race['v_max']:.1f} m/s (paper: 95 %, 6.5 m/s) |" in readme("four_gates")
     starts = ("| ours, with the field |", "| ours, with L_proj ", "| PPO ")
     rows = rows_of("schemes", "scheme", "ours", "projection", "ppo")
+    page = (ROOT / "docs" / "results" / "schemes.md").read_text("utf-8")
     for start, row in zip(starts, rows, strict=True):
         wanted = "| {mean:.2f} ({least:.2f} to {most:.2f}) |".format(**row["curves"]["gates"][-1])
         (line,) = [line for line in text.splitlines() if line.startswith(start)]
         assert line.endswith(wanted), line
+        share, v_max = (row["curves"][name][-1]["mean"] for name in ("success_cross", "v_max"))
+        assert f"million {wanted} {percent(share)} % | {v_max:.1f} m/s | " in page
 
 
 DISTURBANCES = {
