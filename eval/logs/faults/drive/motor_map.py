@@ -41,6 +41,8 @@ FOLLOWS = 0.5
 """Least correlation of commanded and measured thrust."""
 SPAN = 0.2
 """Least range of the thrust in which its curve is identifiable, as a difference of logarithms."""
+AIR = 0.1
+"""Change of the thrust over this range, as a share, that a drag may cause as well as the curve."""
 SWUNG = 1.6
 """Factor by which a battery's voltage can change the thrust. A wrong size within this factor is not
 identifiable where the voltage was not logged."""
@@ -229,10 +231,12 @@ def _findings(ratio: Ratio, drive: Drive) -> list[Finding]:
         f"thrust grows with the command to the power {true:.2f} (± {error:.2f}) from "
         f"{low:.2f} to {high:.2f}, to {exponent:.2f} by the file"
     )
-    if SURE * ratio.curve_error > CURVE or ratio.span < SPAN:
-        why = "too uncertain" if ratio.span >= SPAN else "the commands hardly change"
+    is_other = abs(ratio.curve) > max(CURVE, SURE * ratio.curve_error)
+    hardly = ratio.span < SPAN or (is_other and abs(ratio.curve) * ratio.span < AIR)
+    if SURE * ratio.curve_error > CURVE or hardly:
+        why = "the commands hardly change" if hardly else "too uncertain"
         findings += unseen(drive.subject, f"{figures}: {why}", drive.fault)
-    elif abs(ratio.curve) > max(CURVE, SURE * ratio.curve_error):
+    elif is_other:
         about = (drive.fault, true, 0.95)
         text = f"{figures}: the curve or its linearisation is another"
         findings.append(Finding("doubt", drive.subject, text, *about))
