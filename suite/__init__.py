@@ -96,7 +96,7 @@ def evaluate_policy(
     Raises:
         ValueError: for an argument that cannot be used, before the first flight.
     """
-    from eval.judging.policy_checks.faults import notes_of, object_faults
+    from eval.judging.policy_checks.faults import notes_of, notes_of_file, object_faults
     from eval.judging.policy_checks.in_flight import action_report
     from eval.logs.faults.vehicle import vehicle_doubts
     from eval.quadrotor.vehicle_file import checked_vehicle
@@ -149,7 +149,8 @@ def evaluate_policy(
     content = PolicyContent.of(policy) if is_source else None
     results = fly_from_python(loaded, content, evaluation, trial_set, processes)
     # An object is probed after its flights, so that the probe cannot change them.
-    doubts = () if before or hasattr(loaded, "notes") else object_faults(loaded)
+    is_tested = before or notes_of_file(loaded) is not None
+    doubts = () if is_tested else object_faults(loaded)
     known = {doubt.fault for doubt in doubts}
     in_flight = action_report(results, loaded.spec.action, known)["warnings"]
     warn_of(f"policy {loaded.name!r}: {doubt}" for doubt in (*doubts, *in_flight))
@@ -181,7 +182,8 @@ def train_policy(
             in which another program writes.
     """
     from eval.worlds.engine import warn_of
-    from suite.commands.train import Config, doubts, refuse_policy_folder, resolve
+    from suite.commands.train import Config, doubts, resolve
+    from suite.common.provenance import refuse_policy_folder
     from suite.common.running.lock import one_writer
     from suite.train.run import train
     from tracks.input.ranges import check_ranges

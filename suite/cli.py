@@ -137,7 +137,7 @@ def _refuse_repetition(args: Sequence[str], repeated: set[str]) -> None:
     flags = [arg.partition("=")[0].replace("_", "-") for arg in args if arg.startswith("--")]
     twice = {flag for flag in flags if flags.count(flag) > 1}
     for flag in sorted(twice - repeated):
-        raise ValueError(f"{flag} is given twice; give it once, with all its values behind it")
+        raise ValueError(f"{flag} is given twice; give it once; several values follow one another")
 
 
 def _run(name: str, args: list[str]) -> int:

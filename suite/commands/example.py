@@ -24,6 +24,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """Copy the example, and print the next command.
 
     Raises:
+        ValueError: for another file with the name of one of the example's.
         OSError: if the folder cannot be written.
     """
     from tracks.common.files import replacing_file
@@ -31,9 +32,15 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     config.out.mkdir(parents=True, exist_ok=True)
     contents = _real_files() if config.real else _simulated_files()
     folder = command_line(config.out).encode()
+    # The commands of the README read the files of this folder.
+    for name in [name for name in contents if ".md" in name]:
+        contents[name] = contents[name].replace(b"FOLDER", folder)
     for name, content in contents.items():
-        # The commands of the README read the files of this folder.
-        content = content.replace(b"FOLDER", folder) if ".md" in name else content
+        if (path := config.out / name).is_file() and path.read_bytes() != content:
+            raise ValueError(
+                f"{path} exists, and is not the example's; move it away, or give another --out"
+            )
+    for name, content in contents.items():
         with replacing_file(config.out / name) as new:
             new.write_bytes(content)
     names = sorted(contents)

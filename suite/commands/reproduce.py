@@ -41,9 +41,12 @@ class Config(Command):
     def written(self) -> list[Path]:
         """Return the folders that this command writes; while it runs, no other may write there.
 
-        Without a page (`experiment`) it writes nothing.
+        Without a page (`experiment`), and with `status`, it writes nothing.
         """
-        return [self.out, self.cache] if hasattr(self, "experiment") else []
+        from suite.experiments.published import Status
+
+        is_page = not isinstance(getattr(self, "experiment", Status()), Status)
+        return [self.out, self.cache] if is_page else []
 
 
 def config_of(args: Sequence[str]) -> tuple[Any, str, list[str]]:

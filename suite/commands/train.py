@@ -71,8 +71,8 @@ class Config(Command):
     trained."""
     set: tuple[str, ...] = ()
     """Change settings by name, in every phase, such as loss.progress=0.4; from the second phase
-    on: phases.2.loss.progress=0.4. A new spec.rate_hz also changes episode.steps, so that rollouts
-    last as long as before."""
+    until a later one changes it: phases.2.loss.progress=0.4. A new spec.rate_hz also changes
+    episode.steps, so that rollouts last as long as before."""
     tensorboard: Advanced[bool] = False
     """Also write the curve for TensorBoard, into tensorboard/ of the run (extra `tensorboard`)."""
     list_settings: bool = False
@@ -123,21 +123,6 @@ def resolve(config: Config) -> TrainConfig:
     return run
 
 
-def refuse_policy_folder(out: Path) -> None:
-    """Refuse a run in the folder of a policy.
-
-    Raises:
-        ValueError: naming the folder, and what to give instead.
-    """
-    from policies.formats.checkpoint import CONFIG
-
-    if (out / CONFIG).exists():
-        raise ValueError(
-            f"--out {out} is the folder of a policy; give a folder for the new run, which gets its "
-            "policy in policy/"
-        )
-
-
 def doubts(resolved: TrainConfig, anew: str = "") -> list[str]:
     """Return warnings about settings that are probably mistakes.
 
@@ -172,6 +157,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
     from policies.formats.checkpoint import CONFIG
     from policies.formats.policy_file import load_delta, load_policy_checkpoint
+    from suite.common.provenance import refuse_policy_folder
     from suite.delta.replay import check_corrects
     from suite.judging.flying import checkpoint_folder
     from suite.train.run import start_params, train
@@ -197,7 +183,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
                 + first_changes(changes)
             )
     if config.delta is not None:
-        stored = load_delta(config.delta)
+        try:
+            stored = load_delta(config.delta)
+        except ValueError as error:
+            raise ValueError(f"--delta needs the --out of suite delta: {error}") from error
         for phase in phase_configs(resolved):
             dynamics = phase.quadrotor or phase.physics
             check_corrects(stored.config.get("fit", {}), dynamics, phase.spec.rate_hz, config.delta)

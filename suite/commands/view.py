@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from suite.judging.requests import Evaluation
 
 
+TRIALS = "trials.parquet"
+"""Name of the file with the trials of a suite eval."""
+
+
 @dataclass(frozen=True)
 class Config(Command):
     """Fly trials of a suite eval again; write a recording for rerun, pictures and a video."""
@@ -135,7 +139,8 @@ def _choose_trials(config: Config, console: Console) -> _Chosen:
     from suite.judging.requests import Evaluation
 
     folder = Path(config.run)
-    if not (folder / "trials.parquet").is_file():
+    folder = folder.parent if folder.name == TRIALS else folder
+    if not (folder / TRIALS).is_file():
         if any(folder.glob("journal-*.jsonl")):
             raise ValueError(
                 f"{folder}: this suite eval is not finished; repeat its command to fly the "

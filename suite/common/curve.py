@@ -78,8 +78,8 @@ def read(folder: Path, name: str = CURVE) -> list[dict[str, Any]]:
             if number == len(lines):
                 break
             raise ValueError(
-                f"{path}: line {number} is damaged; restore the file, or move it away: the "
-                "training continues without its earlier curve"
+                f"{path}: line {number} is damaged; restore the file, or move it away: an "
+                "unfinished training continues without its earlier curve"
             ) from None
         if not rows or iteration > rows[-1]["iteration"]:
             rows.append(row)

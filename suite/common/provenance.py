@@ -104,12 +104,29 @@ def _type_name(config: Any) -> str:
     return f"{type(config).__module__}.{type(config).__qualname__}"
 
 
+def refuse_policy_folder(folder: str | os.PathLike[str]) -> None:
+    """Refuse a run in the folder of a policy, whose training replaces all that is in it.
+
+    Raises:
+        ValueError: naming the folder, and what to give instead.
+    """
+    from policies.formats.checkpoint import CONFIG, WEIGHTS
+
+    for place in (Path(folder), *Path(folder).absolute().parents):
+        if all((place / name).is_file() for name in (CONFIG, WEIGHTS)):
+            where = "is" if place == Path(folder) else "is in"
+            raise ValueError(
+                f"--out {folder} {where} the folder of a policy; give a folder for the new run"
+            )
+
+
 def refuse_other_run(folder: str | os.PathLike[str], config: Any) -> None:
-    """Refuse a folder with a run of another kind, whose record would be overwritten.
+    """Refuse the folder of a policy, and one with a run of another kind, which has its own record.
 
     Raises:
         ValueError: with the folder and the command that made it.
     """
+    refuse_policy_folder(folder)
     path = Path(folder) / "run.json"
     try:
         record = read_json(path)

@@ -15,7 +15,7 @@ from typing import Any
 import psutil
 
 from suite.common.console import Console, duration, size
-from suite.common.provenance import write_run_record
+from suite.common.provenance import refuse_other_run, write_run_record
 from tracks.common.files import plain, write_json
 from tracks.common.provenance import differences, first_changes, git_commit, stamp
 from tracks.input.reading import read_json
@@ -32,6 +32,7 @@ def claim(out: Path, config: Any, seed: int) -> None:
     Raises:
         ValueError: with the differences, if `out` has a run of another configuration.
     """
+    refuse_other_run(out, config)
     refuse_other_options(out, config)
     if not (out / "run.json").is_file():
         write_run_record(out, config, seed)

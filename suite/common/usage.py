@@ -95,7 +95,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "list": ("suite list", "suite list policies"),
     "tracks": ("suite tracks", "suite tracks ellipse --difficulty 9 --seed 3"),
     "effects": ("suite effects", "suite effects linear_drag"),
-    "reproduce": ("suite reproduce status", "suite reproduce table2 --out docs/results"),
+    "reproduce": (
+        "suite reproduce status --out docs/results",
+        "suite reproduce table2 --out docs/results",
+    ),
     "blind": ("suite blind make --out runs/blind", "suite blind run --out runs/blind"),
     "bench": ("suite bench", "suite bench train"),
     "completion": ("suite completion bash", "suite completion zsh"),

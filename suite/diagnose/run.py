@@ -12,6 +12,7 @@ from suite.common.console import Console
 from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.report import html
 from suite.common.stages import changed_options
+from suite.common.vehicles import refuse_foreign
 from suite.diagnose.config import Config
 from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.diagnose import diagnose
@@ -28,6 +29,8 @@ from suite.diagnose.verdict.actuators import actuator_mismatches
 from tracks.common.files import check_no_input, plain, write_json, write_text
 from tracks.common.provenance import first_changes, stamp
 
+MARK = "with the effects that suite diagnose named"
+"""Mark in the first line of a vehicle file that this command wrote."""
 SCHEMA = 1
 """Version of diagnosis.json."""
 
@@ -41,6 +44,7 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     out = config.out
     refuse_other_run(out, config)
     check_no_input(out / "vehicle.toml", [config.vehicle])
+    refuse_foreign(out / "vehicle.toml", MARK)
     vehicle = load_vehicle(config.vehicle)
     refuse_own_motion(vehicle)
     # Read the files, and check the logs for faults of interfaces.
@@ -93,7 +97,7 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     result = {**plain(result), **stamp(SCHEMA, config.seed)}
     names = ", ".join(effect["name"] for effect in result["effects"]) or "none"
     out.mkdir(parents=True, exist_ok=True)
-    header = f"{vehicle.name} with the effects that suite diagnose named: {names}"
+    header = f"{vehicle.name} {MARK}: {names}"
     save_vehicle(diagnosis.vehicle, out / "vehicle.toml", header)
     toml = (out / "vehicle.toml").read_text(encoding="utf-8")
     report = page(diagnosis, result, toml, files, rollouts)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from policies import shipped
 from suite.experiments.study.cache import page_code
 from suite.judging.content import policy_digest
 from tracks.common.grid import Grid, table
+from tracks.input.reading import read_json
 
 PUBLISHED = {
     "table2": "--seed 9600000",
@@ -51,14 +51,21 @@ def page_states(folder: Path) -> dict[str, dict[str, Any]]:
         if not path.is_file():
             states[name] = {"commit": "", "newer": None}
             continue
-        page = json.loads(path.read_text(encoding="utf-8"))
+        try:
+            page = read_json(path)
+            facts = [text.partition(", SHA-256 ") for text in page["made_by"].values()]
+            commit, code = page["git_commit"] or "", page.get("code_sha256")
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ValueError(
+                f"{path}: not the numbers of a page ({error}); make the page again with suite "
+                f"reproduce {name}, or move the file away"
+            ) from error
         # A policy's fact is its source and digest. Other policies than the shipped ones stand for
         # themselves: nothing can be newer.
-        facts = [text.partition(", SHA-256 ") for text in page["made_by"].values()]
         flown = [(policy, sha) for policy, _, sha in facts if sha and policy in shipped.names()]
         newer = ["policy"] if any(policy_digest(p)[:16] != sha for p, sha in flown) else []
-        newer += ["code"] if page.get("code_sha256") != page_code(name) else []
-        states[name] = {"commit": page["git_commit"] or "", "newer": newer}
+        newer += ["code"] if code != page_code(name) else []
+        states[name] = {"commit": commit, "newer": newer}
     return states
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from eval.judging.policy_checks.faults import notes_of, unused_inputs
+from eval.judging.policy_checks.faults import notes_of, notes_of_file, unused_inputs
 from eval.judging.policy_checks.in_flight import Watched, action_report
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.check import (
@@ -141,7 +141,7 @@ def policy_findings(policy: Policy, trials: int, console: Console) -> list[Findi
     The policy shows its actions in short flights, `trials` of them, perhaps none.
     """
     console.say(f"{policy.name}: {summary(contract_of(policy.spec))}")
-    of_file = getattr(policy, "notes", ())
+    of_file = notes_of_file(policy) or ()
     findings = [
         _finding("contract" if note in of_file else note.fault.split("_")[0], note)
         for note in notes_of(policy)

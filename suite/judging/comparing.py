@@ -174,9 +174,14 @@ def policy_notes(runs: Sequence[Run], others: Sequence[Run] = ()) -> list[str]:
 
 
 def seed_notes(runs: Sequence[Run]) -> list[str]:
-    """Return a warning if `runs` are no training seeds of one method, by the recorded settings."""
+    """Return warnings if `runs` may be no training seeds of one method, by recorded settings."""
     known = [run for run in runs if run.settings]
-    return [
+    unknown = ", ".join(run.name for run in runs if not run.settings)
+    note = (
+        f"warning: no settings of a training are recorded for {unknown}, so whether these are "
+        "training seeds of one method is unknown"
+    )
+    return [note] * bool(unknown) + [
         f"warning: {known[0].name} and {run.name}: were trained with different settings or for "
         "different numbers of iterations, which the spread over seeds includes; compare "
         "config.json of the two policies"

@@ -104,6 +104,10 @@ def evaluate(
     # Announce the work, and fly what the journals lack.
     count = len(trial_set.trials)
     workers = workers_for(count, workers, evaluation.simulator)
+    first: dict[str, str] = {}
+    for label, content in zip(labels, contents, strict=True):
+        if (other := first.setdefault(content.digest, label)) != label:
+            console.note(f"{other} and {label} have the same policy: expect no difference")
     if (out / "trials.parquet").is_file():
         console.note(f"{out} holds an evaluation; its results will be overwritten")
     total = count * len(entries)

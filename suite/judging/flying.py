@@ -21,6 +21,7 @@ from suite.judging.content import PolicyContent
 from suite.judging.requests import SimulatedFlights
 from suite.judging.trials import TrialSet
 from tracks.common.files import plain
+from tracks.common.names import unknown_name
 from tracks.common.work import Workers, usable_cores, worker_count
 
 if TYPE_CHECKING:
@@ -103,6 +104,15 @@ def checkpoint_folder(policy: str, option: str = "--policy") -> Path:
         ValueError: if the policy is not a checkpoint of the suite; the message names `option`.
     """
     folder = shipped.locate(policy)
+    if not folder.exists():
+        raise ValueError(
+            f"{unknown_name(option, policy, shipped.names())} Or give a checkpoint's folder, such "
+            "as the policy/ in the --out of suite train"
+        )
+    if (folder / "policy" / CONFIG).is_file():
+        raise ValueError(
+            f"{option} {policy} is the folder of a training; give its policy, {folder / 'policy'}"
+        )
     if not (folder / CONFIG).is_file():
         names = ", ".join(shipped.names()) or "none"
         raise ValueError(

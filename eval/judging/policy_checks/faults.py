@@ -59,11 +59,18 @@ AXES = (("y", "left", "right"), ("z", "up", "down"))
 def notes_of(policy: Policy) -> tuple[Note, ...]:
     """Return the notes about a policy before it flies.
 
-    They are the assumptions about its file, and the probable faults of its outputs. An object that
-    is from no file has no `notes`: only its rows are tested, by `check_rows`.
+    They are those of `check_rows`, the assumptions about its file, and the probable faults of its
+    outputs. Of an object that is from no file, only the rows are tested.
     """
+    rows, notes = check_rows(policy), notes_of_file(policy)
+    return rows if notes is None else (*rows, *notes, *probable_faults(policy))
+
+
+def notes_of_file(policy: Policy) -> tuple[Note, ...] | None:
+    """Return the assumptions about a policy's file; None for an object of the user's own class."""
     notes = getattr(policy, "notes", None)
-    return check_rows(policy) if notes is None else (*notes, *probable_faults(policy))
+    is_own = isinstance(notes, tuple) and all(isinstance(note, Note) for note in notes)
+    return notes if is_own else None
 
 
 def object_faults(policy: Policy) -> tuple[Note, ...]:

@@ -11,6 +11,7 @@ from eval.logs.faults.checked import COMPENSATED, read_checked
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console, counted
 from suite.common.provenance import stamp
+from suite.common.vehicles import refuse_foreign
 from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.estimate.parameters import refuse_own_motion
 from suite.diagnose.identify.drive import unmodelled_effects
@@ -89,13 +90,15 @@ def check_out(out: Path, vehicle: str = "") -> None:
     """Refuse to write a file at `out` before the work for it.
 
     Raises:
-        ValueError: for an ending that is not .toml, or the file `vehicle` to start from.
+        ValueError: for an ending that is not .toml, the file `vehicle` to start from, or a file
+            that suite identify has not written.
         OSError: where it cannot be written.
     """
     if out.suffix.lower() != ".toml":
         raise ValueError(f"--out is {str(out)!r}; its ending must be .toml")
     check_place(out)
     check_no_input(out, [vehicle])
+    refuse_foreign(out, MADE_BY)
 
 
 def is_identified(vehicle: str) -> bool:

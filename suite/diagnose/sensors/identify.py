@@ -24,6 +24,7 @@ from eval.sensors.sensors_file import save_sensors, sensor_set
 from suite.common.console import Console, counted
 from suite.common.provenance import stamp
 from suite.diagnose.identify.numbers import Number, number_lines, numbers_json
+from suite.diagnose.identify.run import MADE_BY
 from suite.diagnose.sensors.clock import clock_of, on_gyro_clock
 from suite.diagnose.sensors.colour import SHORT_S, Coloured, Series, fit_colour
 from suite.diagnose.sensors.errors import (
@@ -204,7 +205,7 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
             "the estimate and the reference in the same rows"
         )
     parameters = parameters_of(fitted)
-    header = [f"An on-board estimate against a reference in {flown}; 95 % intervals:"]
+    header = [f"An on-board estimate {MADE_BY} against a reference, {flown}; 95 % intervals:"]
     if clocks_s:
         low = 1e3 * min(least for least, _ in clocks_s.values())
         high = 1e3 * max(largest for _, largest in clocks_s.values())

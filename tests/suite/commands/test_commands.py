@@ -177,7 +177,15 @@ def test_training_goes_on_from_a_policy_by_its_name_and_does_not_write_over_it(
 ):
     assert checkpoint_folder("race-paper", "--init-from") == shipped.locate("race-paper")
     said = refused(capsys, "train --init-from rac --out", tmp_path / "run")
-    assert "--init-from rac: " in said and "a shipped policy's name (race, race-paper" in said
+    assert "unknown --init-from 'rac'. Did you mean 'race'?" in said
+    trained = tmp_path / "trained"
+    shutil.copytree(shipped.locate("race-paper"), trained / "policy")
+    said = refused(capsys, "train --init-from", trained, "--out", tmp_path / "run")
+    assert f"is the folder of a training; give its policy, {trained / 'policy'}" in said
+    said = refused(capsys, "eval --policy race --out", trained / "policy" / "eval")
+    assert "policy/eval is in the folder of a policy" in said
+    said = refused(capsys, "train --delta", trained, "--out", tmp_path / "run")
+    assert "--delta needs the --out of suite delta" in said
     assert not (tmp_path / "run").exists()
     rates = []
     monkeypatch.setattr(training, "start_params", lambda _, spec: rates.append(spec.rate_hz))

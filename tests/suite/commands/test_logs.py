@@ -218,6 +218,12 @@ def test_the_command_copies_all_a_diagnosis_needs(tmp_path, capsys):
     said = capsys.readouterr()
     assert "1 flight(s) that are not the example's" in said.err
     assert "flight_3.parquet --vehicle" in said.out and "mine" not in said.out
+    (vehicle := tmp_path / "vehicle.toml").write_text("# my own\n")
+    given = f"{tmp_path / 'flight_1.parquet'} --vehicle reference"
+    asked = {"example": tmp_path, f"identify {given}": vehicle, f"diagnose {given}": tmp_path}
+    for line, out in asked.items():
+        assert f"{vehicle} exists, and " in refused(capsys, f"{line} --out", out)
+    assert vehicle.read_text() == "# my own\n"
 
 
 def test_the_next_command_can_be_pasted_if_the_folder_has_a_space(tmp_path, capsys):

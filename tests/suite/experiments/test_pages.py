@@ -302,6 +302,11 @@ def test_a_page_is_older_than_another_policy_or_other_code(tmp_path, capsys):
     assert pages["schemes"]["newer"] == []
     assert pages["ablation"]["newer"] is None
     assert "not made" in capsys.readouterr().out
+    assert not config.written() and parse("reproduce", ["table2"])[1].written()
+    for damaged in ("{", "[]", "{}"):
+        (tmp_path / "table2.json").write_text(damaged)
+        with pytest.raises(ValueError, match="table2.json: not the numbers of a page"):
+            command.run(config, Console())
 
 
 def test_all_makes_every_page_by_the_command_of_the_published_one(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """Comparisons of evaluations: published examples, coverage, and what is refused."""
 
 import json
+import shutil
 from math import erf, sqrt
 
 import numpy as np
@@ -9,13 +10,14 @@ from scipy.stats import t as student
 
 from eval.judging.results import write_results
 from eval.judging.statistics import over_seeds, paired_success, wilson
+from policies import shipped
 from suite.commands import compare
 from suite.common.console import Quiet
 from suite.judging.comparing import compare_runs, compare_seeds, paired_sentence, read_runs
 from suite.judging.content import PolicyContent
 from suite.judging.requests import Evaluation
 from tests.support import commands
-from tests.support.judged_cells import result
+from tests.support.judged_cells import cut_short, result
 
 
 @pytest.mark.extended
@@ -236,11 +238,13 @@ def test_seeds_of_several_settings_are_noted(tmp_path, capsys):
         compare.run(config, Quiet())
         said = " ".join(capsys.readouterr().err.split())
         assert ("1 and " in said and "trained with different settings" in said) == is_noted
+        is_unknown = unknown in (*config.runs, *config.against)
+        assert ("no settings of a training are recorded" in said) == is_unknown
 
 
 def test_other_versions_are_noted(tmp_path, capsys):
     judged = Evaluation(simulator="rotorpy")
-    folders = [run_of(tmp_path / name, [True, False], judged) for name in "ab"]
+    folders = [run_of(tmp_path / name, [True, False], judged, settings="x") for name in "ab"]
     for folder, version in zip(folders, ("3.3.0", "3.4.0"), strict=True):
         versions = dict.fromkeys(("mujoco", "mujoco-mjx", "jax", "rotorpy"), version)
         run = {"packages": versions, "plugins": version[2], "machine": {"processor": version[:3]}}
@@ -263,3 +267,11 @@ def test_runs_of_one_policy_or_of_other_speeds_are_noted(tmp_path, capsys):
         for config in (compare.Config((a, other)), compare.Config((a,), against=(other,))):
             compare.run(config, Quiet())
             assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_policy_under_two_names_is_noted(tmp_path, monkeypatch, capsys):
+    own = shutil.copytree(shipped.locate("race-small"), tmp_path / "small")
+    cut_short(monkeypatch, seconds=0.1, stop_after=1)
+    line = "--track zigzag --trials 1 --policy race-small"
+    assert commands.evaluate(tmp_path / "out", line, own) == 130
+    assert "race-small and small have the same policy" in capsys.readouterr().err

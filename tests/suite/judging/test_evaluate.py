@@ -14,6 +14,7 @@ import suite.judging.evaluate
 from eval.judging.results import read_trials
 from suite.commands import view
 from suite.common.console import Console, Quiet
+from suite.common.errors import FAILED
 from suite.judging.content import PolicyContent, policy_digest
 from suite.judging.evaluate import evaluate as evaluate_here
 from suite.judging.flying import Manner, load_in_manner, manners, policy_for_workers
@@ -245,7 +246,8 @@ def test_view_finds_the_trials_of_every_policy_of_a_run(pilots, tmp_path, capfd)
     out, again = tmp_path / "out", ("view --out", tmp_path / "seen", tmp_path / "out")
     policies = ("--policy", pilots["pursuit"], pilots["diver"], pilots["diver2"])
     assert evaluate(out, "--trials 1 --track zigzag --time-limit-s 20", *policies) == 0
-    assert run(*again, "--pick", "failed") == 0
+    assert "expect no difference" not in capfd.readouterr().err
+    assert run(*again[:-1], out / "trials.parquet", "--pick", "failed") == 0
     said = capfd.readouterr().err
     assert f"flying 1 trial of {pilots['diver']}" in said
     assert f"--policy selects another of: {pilots['diver2']}" in said
@@ -341,7 +343,7 @@ def test_a_trial_ends_at_the_time_that_is_given_and_is_seen_so_again(
     assert (row.ended_by, row.time_s) == ("timeout", 0.2)
     assert run("view --out", tmp_path / "seen", out) == 0
     assert "timeout after 0.2 s" in capfd.readouterr().out
-    assert run("collect --difficulty 0 --out", logs, *asked[0].split(), *asked[1:]) == 0
+    assert run("collect --difficulty 0 --out", logs, *asked[0].split(), *asked[1:]) == FAILED
     listed = json.loads((logs / "flights.json").read_text())
     assert [flight["time_s"] for flight in listed["flights"]] == [0.2]
     words = refused(capfd, "eval --time-limit-s 0 --out", out, *asked[1:])

@@ -261,3 +261,18 @@ def test_a_torch_network_in_training_is_refused_as_its_rows_depend_on_each_other
         check_rows(Normalised())  # a single row is an error of the network
     network.eval()
     assert not check_rows(Normalised())
+
+
+def test_a_block_policy_and_an_object_with_notes_of_its_own_are_tested_by_rows():
+    @dataclass
+    class Noted(Pursuit):
+        notes: str = "version 3"
+
+        def act(self, hidden, state, image, fresh):
+            action, hidden = super().act(hidden, state, image, fresh)
+            return action - state.mean(0)[:3], hidden
+
+    block = BlockPolicy("mean", PolicySpec(), lambda *x: (x[0][:, :3] - x[0].mean(), x[2]), (0,))
+    for policy in (Noted(), block):
+        with pytest.raises(ValueError, match="a row's action changes by .* other rows"):
+            notes_of(policy)
