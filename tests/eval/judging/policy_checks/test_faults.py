@@ -268,11 +268,13 @@ def test_a_block_policy_and_an_object_with_notes_of_its_own_are_tested_by_rows()
     class Noted(Pursuit):
         notes: str = "version 3"
 
+    class Mean(Noted):
         def act(self, hidden, state, image, fresh):
             action, hidden = super().act(hidden, state, image, fresh)
             return action - state.mean(0)[:3], hidden
 
     block = BlockPolicy("mean", PolicySpec(), lambda *x: (x[0][:, :3] - x[0].mean(), x[2]), (0,))
-    for policy in (Noted(), block):
+    assert not notes_of(Noted())
+    for policy in (Mean(), block):
         with pytest.raises(ValueError, match="a row's action changes by .* other rows"):
             notes_of(policy)
