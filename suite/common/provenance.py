@@ -104,6 +104,29 @@ def _type_name(config: Any) -> str:
     return f"{type(config).__module__}.{type(config).__qualname__}"
 
 
+def is_marked(path: Path, mark: str) -> bool:
+    """Return whether `path` is a file with `mark` in its first line, a comment.
+
+    A command marks the TOML files that it writes.
+    """
+    if not path.is_file():
+        return False
+    first_line = path.read_text("utf-8", "replace").partition("\n")[0]
+    return first_line.startswith("#") and mark in first_line
+
+
+def refuse_foreign(path: Path, mark: str) -> None:
+    """Refuse to overwrite a file without the `mark` of the command, which did not write it.
+
+    Raises:
+        ValueError: naming the file, and what to do.
+    """
+    if path.is_file() and not is_marked(path, mark):
+        raise ValueError(
+            f"{path} exists, and this command did not write it; move it away, or give another --out"
+        )
+
+
 def refuse_policy_folder(folder: str | os.PathLike[str]) -> None:
     """Refuse a run in the folder of a policy, whose training replaces all that is in it.
 

@@ -30,7 +30,8 @@ def claim(out: Path, config: Any, seed: int) -> None:
     """Make `out` the folder of a run of `config`, or check that it is this already.
 
     Raises:
-        ValueError: with the differences, if `out` has a run of another configuration.
+        ValueError: if `out` is in the folder of a policy, or has a run of another kind or
+            configuration (with the differences).
     """
     refuse_other_run(out, config)
     refuse_other_options(out, config)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from suite.common.console import Console
@@ -17,18 +16,6 @@ OWN_CHECK = ("check", "delta", "diagnose", "identify")
 
 OTHER_CAMERA = "simulated images are those of the policy's camera; train a policy for the vehicle's"
 """Advice for flights of a policy with another camera than that of the vehicle file."""
-
-
-def refuse_foreign(path: Path, mark: str) -> None:
-    """Refuse to overwrite a file whose first line lacks `mark`: the command did not write it.
-
-    Raises:
-        ValueError: naming the file, and what to do.
-    """
-    if path.is_file() and mark not in path.read_text("utf-8", "replace").partition("\n")[0]:
-        raise ValueError(
-            f"{path} exists, and this command did not write it; move it away, or give another --out"
-        )
 
 
 def warn_of_vehicles(command: str, config: Any, console: Console) -> None:

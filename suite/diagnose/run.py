@@ -9,10 +9,9 @@ from eval.logs.faults.check import CheckContext
 from eval.logs.faults.checked import read_checked
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console
-from suite.common.provenance import refuse_other_run, write_run_record
+from suite.common.provenance import refuse_foreign, refuse_other_run, write_run_record
 from suite.common.report import html
 from suite.common.stages import changed_options
-from suite.common.vehicles import refuse_foreign
 from suite.diagnose.config import Config
 from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.diagnose import diagnose

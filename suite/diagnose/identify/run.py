@@ -10,8 +10,7 @@ from eval.logs.faults.check import CheckContext
 from eval.logs.faults.checked import COMPENSATED, read_checked
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console, counted
-from suite.common.provenance import stamp
-from suite.common.vehicles import refuse_foreign
+from suite.common.provenance import is_marked, refuse_foreign, stamp
 from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.estimate.parameters import refuse_own_motion
 from suite.diagnose.identify.drive import unmodelled_effects
@@ -103,7 +102,4 @@ def check_out(out: Path, vehicle: str = "") -> None:
 
 def is_identified(vehicle: str) -> bool:
     """Return whether `vehicle` is a file that suite identify wrote."""
-    if not Path(vehicle).is_file():
-        return False
-    first_line = Path(vehicle).read_text(encoding="utf-8").partition("\n")[0]
-    return first_line.startswith("#") and MADE_BY in first_line
+    return is_marked(Path(vehicle), MADE_BY)
