@@ -15,7 +15,8 @@ from typing import final
 
 import numpy as np
 
-from policies.spec import ACTIONS, NoAnswer, Note, PolicyError, PolicySpec
+from policies.spec import ACTIONS, NoAnswer, Note, PolicyError, PolicySpec, check_spec
+from tracks.input.ranges import Range, check_number, check_type, shown
 
 Model = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Maps (state, image, hidden) to (action, hidden) for exactly one block of rows, all float32."""
@@ -45,6 +46,25 @@ class BlockPolicy:
     """Number of rows of a block that are used, from the first row on: `block`, or 1."""
     notes: tuple[Note, ...] = ()
     """Assumptions about the policy that its file does not state."""
+
+    def __post_init__(self) -> None:
+        """Refuse arguments of other types, and other numbers of rows, with a ValueError."""
+        check_type("BlockPolicy: name", self.name, (str,), "a text")
+        check_type("BlockPolicy: spec", self.spec, (PolicySpec,), "a policies.spec.PolicySpec")
+        check_spec(self.spec, "BlockPolicy: spec.")
+        allowed = "a function (state, image, hidden) -> (action, hidden)"
+        check_type("BlockPolicy: model", self.model, (Callable,), allowed)
+        allowed = "a tuple of whole numbers, such as (64,); (0,) without memory"
+        check_type("BlockPolicy: hidden_shape", self.hidden_shape, (tuple, list), allowed)
+        check_type("BlockPolicy: notes", self.notes, (tuple, list), "a tuple of Note")
+        for size in self.hidden_shape:
+            allowed = Range(0, 2**31, whole=True)
+            check_number("BlockPolicy: hidden_shape", size, allowed, shown(self.hidden_shape))
+        check_number("BlockPolicy: block", self.block, Range(1, 2**31, whole=True))
+        if self.rows not in (1, self.block):
+            raise ValueError(
+                f"BlockPolicy: rows is {shown(self.rows)}, allowed is the block, {self.block}, or 1"
+            )
 
     def start(self, n: int) -> np.ndarray:
         """Return the recurrent state at the start of n trials, (n, *hidden_shape) zeros."""

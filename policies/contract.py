@@ -18,6 +18,7 @@ from typing import Any
 from policies.spec import (
     ACTIONS,
     EXTRAS,
+    WIDTH_MOST,
     ActionSpec,
     DepthEncoding,
     PolicyError,
@@ -128,6 +129,16 @@ _EXTRAS = {
     "second_axis": ("1", BODY),
     "speed_input": ("1", "0 (careful) to 1 (a race)"),
 }
+# Key of a spec -> its name in a contract.
+_NAMES = {
+    "camera.range_m": "image.far_m",
+    "camera.width": "image.shape[-1]",
+    "camera.height": "image.shape[-2]",
+    "camera.": "image.",
+    "depth.scale": "image.scale_m",
+    "depth.near": "image.near_m",
+    "depth.offset": "image.offset",
+}
 
 
 def contract_of(spec: PolicySpec, memory: tuple[int, ...] | None = None) -> Contract:
@@ -175,8 +186,13 @@ def spec_of(contract: Contract, where: str) -> PolicySpec:
     names = [entry.name for entry in contract.state]
     motors = "speed" if "speed" in "".join(action.unit) and action.kind == "motors" else "thrust"
     memory = contract.memory or ()
+    if min(memory, default=1) < 1:
+        raise PolicyError(
+            f"{where}: memory is {shown(list(memory))}, allowed are sizes of 1 and more, or [] "
+            "without memory"
+        )
     extras: dict[str, Any] = {key: key in names for key in EXTRAS}
-    if len(memory) == 1:
+    if len(memory) == 1 and memory[0] <= WIDTH_MOST:
         extras["hidden_size"] = memory[0]
     spec = PolicySpec(
         rate_hz=contract.rate_hz,
@@ -197,7 +213,9 @@ def spec_of(contract: Contract, where: str) -> PolicySpec:
     try:
         check_spec(spec, "")
     except ValueError as error:
-        text = str(error).replace("hidden_size", "memory[0]")  # its name in a contract
+        text = str(error)
+        for key, name in _NAMES.items():
+            text = text.replace(key, name)
         raise PolicyError(f"{where}: {text}") from None
     provided = contract_of(spec, contract.memory)
     for name, theirs, ours in _differences(contract, provided):
@@ -210,6 +228,8 @@ def spec_of(contract: Contract, where: str) -> PolicySpec:
 
 def read_contract(text: str | bytes | Mapping[str, Any], where: str) -> Contract:
     """Return the contract in a JSON text, or in the object of that text.
+
+    A list of one number as `action.scale` or `action.offset` counts for all components.
 
     Raises:
         PolicyError: if it is not a contract of this version, or its digest does not match.
@@ -232,7 +252,10 @@ def read_contract(text: str | bytes | Mapping[str, Any], where: str) -> Contract
             f"{contract.digest[:12]}…; it was changed by hand: make it from a PolicySpec or use "
             "that of the environment"
         )
-    return contract
+    size, action = len(contract.action.names), contract.action
+    scale, offset = _each(action.scale, size), _each(action.offset, size)
+    action = dataclasses.replace(action, scale=scale, offset=offset)
+    return dataclasses.replace(contract, action=action)
 
 
 def refuse_differences(contract: Contract, other: Contract, where: str, whose: str) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from tracks.common.names import unknown_name
 from tracks.geometry.camera import Camera
-from tracks.input.ranges import Range, check_ranges, check_type
+from tracks.input.ranges import Range, check_ranges, check_type, shown
 
 STATE_SIZE = 12
 """Number of numbers in the state of Su et al. 2026: velocity in body axes (3), third row of the
@@ -34,6 +34,10 @@ ACTIONS = {
 CHANNEL_BLOCK = 32
 """The channels of the second and third convolution are multiples of this, so that the C export can
 store their weights in blocks."""
+WIDTH_MOST = 4096
+"""Largest width of the suite's network."""
+HIDDEN_MOST = 2**16
+"""Largest number of numbers in the memory of one row."""
 RAYS_MOST = 640 * 480
 """Largest number of rays of an image: the number of pixels of usual depth cameras. 64 images of
 this size, with all intermediate arrays, fit into 2 GB."""
@@ -104,7 +108,7 @@ class PolicySpec:
     """Camera that takes the images; depths are clipped to its range."""
     depth: DepthEncoding = field(default_factory=DepthEncoding)
     """Conversion of depth to the image input."""
-    hidden_size: Annotated[int, Range(1, 4096)] = 192
+    hidden_size: Annotated[int, Range(1, WIDTH_MOST)] = 192
     """Width of the embeddings and of the recurrent state."""
     channels: Annotated[tuple[int, int, int], Range(2, 1024)] = (32, 64, 128)
     """Output channels of the three convolutions: an even number, then multiples of 32 twice."""
@@ -183,16 +187,19 @@ def check_spec(spec: PolicySpec, where: str = "spec.") -> None:
 
 
 def check_network(spec: PolicySpec) -> None:
-    """Refuse an image size or channels that the suite's network does not support.
+    """Refuse a spec that the suite's network does not support.
 
     Raises:
-        ValueError: naming the side and its pixels, or the channels, and what is allowed.
+        ValueError: naming the key, its value and what is allowed.
     """
-    if spec.depth.channel_axis or spec.depth.uint8 or not spec.action.is_plain:
-        raise ValueError(
-            "spec.depth.channel_axis, spec.depth.uint8 and spec.action.scale are for other "
-            "policies; the suite's network does not support them"
-        )
+    keys = ("depth.channel_axis", "depth.uint8", "action.scale", "action.offset", "action.clip")
+    for part, key in (each.split(".") for each in keys):
+        value, plain = (getattr(getattr(each, part), key) for each in (spec, PolicySpec()))
+        if set(np.ravel(value)) != set(np.ravel(plain)):
+            raise ValueError(
+                f"spec.{part}.{key} is {shown(value)}, allowed for the suite's network is "
+                f"{shown(plain)}; other values are for other policies"
+            )
     first, *others = spec.channels
     if first % 2 or any(count % CHANNEL_BLOCK for count in others):
         raise ValueError(

@@ -30,6 +30,12 @@ from tracks.input.reading import (
 WEIGHTS = "weights.safetensors"
 CONFIG = "config.json"
 """Names of the files in a checkpoint."""
+KINDS = {
+    "policy": "a policy, from suite train",
+    "delta": "a Delta Action Model, from suite delta",
+    "training": "the state of a training, to continue it",
+}
+"""Kind of checkpoint -> its name in messages."""
 SCHEMA = 1
 """Version of the folder's layout; files of another version are refused."""
 
@@ -96,8 +102,8 @@ def load_arrays(folder: Path, *, kind: str) -> Stored:
     config = read_config(folder)
     if config["kind"] != kind:
         raise PolicyError(
-            f"{folder / CONFIG}: kind is {config['kind']!r}, expected {kind!r}; "
-            f"give a checkpoint of that kind"
+            f"{folder / CONFIG}: kind is {shown(config['kind'])}, expected {kind!r}: this is "
+            f"{KINDS.get(config['kind'], 'another checkpoint')}; give {KINDS[kind]}"
         )
     path = folder / WEIGHTS
     expected = config["weights"]

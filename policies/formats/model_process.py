@@ -108,7 +108,7 @@ class ModelProcess:
             "answer_s": ANSWER_S + GRACE_S,
         }
         header = {"bytes": len(self._model), "kind": self._kind, "labels": self._labels, **limits}
-        description, _ = self._request(header, [self._model], LOAD_S, "loaded")
+        description, _ = self._request(header, [self._model], LOAD_S)
         if "error" in description:
             raise PolicyError(
                 f"{self._where}: {self._engine} {description['version']} cannot load it "
@@ -127,7 +127,7 @@ class ModelProcess:
         arrays = {name: np.ascontiguousarray(value, np.float32) for name, value in feed.items()}
         header = {"arrays": [[name, value.shape] for name, value in arrays.items()]}
         data = [value.reshape(-1).view(np.uint8).data for value in arrays.values() if value.size]
-        answer, buffer = self._request(header, data, ANSWER_S, "answered")
+        answer, buffer = self._request(header, data, ANSWER_S)
         if "error" in answer:
             raise NoAnswer(
                 f"{self._where}: fails while it runs ({answer['error']}); correct it and export "
@@ -141,7 +141,7 @@ class ModelProcess:
         return outputs
 
     def _request(
-        self, header: dict[str, Any], data: list[Any], limit_s: float, done: str
+        self, header: dict[str, Any], data: list[Any], limit_s: float
     ) -> tuple[dict[str, Any], bytearray]:
         """Send a frame (see `model_server.py`), and return header and data of the answer."""
         until = time.monotonic() + limit_s
@@ -154,15 +154,17 @@ class ModelProcess:
             answer = json.loads(self._read(length, until))
             return answer, self._read(data_bytes(answer), until)
         except TimeoutError:
-            reason = f"it was not {done} within {limit_s:g} s"
+            text = (
+                f"gave no answer within {limit_s:g} s: the machine is busy, or the policy loops "
+                "without end; repeat it on a free machine, and check the policy for endless loops"
+            )
         except (ConnectionError, EOFError, ValueError, MemoryError):
-            reason = _how_it_ended(self._process)
+            text = (
+                f"{_how_it_ended(self._process)}; repeat it, and if this happens again, check the "
+                "free memory, and the policy's sizes and code"
+            )
         self._end()
-        raise NoAnswer(
-            f"{self._where}: {self._engine} does not come to an end with it "
-            f"({reason}); check for endless loops and for sizes beyond the memory, and export it "
-            "again"
-        )
+        raise NoAnswer(f"{self._where}: the process that runs it with {self._engine} {text}")
 
     def _read(self, count: int, until: float) -> bytearray:
         """Read `count` bytes from the process, or raise a TimeoutError at the time `until`."""
@@ -192,9 +194,9 @@ def _remaining_s(until: float) -> float:
 
 
 def _how_it_ended(process: subprocess.Popen[bytes]) -> str:
-    """Return a text on why the process gave no answer."""
+    """Return a text, without its subject, on why the process gave no answer."""
     try:
         code = process.wait(1.0)
     except subprocess.TimeoutExpired:
-        return "its answer is not valid"
-    return f"it ended by {signal.Signals(-code).name}" if code < 0 else f"it ended with {code}"
+        return "gave an answer that is not valid"
+    return f"ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"

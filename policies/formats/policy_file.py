@@ -122,6 +122,11 @@ def load_delta(folder: Path) -> Stored:
     from policies.networks import delta_network
 
     folder = folder / DELTA if (folder / DELTA).is_dir() else folder
+    if not (folder / CONFIG).exists() and (folder / POLICY / CONFIG).exists():
+        raise PolicyError(
+            f"{folder}: the folder of a training, which has a policy and no Delta Action Model; "
+            "give the folder that suite delta wrote"
+        )
     stored = load_arrays(folder, kind=DELTA)
     check_shapes(folder / WEIGHTS, stored.arrays, _shapes(delta_network.init))
     return stored

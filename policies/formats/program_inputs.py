@@ -11,15 +11,13 @@ import numpy as np
 from policies.block_policy import BLOCK, BlockPolicy, verify_rows
 from policies.formats.model_process import ModelProcess
 from policies.formats.spec_json import KEY, PolicyMetadata
-from policies.spec import EXTRAS, Note, PolicyError, PolicySpec
+from policies.spec import EXTRAS, HIDDEN_MOST, Note, PolicyError, PolicySpec
 from tracks.input.reading import MODEL_BYTES, InputError, read_bytes, reason
 
 INPUTS = ("state", "image", "hidden")
 """Names of a program's inputs, in order; a policy without memory omits the last."""
 BLOCK_MOST = 4096
 """Largest batch size of a model whose batch size is fixed."""
-HIDDEN_MOST = 2**16
-"""Largest number of numbers in the recurrent state of one row."""
 
 
 def read_model(path: Path) -> bytes:

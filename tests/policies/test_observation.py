@@ -1,6 +1,7 @@
 """What a policy sees, by hand and with scipy; a row's answer depends on that row alone."""
 
 import dataclasses
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -204,6 +205,28 @@ def test_a_model_that_rolls_dice_or_has_wrong_outputs_is_refused():
     ]:
         with pytest.raises(PolicyError, match=said):
             verify_rows(dataclasses.replace(base, model=model), "here")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("name", 3, "allowed is a text"),
+        ("spec", "race", "a policies.spec.PolicySpec"),
+        ("spec", PolicySpec(rate_hz=0.0), "allowed is 1 to 500"),
+        ("model", None, "a function (state, image, hidden)"),
+        ("hidden_shape", 4, "a tuple of whole numbers"),
+        ("hidden_shape", (4.0,), "allowed is a whole number"),
+        ("hidden_shape", (-4,), "is (-4,), allowed is 0 to"),
+        ("block", "64", "allowed is a whole number"),
+        ("block", 0, "allowed is 1 to"),
+        ("rows", 7, "allowed is the block, 64, or 1"),
+        ("notes", "assumed", "a tuple of Note"),
+    ],
+)
+def test_a_wrong_argument_is_named(name, value, said):
+    arguments = {"name": "x", "spec": PolicySpec(), "model": min, "hidden_shape": (0,)}
+    with pytest.raises(ValueError, match=rf"BlockPolicy: {name}.*{re.escape(said)}"):
+        BlockPolicy(**arguments | {name: value})
 
 
 @pytest.mark.parametrize("n", [3, 64])

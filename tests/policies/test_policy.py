@@ -145,6 +145,8 @@ def test_a_contract_comes_back_with_its_digest_and_gives_the_spec(spec):
     again = read_contract(contract.text, "here")
     assert again == contract and again.digest == contract.digest
     assert spec_of(again, "here") == dataclasses.replace(spec, hidden_size=4)
+    wide = contract_of(spec, (5000,))  # wider than the suite's network can be
+    assert spec_of(read_contract(wide.text, "here"), "here") == spec
 
 
 @pytest.mark.parametrize(
@@ -181,8 +183,16 @@ def test_the_digest_is_one_for_one_meaning():
         (("action", "frame"), "FRD", "action.frame is 'FRD'"),
         (("action", "unit"), ["g"] * 3, "action.unit"),
         (("image", "encoding"), "depth", "image.encoding is 'depth'"),
-        (("image", "near_m"), 20.0, "depth.near is 20 m"),
-        (("memory",), [5000], r"here: memory\[0\] is 5000"),
+        (("image", "near_m"), 20.0, r"image.near_m is 20 m, allowed is below image.far_m \(10 m"),
+        (("image", "far_m"), 5000.0, "here: image.far_m is 5000.0, allowed is 0.1 to 1000"),
+        (("image", "shape"), [24, 2000], r"here: image.shape\[-1\] is 2000"),
+        (("image", "rays"), 0, "here: image.rays is 0"),
+        (("memory",), [4, 0], r"here: memory is \[4, 0\], allowed are sizes of 1 and more"),
+        (
+            ("action", "scale"),
+            [2.0, 3.0],
+            r"action.scale is \[2.0, 3.0\], allowed are 1 or 3",
+        ),
         (("action", "kind"), "velocity", "unknown kind of action 'velocity'"),
     ],
 )
@@ -195,6 +205,14 @@ def test_what_the_suite_does_not_provide_is_refused_by_its_place(path, value, sa
     part[path[-1]] = value
     with pytest.raises(PolicyError, match=said):
         spec_of(read_contract(json.dumps(data), "here"), "here")
+
+
+def test_one_number_as_scale_counts_for_all_components():
+    contract = contract_of(PolicySpec(action=ActionSpec(scale=(20.0,))))
+    data = contract.to_json()
+    del data["digest"]
+    data["action"] |= {"scale": [20.0], "offset": [0.0]}
+    assert read_contract(data, "here") == contract
 
 
 def test_a_contract_changed_by_hand_or_of_another_version_is_refused():
@@ -292,8 +310,22 @@ def gymnasium_spec():
 
 def test_weights_without_a_program_are_named(tmp_path):
     torch.save(Module().state_dict(), tmp_path / "it.pt")
-    with pytest.raises(PolicyError, match="weights without a program"):
-        load_policy(tmp_path / "it.pt", trust=True)
+    os.link(tmp_path / "it.pt", tmp_path / "it.pt2")
+    for name in ("it.pt", "it.pt2"):
+        with pytest.raises(PolicyError, match="weights without a program"):
+            load_policy(tmp_path / name, trust=True)
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
+def test_a_torch_file_with_the_suffix_of_another_kind_is_named(exported, tmp_path):
+    torch.jit.save(torch.jit.script(Module()), str(tmp_path / "it.pt2"))
+    os.link(exported / "tiny.pt2", tmp_path / "tiny.pt")
+    for name, said in (
+        ("it.pt2", "this file is TorchScript; rename it to it.pt$"),
+        ("tiny.pt", "this file is a torch exported program; rename it to tiny.pt2$"),
+    ):
+        with pytest.raises(PolicyError, match=said):
+            load_policy(tmp_path / name, trust=True)
 
 
 def rollout(policy, n, steps):

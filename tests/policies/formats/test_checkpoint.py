@@ -218,6 +218,9 @@ def edit(folder, change):
         ("camera", {"width": 34}, "camera.width is 34"),
         ("camera", {"fov_deg": [70.0, 180.0]}, r"fov_deg is \(70.0, 180.0\)"),
         ("depth", {"near": 20.0}, "below camera.range_m"),
+        ("depth", {"uint8": True}, "depth.uint8 is True, allowed for the suite's network is False"),
+        ("action", {"scale": [20.0]}, r"action.scale is \(20.0,\), allowed .* is \(1.0,\)"),
+        ("action", {"clip": 1.0}, "action.clip is 1.0, allowed .* is 0.0; other values"),
     ],
 )
 def test_a_spec_that_cannot_be_is_refused_by_key(tmp_path, params, key, value, said):
@@ -253,8 +256,11 @@ def test_a_delta_comes_back_and_a_policy_is_none(tmp_path, params):
     for name, value in delta.items():
         np.testing.assert_array_equal(back.arrays[name], value)
         np.testing.assert_array_equal(of_run.arrays[name], value)
-    with pytest.raises(PolicyError, match="kind is 'policy', expected 'delta'"):
-        load_delta(save_policy(tmp_path / "p", params, SPEC, seed=None))
+    policy = save_policy(tmp_path / "trained/policy", params, SPEC, seed=None)
+    with pytest.raises(PolicyError, match="kind is 'policy', expected 'delta': this is a policy"):
+        load_delta(policy)
+    with pytest.raises(PolicyError, match="folder of a training, .* no Delta Action Model; give"):
+        load_delta(policy.parent)
     with pytest.raises(PolicyError, match=r"'output.bias' is float32 \(4,\)"):
         load_delta(saved(delta | {"output.bias": jnp.zeros(4)}))
 

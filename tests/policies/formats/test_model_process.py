@@ -61,7 +61,7 @@ def test_a_loop_without_an_end_is_refused_in_time(start, tmp_path, monkeypatch):
     monkeypatch.setattr(process, "ANSWER_S", 1.0)
     path = save_onnx(tmp_path, endless(start))
     began = time.monotonic()
-    with pytest.raises(PolicyError, match="it.onnx: onnxruntime does not come to an end with it"):
+    with pytest.raises(PolicyError, match="it.onnx: .*gave no answer within .* loops"):
         load_policy(path)
     assert time.monotonic() - began < 8.0
 
@@ -70,7 +70,7 @@ def test_the_process_ends_itself_where_its_parent_is_gone(monkeypatch):
     monkeypatch.setattr(process, "GRACE_S", -1.5)
     monkeypatch.setattr(process, "ANSWER_S", 2.0)
     model = ModelProcess(endless("state").SerializeToString(), "it", "onnx")
-    with pytest.raises(PolicyError, match="it ended by SIGALRM"):
+    with pytest.raises(PolicyError, match="onnxruntime ended by SIGALRM"):
         model.run({"state": np.ones((1, 12)), "image": np.ones((1, 24, 32))})
 
 
@@ -90,7 +90,7 @@ def test_a_model_that_wants_all_memory_is_refused(tmp_path):
         helper.make_node("Add", ["u", "most"], ["action"]),
     ]
     path = save_onnx(tmp_path, onnx_model(nodes, [WEIGHT, tensor("large", [2**21, 1, 12])]))
-    with pytest.raises(PolicyError, match="it.onnx: .*(fails while it runs|come to an end)"):
+    with pytest.raises(PolicyError, match="it.onnx: .*(fails while it runs|ended by|ended with)"):
         load_policy(path)
 
 
@@ -111,13 +111,13 @@ def test_after_a_death_or_no_answer_the_next_question_goes_to_a_fresh_process(mo
     model = plain()
     np.testing.assert_array_equal(model.run(FEED)[0], np.ones((2, 3)))
     os.kill(model._process.pid, signal.SIGABRT)
-    with pytest.raises(PolicyError, match="it ended by SIGABRT"):
+    with pytest.raises(PolicyError, match="the process that runs it .*ended by SIGABRT; repeat"):
         model.run(FEED)
     np.testing.assert_array_equal(model.run(FEED)[0], np.ones((2, 3)))
     monkeypatch.setattr(process, "ANSWER_S", 0.5)
     stopped = model._process.pid
     os.kill(stopped, signal.SIGSTOP)
-    with pytest.raises(NoAnswer, match="was not answered within 0.5 s"):
+    with pytest.raises(NoAnswer, match="no answer within 0.5 s: the machine is busy, or"):
         model.run(FEED)
     with pytest.raises(ProcessLookupError):
         os.kill(stopped, 0)

@@ -368,6 +368,10 @@ def test_the_memory_of_a_script_is_that_of_its_contract(tmp_path, in_process):
         inputs = np.ones((2, 12)), np.ones((2, 24, 32)), np.zeros(2, bool)
         action, hidden = policy.act(hidden, *inputs)
         assert hidden.shape == (2, 2, 4) and (action == step).all()
+    extra = {contract.KEY: contract_of(PolicySpec(), (2**9, 2**9)).text}
+    torch.jit.save(torch.jit.script(Counting()), str(path), _extra_files=extra)
+    with pytest.raises(PolicyError, match=r"\[512, 512\], allowed are up to 65536 numbers"):
+        load_policy(path, trust=True)
     torch.jit.save(torch.jit.script(Counting()), str(path))  # its memory has no size
     with pytest.raises(PolicyError, match=r"given a hidden of 192 numbers; set hidden_size in the"):
         load_policy(path, trust=True)
