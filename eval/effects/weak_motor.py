@@ -55,7 +55,8 @@ def read(table: Mapping[str, Any]) -> WeakMotor:
 
 def write(values: WeakMotor) -> dict[str, Any]:
     """Return the vehicle file's table with the rotors whose scale is not 1."""
-    weak = [(i + 1, float(s)) for i, s in enumerate(values.scale) if s != 1.0] or [(1, 1.0)]
+    rotors = zip((1, 2, 3, 4), values.scale, strict=True)
+    weak = [(rotor, float(scale)) for rotor, scale in rotors if scale != 1.0] or [(1, 1.0)]
     if len(weak) == 1:
         return {"index": weak[0][0], "scale": weak[0][1]}
     return {"index": [i for i, _ in weak], "scale": [s for _, s in weak]}

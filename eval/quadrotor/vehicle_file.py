@@ -9,6 +9,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import replace
+from numbers import Integral
 from pathlib import Path
 from types import MappingProxyType, NoneType
 from typing import Any
@@ -29,7 +30,7 @@ from tracks.common.toml_table import (
     toml_head,
 )
 from tracks.geometry.camera import Camera
-from tracks.input.ranges import as_path, check_type
+from tracks.input.ranges import as_path, check_type, shown
 
 SCHEMA = 1
 """Version of the file's layout."""
@@ -133,18 +134,22 @@ def vehicle_table(vehicle: Vehicle) -> dict[str, Any]:
         if name in vehicle.effects:
             values = vehicle.effects[name]
             write = EFFECTS[name].write or (lambda values: _plain(values._asdict()))
-            effects[name] = write(values)
+            try:
+                effects[name] = write(values)
+            except (TypeError, ValueError):
+                key, allowed = f"effects.{name}", "numbers, as in docs/vehicle.md"
+                raise ValueError(f"{key} is {shown(values)}, allowed are {allowed}") from None
     return {
         "name": vehicle.name,
         "schema": SCHEMA,
         "mass": vehicle.mass,
-        "inertia": list(vehicle.inertia),
-        "rotors": {**_plain(vars(vehicle.rotors)), "spin": list(vehicle.rotors.spin)},
+        "inertia": _listed(vehicle.inertia),
+        "rotors": {**_plain(vars(vehicle.rotors)), "spin": _listed(vehicle.rotors.spin)},
         "controller": _controller_table(vehicle.controller),
         "body": _plain(vars(vehicle.body)),
         "camera": {
             "pitch_deg": camera.pitch_deg,
-            "fov_deg": list(camera.fov_deg),
+            "fov_deg": _listed(camera.fov_deg),
             "range": camera.range_m,
         },
         **({"motors": _plain(vars(vehicle.motors))} if vehicle.motors else {}),
@@ -164,10 +169,14 @@ def _check_parts(vehicle: Vehicle) -> None:
         fields = ", ".join(f"{field}=..." for field in getattr(kind, "_fields", ()))
         allowed = f"EFFECTS[{name!r}].values({fields}), with EFFECTS of eval.effects"
         check_type(f"effects.{name}", values, (kind,), allowed)
-    module = KINDS.get(vehicle.controller.kind)
+    controller = vehicle.controller
+    check_type("controller.kind", controller.kind, (str,), "a text")
+    module = KINDS.get(controller.kind)
     if module is not None:
         allowed = f"Settings of {module.__name__}"
-        check_type("controller.settings", vehicle.controller.settings, (module.Settings,), allowed)
+        check_type("controller.settings", controller.settings, (module.Settings,), allowed)
+    for key in ("width", "height", "rays"):
+        check_type(f"camera.{key}", getattr(vehicle.camera, key), (Integral,), "a whole number")
 
 
 def _effects(tables: Table, vehicle: Vehicle) -> dict[str, Any]:
@@ -263,9 +272,17 @@ def _camera(table: Table) -> Camera:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as dicts, lists and floats, as TOML has them."""
+    """Return a value as dicts, lists and floats, as TOML has them; others are unchanged."""
     if isinstance(value, Mapping):
         return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, (tuple, list)) or getattr(value, "ndim", 0) > 0:
         return [_plain(entry) for entry in value]
-    return float(value)
+    try:
+        return value if isinstance(value, (str, bytes, bool)) else float(value)
+    except (TypeError, ValueError):
+        return value
+
+
+def _listed(value: Any) -> Any:
+    """Return a tuple or an array as a list; others are unchanged."""
+    return list(value) if isinstance(value, tuple) or getattr(value, "ndim", 0) > 0 else value

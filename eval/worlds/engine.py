@@ -163,17 +163,24 @@ def course_notes(name: str, track: Track, vehicle: Vehicle) -> list[str]:
             at the start, with the start and the touched solid.
     """
     check_track(track)
+    if contact := start_contact(track, vehicle):
+        raise ValueError(f"{name}: at start.position {contact}")
+    return track_doubts(name, track, vehicle)
+
+
+def start_contact(track: Track, vehicle: Vehicle) -> str:
+    """Return the start and the solid that `vehicle` touches there, as a text; "" for none."""
     model = compile_model(track, vehicle, 1.0 / vehicle.controller.frequency, counts(track.scene))
     data = mujoco.MjData(model)
     data.qpos[:] = start_state(track)
     mujoco.mj_forward(model, data)
-    if data.ncon:
-        sides = " x ".join(f"{2 * size:g}" for size in vehicle.body.half_size)
-        raise ValueError(
-            f"{name}: at start.position {np.round(track.start_pos_w, 3).tolist()} the body of "
-            f"{vehicle.name!r} ({sides} m) touches {contact_name(model, data)}; move the start away"
-        )
-    return track_doubts(name, track, vehicle)
+    if not data.ncon:
+        return ""
+    sides = " x ".join(f"{2 * size:g}" for size in vehicle.body.half_size)
+    return (
+        f"{np.round(track.start_pos_w, 3).tolist()} the body of {vehicle.name!r} ({sides} m) "
+        f"touches {contact_name(model, data)}; move the start away"
+    )
 
 
 def family_notes(family: str, level: int, seed: int, vehicle: Vehicle) -> list[str]:
@@ -183,7 +190,10 @@ def family_notes(family: str, level: int, seed: int, vehicle: Vehicle) -> list[s
     """
     if family in FAMILIES.own:
         return []
-    return track_doubts(family, make_track(family, level, seed), vehicle)
+    track = make_track(family, level, seed)
+    contact = start_contact(track, vehicle)
+    notes = [f"{family}: at its start {contact}"] if contact else []
+    return [*notes, *track_doubts(family, track, vehicle)]
 
 
 def track_doubts(name: str, track: Track, vehicle: Vehicle) -> list[str]:

@@ -83,6 +83,9 @@ def test_a_family_with_wrong_yaws_gets_the_notes_of_a_track_file(family):
     vehicle = suite.load_vehicle("reference")
     family(lambda d, rng: line())
     assert family_notes("mine", 0, 0, vehicle) == []
+    family(changed(start_pos_w=np.array([0.0, 0.5, 1.0])))  # in the frame of gate 0
+    said = r"mine: at its start \[0.0, 0.5, 1.0\] the body of 'reference' .* touches gate 0 frame;"
+    assert re.match(said, family_notes("mine", 0, 0, vehicle)[0])
     family(lambda d, rng: line(yaw=np.pi))
     assert "against the path" in family_notes("mine", 0, 0, vehicle)[0]
     family(lambda d, rng: line(side=0.1))

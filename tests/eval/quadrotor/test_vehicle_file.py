@@ -3,6 +3,7 @@
 import copy
 import tomllib
 from dataclasses import replace
+from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -12,7 +13,12 @@ import suite
 from eval.effects import EFFECTS
 from eval.quadrotor import vehicle_file
 from eval.quadrotor.model import BODY, CAMERA, COLLIDES, compile_quadrotor, rotor_name
-from eval.vehicles.vehicle import MotorMap, command_of_thrust, motor_speed, motor_thrust
+from eval.vehicles.vehicle import (
+    MotorMap,
+    command_of_thrust,
+    motor_speed,
+    motor_thrust,
+)
 from eval.vehicles.vehicle_check import check_vehicle
 from tests.support.pilots import Pursuit
 from tests.support.vehicles import PLAIN, drawn_effects, with_effects
@@ -20,7 +26,8 @@ from tracks.common.provenance import stamp, stamp_text
 from tracks.common.toml_table import to_toml
 from tracks.geometry.camera import optical_axis_b
 
-DRAG = EFFECTS["linear_drag"].values((0.3, 0.3, 0.3))
+LINEAR, WEAK = (EFFECTS[name].values for name in ("linear_drag", "weak_motor"))
+DRAG = LINEAR((0.3, 0.3, 0.3))
 TABLE = tomllib.loads((vehicle_file.SHIPPED / "racer5.toml").read_text())
 
 
@@ -186,9 +193,23 @@ def test_a_vehicle_of_a_program_is_checked_as_a_file_is(tmp_path, effect, drag, 
         ("effects", {"quadratic_drag": DRAG}, "effects.quadratic_drag is LinearDrag"),
         ("controller", replace(PLAIN.controller, kind="pid"), "controller.kind is 'pid', allowed"),
         ("controller", replace(PLAIN.controller, kind="px4"), "controller.settings is None, allo"),
+        ("controller.kind", [], r"controller.kind is \[\], allowed is a text"),
+        ("mass", "0.75", "mass is '0.75', allowed is a finite number"),
+        ("inertia", 0.003, "inertia is 0.003, allowed is a list of 3 numbers"),
+        ("rotors.spin", None, "rotors.spin is None, allowed is a list of 4 numbers"),
+        ("rotors.position", (0.1,) * 4, r"rotors.position\[0\] is 0.1, allowed is a list of 3"),
+        ("rotors.speed_max", "2100", "rotors.speed_max is '2100', allowed is a finite number"),
+        ("body.half_size", {"x": 0.1}, "body.half_size is {'x': 0.1}, allowed is a list of 3"),
+        ("camera.fov_deg", 90.0, "camera.fov_deg is 90.0, allowed is a list of 2 numbers"),
+        ("camera.width", "32", "camera.width is '32', allowed is a whole number"),
+        ("motors", MotorMap((1.0, 5.0), cast(Any, None)), "motors.voltage is None, allowed is a f"),
+        ("effects", {"linear_drag": LINEAR(0.3)}, "linear_drag.coefficient is 0.3, allowed is a"),
+        ("effects", {"weak_motor": WEAK((1.0,) * 3)}, r"effects.weak_motor is Weak.*\(1.0, 1.0, 1"),
     ],
 )
 def test_a_part_of_another_type_is_refused_by_its_name(tmp_path, part, value, said):
+    part, _, key = part.partition(".")
+    value = replace(getattr(PLAIN, part), **{key: value}) if key else value
     vehicle = replace(PLAIN, **{part: value})
     with pytest.raises(ValueError, match=said):
         vehicle_file.save_vehicle(vehicle, tmp_path / "v.toml")
