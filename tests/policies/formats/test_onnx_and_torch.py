@@ -348,35 +348,6 @@ def test_torchscript_needs_trust_and_flies_on_after_a_failure(tmp_path):
     np.testing.assert_array_equal(action_of(policy, np.ones((2, 12))), np.ones((2, 3)))
 
 
-class Counting(torch.nn.Module):
-    """Counts its steps in a memory of two rows, as that of an LSTM."""
-
-    def forward(
-        self, state: torch.Tensor, image: torch.Tensor, hidden: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        return hidden[:, 1, :3], hidden + 1.0
-
-
-@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
-def test_the_memory_of_a_script_is_that_of_its_contract(tmp_path, in_process):
-    path = tmp_path / "it.pt"
-    text = contract_of(PolicySpec(), (2, 4)).text
-    torch.jit.save(torch.jit.script(Counting()), str(path), _extra_files={contract.KEY: text})
-    policy = load_policy(path, trust=True)
-    hidden = policy.start(2)
-    for step in range(2):
-        inputs = np.ones((2, 12)), np.ones((2, 24, 32)), np.zeros(2, bool)
-        action, hidden = policy.act(hidden, *inputs)
-        assert hidden.shape == (2, 2, 4) and (action == step).all()
-    extra = {contract.KEY: contract_of(PolicySpec(), (2**9, 2**9)).text}
-    torch.jit.save(torch.jit.script(Counting()), str(path), _extra_files=extra)
-    with pytest.raises(PolicyError, match=r"\[512, 512\], allowed are up to 65536 numbers"):
-        load_policy(path, trust=True)
-    torch.jit.save(torch.jit.script(Counting()), str(path))  # its memory has no size
-    with pytest.raises(PolicyError, match=r"given a hidden of 192 numbers; set hidden_size in the"):
-        load_policy(path, trust=True)
-
-
 @pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
 def test_a_script_without_the_memory_of_its_contract_is_refused(tmp_path, in_process):
     path = tmp_path / "it.pt"
