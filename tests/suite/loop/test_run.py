@@ -118,7 +118,7 @@ def test_a_finished_loop_is_only_told_again_and_another_one_refused(whole, monke
     said = json.loads(printed.out)
     assert said["verdict"] in before and (out / "table.md").read_text() == before
     for name, count in (("fine-tunings", 2), ("training", 3)):
-        assert f"the {name}: {count} gradient steps are not more than the warm-up" in printed.err
+        assert f"the {name}: {count} gradient steps, not more than the warm-up" in printed.err
     assert "| point mass with Delta Action Model |" in printed.err and "<!--" not in printed.err
     other = " ".join(TRAIN).replace("--trials 2", "--trials 5").split()
     assert cli.main([*other, "--out", str(out)]) == 2
