@@ -204,11 +204,11 @@ def test_training_goes_on_from_a_policy_by_its_name_and_does_not_write_over_it(
     assert "config.json is also an input and would be overwritten" in said
     said = refused(capsys, "train --init-from race-paper --out", own)
     assert "is the folder of a policy; give a folder for the new run" in said
-    asked = "train --recipe race-paper --iterations 20 --set spec.camera.fov_deg=1.4,1.1 --out"
-    run(asked, tmp_path / "run")
+    changes = "--set spec.camera.fov_deg=1.4,1.1 loss.tilt=1"
+    run(f"train --recipe race-paper --iterations 20 {changes} --out", tmp_path / "run")
     said = capsys.readouterr().err
     assert "20 gradient steps, not more than the warm-up" in said
-    assert "sees only 1.4 x 1.1 deg" in said
+    assert "sees only 1.4 x 1.1 deg" in said and "loss.tilt has no gradient" in said
     assert "optimizer.rate" in refused(capsys, "train --set optimizer.rate=0 --out", tmp_path / "r")
 
 
