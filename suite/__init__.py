@@ -198,7 +198,7 @@ def train_policy(
         resolved = resolve(config)
         refuse_policy_folder(folder)
         with one_writer(folder), _precision_of_commands():
-            warn_of(doubts(resolved))
+            warn_of(doubts(resolved, changes))
             outcome = train(resolved, folder, _console(progress))
     return Path(outcome.policy)
 

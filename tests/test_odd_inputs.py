@@ -195,7 +195,7 @@ def test_python_names_its_own_arguments_and_not_options_of_commands(tmp_path):
         (partial(fly, difficulty="easy"), "difficulty 'easy': 'easy' is no level"),
         (partial(fly, workers=0), "workers is 0, allowed is 1 to 256"),
         (partial(fly, workers="2"), "workers is '2', allowed is a whole number, 1 to 256"),
-        (partial(train, settings=["los.progress=1"]), "unknown settings 'los.progress=1'"),
+        (partial(train, settings=["los.progress=1"]), "settings 'los.progress=1': unknown"),
         (partial(train, seed=-1), "seed is -1, allowed is 0 to"),
         (partial(suite.diagnose_flights, [], "racer5", tmp_path / "out"), "flights is empty, allo"),
     ):

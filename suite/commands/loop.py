@@ -17,6 +17,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """Run the loop, or its unfinished stages."""
     from suite.loop.config import resolve
     from suite.loop.run import run_loop
+    from suite.train.run import change_warnings
 
     workers = read_workers_option(config.workers, whole_cores=True)
-    return run_loop(resolve(config), config.out, console, workers)
+    resolved = resolve(config)
+    changed = resolved.training if resolved.policy is None else resolved.tuning
+    for warning in change_warnings(changed, config.set):
+        console.note(f"warning: {warning}")
+    return run_loop(resolved, config.out, console, workers)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,8 +21,6 @@ from suite.train.overrides import (
     check_owned,
     check_phases,
     phase_configs,
-    rate_loop_warnings,
-    warmup_warnings,
     with_changes,
 )
 from suite.train.recipes import finetune, named_recipe, with_model, with_sensors
@@ -123,14 +122,16 @@ def resolve(config: Config) -> TrainConfig:
     return run
 
 
-def doubts(resolved: TrainConfig, anew: str = "") -> list[str]:
+def doubts(resolved: TrainConfig, changes: Sequence[str], anew: str = "") -> list[str]:
     """Return warnings about settings that are probably mistakes.
 
-    `anew` follows the advice on another camera.
+    `changes` are those of --set. `anew` follows the advice on another camera.
     """
     from eval.logs.faults.vehicle import narrow_view
+    from suite.train.run import change_warnings, rate_loop_warnings, warmup_warnings
 
-    warnings = [*warmup_warnings(resolved), *rate_loop_warnings(resolved)]
+    warnings = [*change_warnings(resolved, changes), *warmup_warnings(resolved)]
+    warnings += rate_loop_warnings(resolved)
     if text := narrow_view(resolved.spec.camera.fov_deg):
         text = f"the policy: {text}; spec.camera.fov_deg is in degrees, not radians"
         warnings = [text, *warnings]
@@ -165,7 +166,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     resolved = resolve(config)
     refuse_policy_folder(config.out)
     anew = "" if config.init_from is None else " and leave --init-from out"
-    for warning in doubts(resolved, anew):
+    for warning in doubts(resolved, config.set, anew):
         console.note(f"warning: {warning}")
     params, delta = None, None
     if config.init_from is not None:

@@ -24,7 +24,7 @@ from suite.loop.compare import CAVEAT, PolicyResult, cell_grid, overall_grid, po
 from suite.loop.config import LoopConfig, loop_by_content
 from suite.loop.variants import COLOURS, Findings
 from suite.loop.work import LoopRun, plan
-from suite.train.overrides import warmup_warnings
+from suite.train.run import warmup_warnings
 from tracks.common.files import check_no_input, plain, to_json, write_json, write_text
 from tracks.common.grid import markdown, rich_table, table
 from tracks.common.provenance import VERSION, git_commit, stamp, stamp_text

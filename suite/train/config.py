@@ -15,7 +15,7 @@ from typing import Annotated
 from eval.sensors.sensors_file import SensorSet
 from eval.vehicles.vehicle import Vehicle
 from policies.spec import PolicySpec, check_network, check_spec
-from tracks.input.ranges import Iterations, Range, Seed, Share, check_ranges
+from tracks.input.ranges import Iterations, Range, Seed, Share, check_ranges, check_type
 
 COM_STD_MOST, TRIM_STD_MOST = 0.02, 0.2
 """Upper limits of `QuadrotorConfig.com_std_m` [m] and `trim_std` [N m]."""
@@ -93,6 +93,9 @@ class QuadrotorConfig:
     trim_std: Annotated[float, Range(0.0, TRIM_STD_MOST)] = 0.0
     """Standard deviation of a constant torque over worlds, about x and about y, around that in the
     vehicle file [N m]; about z it is a fifth. Deviations above twice this value are cut to it."""
+
+    def __post_init__(self) -> None:
+        check_type("vehicle", self.vehicle, (Vehicle,), "a Vehicle, as load_vehicle returns it")
 
 
 @dataclass(frozen=True)

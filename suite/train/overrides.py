@@ -52,6 +52,14 @@ ABSENT = {
 FROM_FILES = {"quadrotor.vehicle": "--vehicle", "sensors.seen": "--sensors"}
 """Part of the settings that is the content of a file -> the option that names the file. It is not
 changed by `--set`: the camera of a vehicle file, for example, has no effect on a training."""
+OTHER_NAMES = [
+    ("lr", "optimizer.rate"),
+    ("learning_rate", "optimizer.rate"),
+    ("num_envs", "episode.batch"),
+]
+"""(name that other trainers or an option of the command have for a setting, the setting's path)."""
+KINDS: dict[type, str] = {int: "a whole number", float: "a number", str: "a text"}
+"""Type of a setting -> what is allowed for it."""
 PREFIX = "phases."
 """Prefix of a change that begins in a later phase."""
 
@@ -69,14 +77,16 @@ def _changed(config: T, changes: Iterable[str]) -> T:
                     f"--set {shown(change)}: {part} comes from a file; give another file with "
                     f"{option}"
                 )
+        if keys[0] == "phases":
+            raise ValueError(f"--set {shown(change)}: write phases.N.SETTING=VALUE with N from 1")
         _check_model(config, keys, shown(change))
         config = _with_value(config, keys, text.strip(), shown(change), config)
         check_ranges(config, f"--set {shown(change)}: ")
     return config
 
 
-def _path(change: str) -> str:
-    """Return the path of a change PATH=VALUE."""
+def path_of(change: str) -> str:
+    """Return the path of the setting that a change PATH=VALUE sets."""
     return change.partition("=")[0].strip()
 
 
@@ -118,7 +128,7 @@ def check_owned(changes: Iterable[str], owned: Mapping[str, str]) -> None:
         ValueError: naming the setting and what to do instead.
     """
     for change in changes:
-        path = _path(_phase_of(change)[1])
+        path = path_of(phase_of(change)[1])
         for owned_path, advice in owned.items():
             if is_within(path, owned_path):
                 raise ValueError(f"--set {shown(change)}: this command sets {path}; {advice}")
@@ -144,30 +154,40 @@ def _with_value(config: T, path: list[str], text: str, change: str, root: object
     name, *rest = path
     names = [field.name for field in dataclasses.fields(config)]
     if name not in names:
-        ends = {path: path.rpartition(".")[2] for path in _paths(root)}
-        leaf = closest(name, ends.values())
-        elsewhere = [path for path, end in ends.items() if end == leaf]
+        ends = [(path.rpartition(".")[2], path) for path in _paths(root)] + OTHER_NAMES
+        leaf = closest(name, [end for end, _ in ends])
+        elsewhere = [path for end, path in ends if end == leaf]
+        problem: object = unknown_name("setting", name, names)
         if elsewhere and (leaf == name or closest(name, names) is None):
-            raise ValueError(
-                f"--set {change}: setting {shown(name)} is unknown. Did you mean "
-                f"{', '.join(elsewhere)}? suite train --list-settings prints all settings"
-            )
-        raise unknown_name(f"--set {change}: setting", name, names)
+            problem = f"unknown setting {shown(name)}. Did you mean {', '.join(elsewhere)}?"
+        raise ValueError(
+            f"--set {change}: {problem} suite train --list-settings prints all settings"
+        )
     old = getattr(config, name)
-    if rest and old is None and name in ABSENT:
+    if old is None and name in ABSENT:
         raise ValueError(f"--set {change}: this run has no {ABSENT[name]}")
     if rest:
         return dataclasses.replace(config, **{name: _with_value(old, rest, text, change, root)})
     if dataclasses.is_dataclass(old):
         parts = ", ".join(field.name for field in dataclasses.fields(old))
         raise ValueError(f"--set {change}: {name!r} has parts, set one of {parts}")
-    return dataclasses.replace(config, **{name: _value(old, text, change)})
+    try:
+        value = _value(old, text)
+    except ValueError:
+        several = "; separate settings by spaces, not by commas" if "=" in text else ""
+        raise ValueError(
+            f"--set {change}: {name} is {shown(text)}, allowed is {_allowed(old)}{several}"
+        ) from None
+    return dataclasses.replace(config, **{name: value})
 
 
-def _value(old: object, text: str, change: str) -> object:
+def _value(old: object, text: str) -> object:
     """Return the value in `text` for a setting, which must have the type of the `old` value.
 
     Whole numbers are allowed for floats, and lists for tuples of the same length.
+
+    Raises:
+        ValueError: without a message, for a value of another type.
     """
     try:
         value = ast.literal_eval(text)
@@ -177,15 +197,19 @@ def _value(old: object, text: str, change: str) -> object:
     if isinstance(old, float) and value == "inf":
         return math.inf
     if isinstance(old, tuple) and isinstance(value, (tuple, list)) and len(value) == len(old):
-        return tuple(_value(a, repr(b), change) for a, b in zip(old, value, strict=True))
+        return tuple(_value(a, repr(b)) for a, b in zip(old, value, strict=True))
     if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
         return float(value) if is_finite(value) else math.inf
     if type(value) is not type(old) or isinstance(old, tuple):
-        raise ValueError(
-            f"--set {change}: {shown(text)} does not fit, the setting is like {old!r} "
-            f"({type(old).__name__})"
-        )
+        raise ValueError
     return value
+
+
+def _allowed(old: object) -> str:
+    """Return what is allowed for a setting with the `old` value."""
+    if isinstance(old, tuple):
+        return f"a list of {len(old)}, such as {repr(old)[1:-1].replace(' ', '')}"
+    return "True or False" if isinstance(old, bool) else f"{KINDS[type(old)]}, such as {old}"
 
 
 def phase_ends(config: TrainConfig) -> tuple[int, ...]:
@@ -196,31 +220,6 @@ def phase_ends(config: TrainConfig) -> tuple[int, ...]:
         share += phase.share
         ends.append(min(total, round(share * total)))
     return tuple(ends)
-
-
-def warmup_warnings(config: TrainConfig) -> list[str]:
-    """Return a warning for each phase that ends before its learning rate reaches the peak."""
-    ends = phase_ends(config)
-    counts = (end - begin for begin, end in zip((0, *ends), ends, strict=False))
-    return [
-        f"{count} gradient steps are not more than the warm-up (optimizer.warmup "
-        f"{phase.optimizer.warmup}), so the learning rate stays below its peak"
-        for phase, count in zip(phase_configs(config), counts, strict=True)
-        if count <= phase.optimizer.warmup
-    ]
-
-
-def rate_loop_warnings(config: TrainConfig) -> list[str]:
-    """Return a warning if the rate loop overshoots at every physics step of the training."""
-    for quadrotor in (phase.quadrotor for phase in phase_configs(config) if phase.quadrotor):
-        controller, hz = quadrotor.vehicle.controller, quadrotor.physics_hz
-        if controller.overshoots(1.0 / hz):
-            return [
-                f"vehicle {quadrotor.vehicle.name!r}: controller.rate_gain has "
-                f"{max(controller.rate_gain):g} 1/s, too fast for the training's {hz:g} physics "
-                f"steps a second; give --set quadrotor.physics_hz={controller.frequency:g}"
-            ]
-    return []
 
 
 def phase_configs(config: TrainConfig) -> tuple[TrainConfig, ...]:
@@ -286,32 +285,32 @@ def with_changes(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
         ValueError: naming the setting, what is wrong with it and what is allowed.
     """
     # A run's record does not depend on the order of changes of different settings.
-    changes = sorted((change.strip() for change in changes), key=_path)
+    changes = sorted((change.strip() for change in changes), key=path_of)
     given = set[tuple[int, str]]()
     for change in changes:
         _check_phase(change, len(config.phases))
-        number, rest = _phase_of(change)
-        if (setting := (int(number or 0), _path(rest))) in given:
+        number, rest = phase_of(change)
+        if (setting := (int(number or 0), path_of(rest))) in given:
             raise ValueError(f"--set {shown(change)}: {setting[1]} is given twice; give it once")
         given.add(setting)
     in_all_phases = [change for change in changes if not change.startswith(PREFIX)]
     in_all_phases = [*_same_seconds(config, in_all_phases), *in_all_phases]
     # These replace the recipe's own changes in its phases, but not the user's.
-    config = _changed(_without_phase_changes(config, map(_path, in_all_phases)), in_all_phases)
+    config = _changed(_without_phase_changes(config, map(path_of, in_all_phases)), in_all_phases)
     phases = list(config.phases)
     for index, phase in enumerate(config.phases):
-        own = [rest for text, rest in map(_phase_of, changes) if text and int(text) == index + 1]
+        own = [rest for text, rest in map(phase_of, changes) if text and int(text) == index + 1]
         own = [*_same_seconds(phase_configs(config)[index], own), *own]
         phases[index] = replace(phase, set=(*phase.set, *own))
         config = replace(config, phases=tuple(phases))
     configs = phase_configs(config)
     for change in changes:
-        number, rest = _phase_of(change)
-        _check_effective(configs[int(number or 1) - 1 :], _path(rest), shown(change))
+        number, rest = phase_of(change)
+        _check_effective(configs[int(number or 1) - 1 :], path_of(rest), shown(change))
     return config
 
 
-def _phase_of(change: str) -> tuple[str, str]:
+def phase_of(change: str) -> tuple[str, str]:
     """Return the number of the phase from which a change holds, "" for all, and the change."""
     if not change.startswith(PREFIX):
         return "", change
@@ -321,7 +320,7 @@ def _phase_of(change: str) -> tuple[str, str]:
 
 def _check_phase(change: str, count: int) -> None:
     """Refuse a change from a phase on that cannot be made in a run with `count` phases."""
-    number, rest = _phase_of(change)
+    number, rest = phase_of(change)
     if not change.startswith(PREFIX):
         return
     if not count:
@@ -331,7 +330,7 @@ def _check_phase(change: str, count: int) -> None:
             f"--set {shown(change)}: this run has {count} phases; write phases.N.SETTING=VALUE "
             "with N from 1"
         )
-    if _path(rest) == "optimizer.iterations":
+    if path_of(rest) == "optimizer.iterations":
         raise ValueError(
             f"--set {shown(change)}: phases take shares of the run's gradient steps; set "
             "optimizer.iterations without a phase"
@@ -343,8 +342,8 @@ def _same_seconds(config: TrainConfig, changes: Sequence[str]) -> list[str]:
 
     There are none if `changes` also set the number of steps.
     """
-    paths = set(map(_path, changes))
-    rate = [change for change in changes if _path(change) == "spec.rate_hz"]
+    paths = set(map(path_of, changes))
+    rate = [change for change in changes if path_of(change) == "spec.rate_hz"]
     if not rate or "episode.steps" in paths:
         return []
     same = at_rate(config, _changed(config, rate).spec.rate_hz)
@@ -394,7 +393,7 @@ def _without_phase_changes(config: TrainConfig, paths: Iterable[str]) -> TrainCo
     removed = tuple(paths)
 
     def is_kept(change: str) -> bool:
-        return not any(is_within(_path(change), path) for path in removed)
+        return not any(is_within(path_of(change), path) for path in removed)
 
     phases = (replace(phase, set=tuple(filter(is_kept, phase.set))) for phase in config.phases)
     return replace(config, phases=tuple(phases))

@@ -300,7 +300,8 @@ def with_model(config: TrainConfig, model: str | None, vehicle: str | None) -> T
     keeps that of the recipe.
 
     Raises:
-        ValueError: for a point mass with a vehicle, "quad" without one, or an invalid vehicle.
+        ValueError: for a point mass with a vehicle, "quad" without one for a recipe with the point
+            mass, or an invalid vehicle.
     """
     from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
 
@@ -312,11 +313,11 @@ def with_model(config: TrainConfig, model: str | None, vehicle: str | None) -> T
         return without_quadrotor(config)
     if vehicle is not None:
         return with_quadrotor(config, load_vehicle(vehicle))
-    if model is None:
+    if config.quadrotor is not None:
         return config
     raise ValueError(
-        "--model quad needs --vehicle: a vehicle file, or a shipped one by its name "
-        f"({', '.join(shipped_vehicles())})"
+        "--model quad needs --vehicle, since this recipe has the point mass: add --vehicle racer5, "
+        f"another shipped vehicle ({', '.join(shipped_vehicles())}) or a vehicle file"
     )
 
 

@@ -1,5 +1,6 @@
-"""Train a policy by backpropagation through differentiable dynamics, or estimate how long it takes.
+"""Train a policy by backpropagation through differentiable dynamics; estimate how long it takes.
 
+Further functions return warnings about settings that are allowed, but are probably mistakes.
 A run is one training; a phase is a part of it with its own settings. `train` describes the phases
 to the loop of `training_loop.py`, which iterates, saves and resumes in a folder. Simulated scenes
 and noise depend only on the seed and the iteration.
@@ -9,7 +10,8 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +23,12 @@ from eval.effects import without_signal
 from policies.formats.policy_file import PolicyCheckpoint
 from policies.networks import delta_network, network
 from policies.spec import PolicySpec
-from suite.common.console import Console
+from suite.common.console import Console, counted
 from suite.common.curve import Mirror
 from suite.common.running import hosts
 from suite.common.stages import Estimate
 from suite.train.config import TrainConfig
-from suite.train.overrides import check_phases, phase_configs, phase_ends
+from suite.train.overrides import check_phases, path_of, phase_configs, phase_ends, phase_of
 from suite.train.shards import check_processes
 from suite.train.training_loop import Outcome, Run, RunPhase, Watch, flight_note, train_in_folder
 from suite.train.update import make_update, start_state
@@ -69,6 +71,65 @@ def estimate(
         most_frames = max(most_frames, frames)
     floats = most_frames * (images * pixels + FLOATS_PER_UNIT * config.spec.hidden_size)
     return Estimate(seconds, PROGRAM_BYTES + floats * 4.0)  # 4 bytes a float
+
+
+def warmup_warnings(config: TrainConfig) -> list[str]:
+    """Return a warning for each phase that ends before its learning rate reaches the peak."""
+    ends, phases = phase_ends(config), phase_configs(config)
+    counts = (end - begin for begin, end in zip((0, *ends), ends, strict=False))
+    return [
+        (f"phase {number} of {len(phases)}: " if config.phases else "")
+        + f"{counted(count, 'gradient step')}, not more than the warm-up (optimizer.warmup "
+        f"{phase.optimizer.warmup}), so the learning rate stays below its peak; give more "
+        "iterations or a smaller optimizer.warmup"
+        for number, (phase, count) in enumerate(zip(phases, counts, strict=True), 1)
+        if count <= phase.optimizer.warmup
+    ]
+
+
+def rate_loop_warnings(config: TrainConfig) -> list[str]:
+    """Return a warning if the rate loop overshoots at every physics step of the training."""
+    for quadrotor in (phase.quadrotor for phase in phase_configs(config) if phase.quadrotor):
+        controller, hz = quadrotor.vehicle.controller, quadrotor.physics_hz
+        if controller.overshoots(1.0 / hz):
+            return [
+                f"vehicle {quadrotor.vehicle.name!r}: controller.rate_gain has "
+                f"{max(controller.rate_gain):g} 1/s, too fast for the training's {hz:g} physics "
+                f"steps a second; give --set quadrotor.physics_hz={controller.frequency:g}"
+            ]
+    return []
+
+
+def change_warnings(config: TrainConfig, changes: Iterable[str]) -> list[str]:
+    """Return warnings about a user's `changes`, which are made in `config` already.
+
+    A later phase may undo a change, and a tilt has no gradient through a point mass.
+    """
+    # (number of the phase from which a change holds, path of the setting)
+    given = [
+        (int(number or 1), path_of(rest))
+        for number, rest in (phase_of(change.strip()) for change in changes)
+    ]
+    configs, warnings = phase_configs(config), []
+    for first, path in given:
+        value = attrgetter(path)(configs[first - 1])
+        for number, phase in enumerate(configs[first:], first + 1):
+            if (number, path) in given:
+                break
+            if (other := attrgetter(path)(phase)) != value:
+                warnings.append(
+                    f"{path} is {value!r} until phase {number} of {len(configs)}, which sets it to "
+                    f"{other!r}; to keep it, give phases.{number}.{path} as well, or {path} for "
+                    "all phases"
+                )
+                break
+        if path == "loss.tilt" and value > 0.0 and config.quadrotor is None:
+            warnings.append(
+                "loss.tilt has no gradient through the point mass, which has no attitude: it only "
+                "leaves out worlds that tilt beyond 90 degrees; train through quadrotors (suite "
+                "train: add --model quad and --vehicle), or leave loss.tilt out"
+            )
+    return warnings
 
 
 def start_params(start: PolicyCheckpoint, spec: PolicySpec) -> network.Params:

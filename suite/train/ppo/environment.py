@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,14 @@ from suite.train.rollout import Episode, Observer, queue, world_keys
 from suite.train.step import BODY_RADIUS_M, target_gate
 from suite.train.worlds import Worlds, sample_worlds
 from tracks.common.masks import select
+from tracks.input.ranges import (
+    SEED_MOST,
+    Range,
+    TimeLimit,
+    check_number,
+    check_ranges,
+    check_type,
+)
 
 ACTION_LIMIT = 20.0
 """Acceleration that an action of 1 means in `JaxRace`, as in `eval.envs` [m/s^2]."""
@@ -124,10 +132,14 @@ class JaxRace:
     config: TrainConfig
     """Settings of the observation, dynamics, randomisation and tracks; of those of the loss only
     the safety radius r_q is used."""
-    time_limit_s: float = 20.0
+    time_limit_s: TimeLimit = 20.0
     """Longest episode [s]."""
-    reward_scale: float = 0.01
+    reward_scale: Annotated[float, Range(0.0, 1e6, above=True)] = 0.01
     """Factor on the rewards of `suite.train.ppo.reward`."""
+
+    def __post_init__(self) -> None:
+        check_type("config", self.config, (TrainConfig,), "a TrainConfig, the settings")
+        check_ranges(self)
 
     @property
     def spec(self) -> PolicySpec:
@@ -153,7 +165,13 @@ class JaxRace:
             return make_race(self.config)
 
     def worlds(self, count: int, seed: int = 0) -> Worlds:
-        """Return a pool of `count` worlds: tracks, starts and vehicles, drawn by numpy."""
+        """Return a pool of `count` worlds: tracks, starts and vehicles, drawn by numpy.
+
+        Raises:
+            ValueError: for a count or a seed outside its range.
+        """
+        check_number("count", count, Range(1, 10**6, whole=True))
+        check_number("seed", seed, Range(0, SEED_MOST, whole=True))
         episode = replace(self.config.episode, batch=count)
         drawn = sample_worlds(replace(self.config, episode=episode, seed=seed), 0)
         return jax.tree.map(jnp.asarray, drawn)

@@ -20,7 +20,7 @@ from suite.common.vehicles import camera_warnings
 from suite.delta.replay import describe_dynamics
 from suite.judging.flying import checkpoint_folder
 from suite.train import run as training
-from suite.train.overrides import rate_loop_warnings
+from suite.train.run import rate_loop_warnings
 from tests.support.commands import answer, refused, run
 from tests.support.documents import unpainted
 from tests.support.marks import more
@@ -204,11 +204,11 @@ def test_training_goes_on_from_a_policy_by_its_name_and_does_not_write_over_it(
     assert "config.json is also an input and would be overwritten" in said
     said = refused(capsys, "train --init-from race-paper --out", own)
     assert "is the folder of a policy; give a folder for the new run" in said
-    asked = "train --recipe race-paper --iterations 20 --set spec.camera.fov_deg=1.4,1.1 --out"
-    run(asked, tmp_path / "run")
+    changes = "--set spec.camera.fov_deg=1.4,1.1 loss.tilt=1"
+    run(f"train --recipe race-paper --iterations 20 {changes} --out", tmp_path / "run")
     said = capsys.readouterr().err
-    assert "20 gradient steps are not more than the warm-up" in said
-    assert "sees only 1.4 x 1.1 deg" in said
+    assert "20 gradient steps, not more than the warm-up" in said
+    assert "sees only 1.4 x 1.1 deg" in said and "loss.tilt has no gradient" in said
     assert "optimizer.rate" in refused(capsys, "train --set optimizer.rate=0 --out", tmp_path / "r")
 
 
@@ -232,8 +232,9 @@ def test_the_command_line_asks_for_model_and_vehicle_together():
     own = resolve(Config()).quadrotor
     assert own is not None and own.vehicle != reference, "by default it has not seen the tables'"
     assert resolve(Config(recipe="race-paper")).quadrotor is None
-    with pytest.raises(ValueError, match="--model quad needs --vehicle.*reference"):
-        resolve(Config(model="quad"))
+    assert resolve(Config(model="quad")) == resolve(Config()), "the recipe's vehicle"
+    with pytest.raises(ValueError, match="--model quad needs --vehicle.*add --vehicle racer5"):
+        resolve(Config(recipe="quick", model="quad"))
     around = resolve(Config(vehicle="reference")).quadrotor
     assert around == replace(own, vehicle=reference), "the recipe's own spreads"
     with pytest.raises(ValueError, match="--vehicle is racer5.*point mass has none.*--model quad"):

@@ -36,7 +36,7 @@ from tracks.common.files import write_text
 
 EXAMPLE = "examples/hidden.toml"
 SIZES = "loop --recipe quick --track zigzag --difficulty 0 --trials 2 --flights 2"
-SIZES += " --finetune-iterations 2 --seed 4 --set episode.batch=2"
+SIZES += " --finetune-iterations 2 --seed 4 --set episode.batch=2 loss.tilt=1"
 TUNE = [*SIZES.split(), "--fit-iterations", "3"]
 TRAIN = [*TUNE, "--iterations", "3"]
 HIDDEN = [*SIZES.split(), "--hidden-vehicle", EXAMPLE]
@@ -118,7 +118,8 @@ def test_a_finished_loop_is_only_told_again_and_another_one_refused(whole, monke
     said = json.loads(printed.out)
     assert said["verdict"] in before and (out / "table.md").read_text() == before
     for name, count in (("fine-tunings", 2), ("training", 3)):
-        assert f"the {name}: {count} gradient steps are not more than the warm-up" in printed.err
+        assert f"the {name}: {count} gradient steps, not more than the warm-up" in printed.err
+    assert "warning: loss.tilt has no gradient through the point mass" in printed.err
     assert "| point mass with Delta Action Model |" in printed.err and "<!--" not in printed.err
     other = " ".join(TRAIN).replace("--trials 2", "--trials 5").split()
     assert cli.main([*other, "--out", str(out)]) == 2

@@ -22,7 +22,7 @@ from suite.train.overrides import (
     without_quadrotor,
 )
 from suite.train.recipes import RECIPES, named_recipe, with_iterations, with_model
-from suite.train.run import train
+from suite.train.run import change_warnings, train, warmup_warnings
 from tests.support.training import small_config
 
 
@@ -95,15 +95,25 @@ def test_settings_that_would_do_nothing_or_that_the_command_sets_itself_are_refu
     ("change", "words"),
     [
         ("loss.progres=1", "Did you mean 'progress'"),
-        ("progress=2", "setting 'progress' is unknown. Did you mean loss.progress"),
-        ("loss.rate_hz=20", "setting 'rate_hz' is unknown. Did you mean spec.rate_hz"),
+        ("progress=2", "unknown setting 'progress'. Did you mean loss.progress"),
+        ("loss.rate_hz=20", "unknown setting 'rate_hz'. Did you mean spec.rate_hz"),
+        ("lr=1e-3", "unknown setting 'lr'. Did you mean optimizer.rate? suite train --list"),
+        ("optimizer.learning_rate=1e-3", "Did you mean optimizer.rate?"),
+        ("num_envs=8", "Did you mean episode.batch?"),
+        ("epochs=8", ": unknown setting 'epochs'. Known: spec, "),
+        ("phases=3", "write phases.N.SETTING=VALUE"),
+        ("sensors=vio", "this run has no sensor models; suite train: add --sensors"),
         ("loss=1", "has parts, set one of clearance"),
         ("loss.progress.more=1", "'more' is below a setting that has no parts"),
         ("quadrotor.mass_std=0.1", "this run has no quadrotor; take a recipe"),
         ("loss.progress", "write FIELD=VALUE"),
-        ("loss.progress=fast", "'fast' does not fit, the setting is like"),
-        ("physics.drag=(1,2,3)", "(tuple)"),
-        ("physics.drag=(1,'a')", "(float)"),
+        ("loss.progress=true", "progress is 'true', allowed is a number, such as 1.2"),
+        ("loss.progress=1,loss.jerk=2", "a number, such as 1.2; separate settings by spaces"),
+        ("loss.pass_first=yes", "pass_first is 'yes', allowed is True or False"),
+        ("episode.batch=1.5", "batch is '1.5', allowed is a whole number, such as 64"),
+        ("spec.action.kind=3", "kind is '3', allowed is a text, such as acceleration"),
+        ("physics.drag=(1,2,3)", "allowed is a list of 2, such as 0.1,0.8"),
+        ("physics.drag=(1,'a')", "allowed is a list of 2, such as 0.1,0.8"),
     ],
 )
 def test_wrong_settings_are_refused_by_name(change, words):
@@ -218,6 +228,34 @@ def test_a_phase_keeps_what_came_before_and_a_change_holds_in_all_or_in_the_one_
     recipe = without_quadrotor(named_recipe("race"))
     check_phases(recipe)
     assert all(one.quadrotor is None for one in phase_configs(recipe))
+
+
+@pytest.mark.parametrize(
+    ("run", "changes", "words"),
+    [
+        ("race", ["phases.2.loss.tilt=5"], r"loss.tilt is 5.0 until phase 3 of 3, .* to 40.0; to"),
+        ("race", ["phases.1.loss.progress=1"], "give phases.2.loss.progress as well"),
+        ("race", ["episode.steps=90", "phases.3.spec.rate_hz=60"], "steps is 90 until phase 3"),
+        ("race", ["phases.2.loss.tilt=5", "phases.3.loss.tilt=6"], None),
+        ("race", ["phases.2.loss.collide=5", "loss.tilt=6"], None),
+        ("quick", ["loss.tilt=5"], "loss.tilt has no gradient through the point mass"),
+        ("quick", ["loss.tilt=0", "loss.jerk=1"], None),
+    ],
+)
+def test_changes_that_a_later_phase_undoes_or_without_a_gradient_give_a_warning(
+    run, changes, words
+):
+    warnings = change_warnings(with_changes(named_recipe(run), changes), changes)
+    assert len(warnings) == (words is not None), warnings
+    assert words is None or re.search(words, warnings[0])
+
+
+def test_a_warning_of_the_warm_up_names_the_phase():
+    changes = ["optimizer.warmup=2"]
+    (warning,) = warmup_warnings(with_changes(RUN, changes))
+    assert warning.startswith("phase 3 of 3: 2 gradient steps, not more than the warm-up")
+    (warning,) = warmup_warnings(with_iterations(TrainConfig(), 1))
+    assert warning.startswith("1 gradient step, not")
 
 
 def test_recipes_are_within_the_limits_and_their_phases_share_any_number_of_iterations():

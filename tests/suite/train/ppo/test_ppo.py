@@ -276,6 +276,25 @@ reset = jax.jit(jax.vmap(ENV.reset, (0, None)))
 step = jax.jit(jax.vmap(ENV.step, (0, 0, 0, None)))
 
 
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: ENV.worlds(0), "count is 0, allowed is 1 to"),
+        (lambda: ENV.worlds(2, seed=-1), "seed is -1, allowed is 0 to"),
+        (lambda: replace(ENV, time_limit_s=-1), "time_limit_s is -1, allowed is above 0"),
+        (
+            lambda: replace(ENV, reward_scale=float("nan")),
+            "reward_scale is nan, allowed is above 0",
+        ),
+        (lambda: JaxRace("race"), "config is 'race', allowed is a TrainConfig"),  # type: ignore[arg-type]
+        (lambda: QuadrotorConfig("racer5"), "vehicle is 'racer5', allowed is a Vehicle"),  # type: ignore[arg-type]
+    ],
+)
+def test_a_race_that_cannot_be_made_is_refused_with_what_is_allowed(call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
+
+
 @pytest.fixture(scope="module")
 def worlds():
     drawn = ENV.worlds(4, seed=3)
