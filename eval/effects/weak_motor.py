@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from eval.effects.interface import Array, Effect, Parameter
 from tracks.input.ranges import is_number, shown
 
@@ -55,6 +57,8 @@ def read(table: Mapping[str, Any]) -> WeakMotor:
 
 def write(values: WeakMotor) -> dict[str, Any]:
     """Return the vehicle file's table with the rotors whose scale is not 1."""
+    if np.shape(values.scale) != (4,):
+        raise ValueError(f"effects.weak_motor.scale is {shown(values.scale)}, allowed is 4 numbers")
     weak = [(i + 1, float(s)) for i, s in enumerate(values.scale) if s != 1.0] or [(1, 1.0)]
     if len(weak) == 1:
         return {"index": weak[0][0], "scale": weak[0][1]}

@@ -138,13 +138,13 @@ def vehicle_table(vehicle: Vehicle) -> dict[str, Any]:
         "name": vehicle.name,
         "schema": SCHEMA,
         "mass": vehicle.mass,
-        "inertia": list(vehicle.inertia),
-        "rotors": {**_plain(vars(vehicle.rotors)), "spin": list(vehicle.rotors.spin)},
+        "inertia": _listed(vehicle.inertia),
+        "rotors": {**_plain(vars(vehicle.rotors)), "spin": _listed(vehicle.rotors.spin)},
         "controller": _controller_table(vehicle.controller),
         "body": _plain(vars(vehicle.body)),
         "camera": {
             "pitch_deg": camera.pitch_deg,
-            "fov_deg": list(camera.fov_deg),
+            "fov_deg": _listed(camera.fov_deg),
             "range": camera.range_m,
         },
         **({"motors": _plain(vars(vehicle.motors))} if vehicle.motors else {}),
@@ -263,9 +263,20 @@ def _camera(table: Table) -> Camera:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as dicts, lists and floats, as TOML has them."""
+    """Return a value as dicts, lists and floats, as TOML has them; the reader refuses others."""
     if isinstance(value, Mapping):
         return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, (tuple, list)) or getattr(value, "ndim", 0) > 0:
         return [_plain(entry) for entry in value]
-    return float(value)
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return value
+
+
+def _listed(value: Any) -> Any:
+    """Return the values of a tuple as a list; the reader refuses what has none."""
+    try:
+        return list(value)
+    except TypeError:
+        return value

@@ -3,6 +3,7 @@
 import copy
 import tomllib
 from dataclasses import replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 import suite
 from eval.effects import EFFECTS
+from eval.effects.weak_motor import WeakMotor
 from eval.quadrotor import vehicle_file
 from eval.quadrotor.model import BODY, CAMERA, COLLIDES, compile_quadrotor, rotor_name
 from eval.vehicles.vehicle import MotorMap, command_of_thrust, motor_speed, motor_thrust
@@ -18,8 +20,10 @@ from tests.support.pilots import Pursuit
 from tests.support.vehicles import PLAIN, drawn_effects, with_effects
 from tracks.common.provenance import stamp, stamp_text
 from tracks.common.toml_table import to_toml
-from tracks.geometry.camera import optical_axis_b
+from tracks.geometry.camera import Camera, optical_axis_b
 
+ANY: Any = replace
+"""`replace` for values of wrong types, which a type checker refuses."""
 DRAG = EFFECTS["linear_drag"].values((0.3, 0.3, 0.3))
 TABLE = tomllib.loads((vehicle_file.SHIPPED / "racer5.toml").read_text())
 
@@ -74,8 +78,9 @@ def test_arrays_are_written_as_numbers(tmp_path):
     vehicle_file.save_vehicle(vehicle, tmp_path / "v.toml")
     loaded = vehicle_file.load_vehicle(tmp_path / "v.toml")
     assert loaded == with_effects(linear_drag=((0.1, 0.2, 0.3),), mass_offset=(0.1,))
-    vehicle_file.save_vehicle(replace(PLAIN, mass=np.float64(0.7)), tmp_path / "v.toml")
-    assert vehicle_file.load_vehicle(tmp_path / "v.toml") == replace(PLAIN, mass=0.7)
+    for kind in (np.float64, np.float32):
+        vehicle_file.save_vehicle(replace(PLAIN, mass=kind(0.7)), tmp_path / "v.toml")
+        assert vehicle_file.load_vehicle(tmp_path / "v.toml") == replace(PLAIN, mass=kind(0.7))
 
 
 def test_an_impossible_vehicle_is_not_written(tmp_path):
@@ -178,6 +183,16 @@ def test_a_vehicle_of_a_program_is_checked_as_a_file_is(tmp_path, effect, drag, 
     [
         ("rotors", None, "rotors is None, allowed is a Rotors"),
         ("camera", 90.0, "camera is 90.0, allowed is a Camera"),
+        (
+            "camera",
+            ANY(Camera(), fov_deg=80),
+            "camera.fov_deg is 80, allowed is a list of 2 numbers",
+        ),
+        ("camera", ANY(Camera(), fov_deg=(80,)), "camera.fov_deg is .80., allowed is a list of 2"),
+        ("inertia", None, "inertia is None, allowed is a list of 3 numbers"),
+        ("rotors", ANY(PLAIN.rotors, spin=1), "rotors.spin is 1, allowed is a list of 4"),
+        ("rotors", ANY(PLAIN.rotors, time_constant="a"), "time_constant is 'a', allowed is a"),
+        ("effects", {"weak_motor": WeakMotor(0.9)}, "weak_motor.scale is 0.9, allowed is 4 numb"),
         ("motors", (1.0, 2.0), "motors is .*, allowed is a MotorMap or None"),
         ("effects", ["linear_drag"], "effects is .*, allowed is values by name of the effect"),
         ("effects", {"linear_drag": {"coefficient": (0.3, 0.3, 0.3)}}, "effects.linear_drag is {"),
