@@ -117,9 +117,6 @@ def evaluate_policy(
     check_type("difficulty", difficulty, (str, Integral), "a level, or several as a text: '0,3'")
     check_type("vehicle", vehicle, (*PATH, Vehicle), "a name, a path or a Vehicle")
     check_type("sensors", sensors, PATH, "a name or a path")
-    for name, number in (("trials", trials), ("seed", seed)):
-        if number is None:  # a range lets it pass, for settings that may have no value
-            raise ValueError(f"{name} is None, allowed is a whole number")
     if workers is not None:
         check_number("workers", workers, Range(1, MOST, whole=True))
     if isinstance(vehicle, Vehicle):
@@ -190,8 +187,6 @@ def train_policy(
 
     folder = as_path("out", out)
     changes = _all("settings", settings, "a text such as 'loss.progress=2'")
-    if seed is None:
-        raise ValueError("seed is None, allowed is a whole number")
     with _options_as_arguments("seed", "iterations", "out", set="settings"):
         config = Config(recipe=recipe, iterations=iterations, set=changes, seed=seed)
         check_ranges(config, options=True)
@@ -231,7 +226,7 @@ def diagnose_flights(
     from suite.diagnose.run import diagnose_files
 
     paths, before = (
-        tuple(map(Path, _all(name, given)))
+        tuple(as_path(name, entry) for entry in _all(name, given))
         for name, given in (("flights", flights), ("reference", reference))
     )
     file, folder = str(as_path("vehicle", vehicle)), as_path("out", out)
@@ -263,7 +258,7 @@ def identify_vehicle(
     """
     from suite.diagnose.identify.run import identify_files
 
-    paths = [*map(Path, _all("flights", flights))]
+    paths = [as_path("flights", entry) for entry in _all("flights", flights)]
     faults = _all("accept", accept, "the name of a fault")
     start, file, console = str(as_path("vehicle", vehicle)), as_path("out", out), _console(progress)
     with _options_as_arguments("out", "accept"), _precision_of_commands():

@@ -279,7 +279,7 @@ def _plain(value: Any) -> Any:
         return [_plain(entry) for entry in value]
     try:
         return value if isinstance(value, (str, bytes, bool)) else float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return value
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 DEFAULT = "race"
@@ -18,4 +19,5 @@ def names() -> list[str]:
 
 def locate(name_or_path: str | Path) -> Path:
     """Return a shipped policy's folder for its name; any other text is returned as a path."""
-    return (_HERE if str(name_or_path) in names() else Path()) / name_or_path
+    here = _HERE if str(name_or_path) in names() else Path()
+    return here / os.path.expanduser(name_or_path)

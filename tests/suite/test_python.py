@@ -17,7 +17,8 @@ from suite.diagnose import example
 from tests.support.courses import ONE_GATE
 from tests.support.pilots import Pursuit
 from tests.support.tools import python
-from tracks.families import FAMILIES
+from tracks.families import FAMILIES, make_track
+from tracks.families.layout import Layout
 
 EXAMPLE = Path(example.__file__).parent
 """Folder of the example's flights and its vehicle file."""
@@ -167,6 +168,11 @@ def test_what_cannot_be_used_is_not_registered(monkeypatch):
         suite.register_simulator("incomplete", Incomplete)
     with pytest.raises(ValueError, match="'all', which means the judged families"):
         suite.register_track("all", FAMILIES["zigzag"])
+    drawn = make_track("zigzag", 0, 0)
+    layout = Layout(drawn.scene, drawn.start_pos_w, drawn.start_yaw, drawn.names)
+    with pytest.raises(ValueError, match="Layout.* characters.; must be a function") as refused:
+        suite.register_track("layout", layout)
+    assert len(str(refused.value)) < 200
     for kept in ("_entries", "_values"):
         monkeypatch.setattr(FAMILIES, kept, {**getattr(FAMILIES, kept)})
     suite.register_track("own", FAMILIES["zigzag"])

@@ -10,6 +10,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
+from numbers import Integral, Real
 from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -332,9 +333,9 @@ def _value(value: Any) -> str:
     """Return a value that is not a table as TOML."""
     if isinstance(value, bool):
         return "true" if value else "false"
-    if isinstance(value, int):
-        return str(value)
-    if isinstance(value, float):
+    if isinstance(value, Integral):
+        return str(int(value))
+    if isinstance(value, Real):
         return repr(float(value))  # the repr of numpy's floats contains their type
     if isinstance(value, str):
         # TOML's basic strings use JSON's escapes, and DEL must be escaped as well.

@@ -18,7 +18,7 @@ from tracks.common.names import Registry
 from tracks.families import judged, random
 from tracks.families.layout import GATE_COUNT, Layout
 from tracks.geometry.scene import Counts, counts
-from tracks.input.ranges import check_type
+from tracks.input.ranges import check_type, shown
 from tracks.track import Track
 from tracks.track_check import check_track
 
@@ -31,7 +31,9 @@ FAMILIES: Registry[Callable[[float, np.random.Generator], Layout]] = Registry(
         "ellipse": judged.ellipse,
         "random": random.make,
     },
-    lambda _, make: None if callable(make) else f"{make!r}; must be a function (d, rng) -> Layout",
+    lambda _, make: (
+        None if callable(make) else f"{shown(make)}; must be a function (d, rng) -> Layout"
+    ),
 )
 """Name of a family -> function that draws its tracks."""
 JUDGED = ("zigzag", "circular", "ellipse")

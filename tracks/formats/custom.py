@@ -26,12 +26,14 @@ from tracks.track import Track
 if TYPE_CHECKING:
     import trimesh
 
-_START_BEHIND_M = 2.5
+START_BEHIND_M = 2.5
 """Default distance of the start before gate 0 [m]."""
 FARTHEST_M = 1e5
 """Largest allowed coordinate, as in a flight log [m]."""
 LEAST_M, MOST_M = 1e-3, 1e5
 """Smallest and largest allowed length [m]."""
+OPENING_MOST_M = 20.0
+"""Largest plausible opening of a gate [m]."""
 ANGLE_MOST_DEG = 3600.0
 """Largest allowed angle, ten turns: the heading along a course may count its turns [deg]."""
 MOST_TABLES = 1000
@@ -46,10 +48,11 @@ _TOP_KEYS = (
     *("boxes", "cylinders", "capsules", "spheres", "meshes"),
 )
 """All keys at the top of a file."""
-_GATE_KEYS = (
-    *("center", "yaw_deg", "pitch_deg", "roll_deg", "quat_wxyz", "width", "height", "radius"),
-    *("corners", "polygon", "frame_width", "frame_depth"),
-)
+_ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
+"""Keys of a rotation, instead of `quat_wxyz`."""
+_OPENING_KEYS = ("width", "height", "radius", "corners", "polygon")
+"""Keys of an opening; `_opening` has those that are given together."""
+_GATE_KEYS = ("center", *_ANGLES, "quat_wxyz", *_OPENING_KEYS, "frame_width", "frame_depth")
 """All keys of a gate."""
 _ROUNDING = 0.01
 """Share by which a mesh may be thinner than `LEAST_M`, because of rounding."""
@@ -168,8 +171,7 @@ def _gates(tables: list[Table]) -> Gates:
         table.close()
         lowest = (center[2] + opening @ rot[2, 1:]).min()
         if lowest < 0:
-            allowed = f"at least {-lowest:.2f} m higher: the opening reaches below the ground"
-            raise table.error("center", center.tolist(), allowed)
+            raise _below_ground(table, float(-lowest), float(np.ptp(opening, axis=0).max()))
         rows.append((center, rot, width, depth))
         openings.append(opening)
     corners = max(map(len, openings))
@@ -178,18 +180,29 @@ def _gates(tables: list[Table]) -> Gates:
     return Gates(center, rot, np.array(padded), width, depth)
 
 
+def _below_ground(table: Table, depth_m: float, size_m: float) -> ValueError:
+    """Return the error for an opening of a size that reaches to a depth below the ground."""
+    if size_m <= OPENING_MOST_M:
+        allowed = f"at least {depth_m:.2f} m higher: the opening reaches below the ground"
+        return table.error("center", table.values["center"], allowed)
+    given = {key: table.values[key] for key in _OPENING_KEYS if key in table.values}
+    allowed = f"lengths in metres; the opening is {size_m:g} m long and reaches {depth_m:g} m"
+    return table.error("opening", given, f"{allowed} below the ground: is it in centimetres?")
+
+
 def _opening(table: Table) -> np.ndarray:
     """Return the corners (V, 2) of one of: width and height; corners and radius; polygon."""
-    keys = [key for key in ("width", "radius", "polygon") if table.has(key)]
-    if len(keys) != 1:
+    keys = [key for key in _OPENING_KEYS if table.has(key)]
+    kinds = ({"width", "height"}, {"radius", "corners"}, {"polygon"})
+    if not keys or not any(kind.issuperset(keys) for kind in kinds):
         raise table.error(
             "opening",
             keys,
-            "one of: width and height; radius with corners (of a regular polygon); polygon",
+            "only one of: width and height; radius with corners (of a regular polygon); polygon",
         )
-    if keys == ["width"]:
+    if keys[0] in ("width", "height"):
         return rectangle(_length(table, "width"), _length(table, "height"))
-    if keys == ["radius"]:
+    if keys[0] != "polygon":
         corners = table.whole("corners", 12, least=3, most=64)
         return regular_polygon(corners, _length(table, "radius"))
     return _convex(table, table.points("polygon", 2, least=3, most=MOST_M))
@@ -226,8 +239,11 @@ def rotation(table: Table) -> np.ndarray:
     is positive nose up, roll positive right side down, body axes forward-left-up.
     """
     if table.has("quat_wxyz"):
+        for key in filter(table.has, _ANGLES):
+            allowed = "only one of both: the angles, or quat_wxyz, which is given too"
+            raise table.error(key, table.values[key], allowed)
         return quat_to_rot(_unit(table, "quat_wxyz", table.vector("quat_wxyz", 4)))
-    angles = np.deg2rad([_angle(table, f"{angle}_deg", 0.0) for angle in ("yaw", "pitch", "roll")])
+    angles = np.deg2rad([_angle(table, key, 0.0) for key in _ANGLES])
     (cy, cp, cr), (sy, sp, sr) = np.cos(angles), np.sin(angles)
     yaw = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     pitch = np.array([[cp, 0, -sp], [0, 1, 0], [sp, 0, cp]])
@@ -258,7 +274,7 @@ def _start(top: Table, gates: Gates) -> tuple[np.ndarray, float]:
     """Return the start's position (3,) [m] and heading [rad]: the file's, or before gate 0."""
     ahead = gates.rot_w[0, :, 0] * [1.0, 1.0, 0.0]
     level = np.linalg.norm(ahead)
-    pos_w = gates.center_w[0] - _START_BEHIND_M * ahead / max(level, 1e-9)
+    pos_w = gates.center_w[0] - START_BEHIND_M * ahead / max(level, 1e-9)
     table = top.table("start", {})
     if level < 1e-6 and not table.has("position"):
         raise table.error("position", None, "a position: gate 0 is flown straight up or down")

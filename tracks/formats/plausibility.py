@@ -6,15 +6,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tracks.formats.custom import OPENING_MOST_M, START_BEHIND_M
 from tracks.geometry.scene import Gates
 from tracks.track import Track
 
 if TYPE_CHECKING:
     import trimesh
 
-OPENING_MOST_M, STEP_MOST_M = 20.0, 200.0
-"""Largest plausible opening of a gate, and distance between gates that follow each other, of the
-start from gate 0, and of a solid from all of these [m]."""
+STEP_MOST_M = 200.0
+"""Largest plausible distance between gates that follow each other, of the start from gate 0, and of
+a solid from all of these [m]."""
 FRAME_MOST_M = 5.0
 """Largest plausible width and depth of a gate's frame, the largest of a race are about 1 m [m]."""
 THICK_MOST_M = 30.0
@@ -32,7 +33,16 @@ ROUNDING = 0.005
 STEP_LEAST_M = 0.3
 """Smallest plausible distance between different gates that follow each other [m]."""
 AGAINST = -0.7
-"""A gate is turned round if the cosines of its direction with the ways to and from it are less."""
+"""Cosine of a gate's direction with the path below which it is turned round."""
+ACROSS, ACROSS_AT_END = 0.2, 0.1
+"""Cosines of a gate's yaw with the path below which the gate is turned, and of one at an end of the
+path, which has a way on one side only. On the families' tracks they are larger. Two gates may
+stand next to each other."""
+CLEAR_WAY = 0.5
+"""Horizontal size of the unit vector to a gate, or of the mean of those to and from it, below which
+the path has no direction there: it is steep, or turns back."""
+CLOSED = 1.5
+"""A path is closed if its ends are nearer than this multiple of its longest step."""
 ALONG, ALONG_OTHERWISE, AMISS = 0.7, 0.85, 0.55
 """Mean cosine of the gates' directions with the ways through them: the smallest usual one, one that
 another reading of the yaws must reach, and one that is a mistake without another reading. On the
@@ -58,8 +68,8 @@ def track_notes(name: str, track: Track) -> list[str]:
         )
     yaw = np.arctan2(ahead_w[:, 1], ahead_w[:, 0])
     yaw_deg = np.rad2deg(yaw)
-    written = _in_radians(yaw_deg)
-    if written.any() and np.abs(yaw_deg).max() < 2.0 * np.pi + ROUNDING:
+    written = _in_radians(yaw_deg) & (np.abs(yaw_deg).max() < 2.0 * np.pi + ROUNDING)
+    if written.any():
         gate = int(np.argmax(written))
         notes.append(f"gate {gate} has a yaw of {yaw_deg[gate]:.4g} deg; is yaw_deg in radians?")
     way_w = way_w / np.maximum(length_m, 1e-9)[:, None]
@@ -75,14 +85,11 @@ def track_notes(name: str, track: Track) -> list[str]:
     for gate in np.flatnonzero((length_m[1:] > 1e-3) & (length_m[1:] < STEP_LEAST_M))[:1]:
         apart_m = length_m[gate + 1]
         notes.append(f"gates {gate} and {gate + 1} are only {apart_m:.2g} m apart; in metres?")
-    cosine = (way_w * ahead_w).sum(axis=1), (way_w[1:] * ahead_w[:-1]).sum(axis=1)
-    against = np.flatnonzero((cosine[0][:-1] < AGAINST) & (cosine[1] < AGAINST))
-    for gate in against[:1]:
-        notes.append(f"gate {gate} faces against the path to and from it; turn its yaw by 180 deg?")
-    if cosine[0][0] < AGAINST and 0 not in against:
+    turned = _turned(track, way_w, yaw)
+    if way_w[0] @ ahead_w[0] < AGAINST and not any(gate == 0 for gate, _ in turned):
         notes.append("the start is behind gate 0, on the side where the drone leaves it")
-    if not len(against) and not written.any():
-        notes += _misdirected(way_w, yaw)
+    if not written.any():
+        notes += _misdirected(way_w, yaw, turned)
     # A gate may be listed again, for another lap, but not next to itself.
     step_w, turn = np.diff(center_w, axis=0), (ahead_w[1:] * ahead_w[:-1]).sum(axis=1)
     for gate in np.flatnonzero((np.linalg.norm(step_w, axis=1) < 1e-3) & (turn > 0.999))[:1]:
@@ -90,24 +97,70 @@ def track_notes(name: str, track: Track) -> list[str]:
     return [f"{name}: {note}" for note in [*notes, *_misplaced(track)]]
 
 
-def _misdirected(way_w: np.ndarray, yaw: np.ndarray) -> list[str]:
-    """Return a note if the gates' directions are not along the path.
+def _turned(track: Track, way_w: np.ndarray, yaw: np.ndarray) -> list[tuple[int, float]]:
+    """Return the gates that are not along the path, with the cosine of their yaw with it.
+
+    The arguments are those of `_misdirected`. At an end, the path has the direction of the only way
+    there, or of a curve that continues the last turn, or leads to the other end of a closed path. A
+    start that the file leaves out is placed by gate 0, so that gate 0 is an end then.
+    """
+    gates, count = track.scene.gates, len(yaw)
+    if count < 2:
+        return []
+    step_w = np.diff(gates.center_w, axis=0, append=gates.center_w[:1])
+    length_m = np.linalg.norm(step_w, axis=1)
+    is_closed = count > 3 and length_m[-1] < CLOSED * length_m[:-1].max()
+    ways = np.vstack([way_w, step_w[-1:] / max(length_m[-1], 1e-9)])[:, :2]
+    angle, through = np.arctan2(ways[:, 1], ways[:, 0]), (ways[:-1] + ways[1:]) / 2.0
+    is_clear = np.linalg.norm(through, axis=1) > CLEAR_WAY
+    cosine = np.where(is_clear, np.cos(yaw - np.arctan2(through[:, 1], through[:, 0])), 1.0)
+    limit = np.full(count, ACROSS if count > 2 else AGAINST)
+
+    def at_end(gate: int, way: int, inner: int, closing_w: np.ndarray) -> None:
+        turn = np.angle(np.exp(1j * (angle[way] - angle[inner])))
+        paths = [angle[way], angle[way] + turn / 2.0]
+        if is_closed:
+            paths.append(float(np.arctan2(closing_w[1], closing_w[0])))
+        clear = np.linalg.norm(ways[way]), np.linalg.norm(closing_w) if is_closed else 1.0
+        cosine[gate] = np.cos(yaw[gate] - np.array(paths)).max() if min(clear) > CLEAR_WAY else 1.0
+        limit[gate] = min(limit[gate], ACROSS_AT_END)
+
+    at_end(count - 1, count - 1, count - 2, through[-1])
+    ahead_w = gates.rot_w[:, :, 0] * [1.0, 1.0, 0.0]
+    behind_w = START_BEHIND_M * ahead_w[0] / max(np.linalg.norm(ahead_w[0]), 1e-9)
+    if np.allclose(track.start_pos_w, gates.center_w[0] - behind_w):
+        at_end(0, 1, min(2, count - 1), (ways[-1] + ways[1]) / 2.0)
+    is_level = np.linalg.norm(ahead_w, axis=1) > CLEAR_WAY
+    return [(int(gate), cosine[gate]) for gate in np.flatnonzero(is_level & (cosine < limit))]
+
+
+def _misdirected(way_w: np.ndarray, yaw: np.ndarray, turned: list[tuple[int, float]]) -> list[str]:
+    """Return a note if the gates' directions are not along the path, or one is turned.
 
     `way_w` (N, 3) are unit vectors to each gate, and `yaw` (N,) the gates' yaws [rad]. The way
     through a gate is the mean of the horizontal ways to and from it; turns back have none.
     """
+    notes = [
+        f"gate {gate} faces "
+        + (
+            "against the path; turn its yaw by 180 deg?"
+            if cosine < AGAINST
+            else "across the path; check its yaw_deg, the direction of flight"
+        )
+        for gate, cosine in turned[:1]
+    ]
     through_w = (way_w + np.vstack([way_w[1:], way_w[-1:]]))[:, :2] / 2.0
     size = np.linalg.norm(through_w, axis=1)
     clear = size > 0.05
     if clear.sum() < 3:
-        return []
+        return notes
     way = np.arctan2(through_w[clear, 1], through_w[clear, 0])
 
     def along(read: np.ndarray) -> float:
         return float(np.cos(read[clear] - way).mean())
 
     if (found := along(yaw)) >= ALONG:
-        return []
+        return notes
     otherwise = {
         "with all yaws turned by 90 deg": along(yaw + np.pi / 2.0),
         "with all yaws turned by -90 deg": along(yaw - np.pi / 2.0),
@@ -118,7 +171,8 @@ def _misdirected(way_w: np.ndarray, yaw: np.ndarray) -> list[str]:
     text = f"the gates' directions are not along the path: their mean cosine is {found:.2f}"
     if otherwise[best] >= ALONG_OTHERWISE:
         return [f"{text}, {best} {otherwise[best]:.2f}; yaw_deg is the direction of flight"]
-    return [f"{text}; check the order of the gates and each yaw_deg"] if found < AMISS else []
+    order = [f"{text}; check the order of the gates and each yaw_deg"] if found < AMISS else []
+    return notes or order
 
 
 def _in_radians(yaw_deg: np.ndarray | float) -> np.ndarray:

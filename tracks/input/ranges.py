@@ -18,7 +18,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Annotated, Any, TypeGuard, get_args, get_type_hints
+from types import NoneType
+from typing import Annotated, Any, TypeGuard, get_args, get_origin, get_type_hints
 
 
 @dataclass(frozen=True)
@@ -36,12 +37,22 @@ class Range:
     ordered: bool = False
     """Whether a tuple's numbers must not decrease, as in a range from low to high."""
     whole: bool = False
-    """Whether only whole numbers are allowed; `_fields` takes it from the annotated type."""
+    """Whether only whole numbers are allowed; `_fields` takes it and the next from the type."""
+    size: Any = None
+    """Number of a tuple's numbers, `...` for any; None where the value is a single number."""
 
     def holds(self, value: float) -> bool:
         """Return whether `value` is allowed; NaN is not."""
         above_low = self.low < value if self.above else self.low <= value
         return above_low and (value < self.high if self.below else value <= self.high)
+
+    def of_kind(self) -> str:
+        """Return a text of the allowed type and interval."""
+        number = "whole number" if self.whole else "number"
+        if self.size is None:
+            return f"a {number}, {self}"
+        count = "" if self.size is ... else f"{self.size} "
+        return f"a tuple of {count}{number}s, each {self}"
 
     def __str__(self) -> str:
         first = f"above {_number(self.low)}" if self.above else _number(self.low)
@@ -79,7 +90,7 @@ PATH = (str, os.PathLike)
 
 
 def as_path(name: str, value: object, allowed: str = "a text or a path") -> Path:
-    """Return the argument `name` as a path.
+    """Return the argument `name` as a path; `~` at its start is the user's folder.
 
     Raises:
         ValueError: for an argument that is neither a text nor a path, or is empty.
@@ -87,7 +98,7 @@ def as_path(name: str, value: object, allowed: str = "a text or a path") -> Path
     check_type(name, value, PATH, allowed)
     if value == "":
         raise ValueError(f"{name} is '', allowed is {allowed}")
-    return Path(value)  # pyrefly: ignore[bad-argument-type]
+    return Path(os.path.expanduser(value))  # pyrefly: ignore[no-matching-overload]
 
 
 def check_ranges(config: Any, where: str = "", options: bool = False) -> None:
@@ -103,6 +114,9 @@ def check_ranges(config: Any, where: str = "", options: bool = False) -> None:
         name = f"--{path[-1].replace('_', '-')}" if options else where + ".".join(path)
         ends = value if isinstance(value, tuple) else (value,)
         text = " ".join(map(shown, ends)) if options else shown(value)
+        size = len(ends) if isinstance(value, tuple) else None
+        if size != allowed.size and (size is None or allowed.size is not ...):
+            raise ValueError(f"{name} is {text}, allowed is {allowed.of_kind()}")
         for end in ends:
             check_number(name, end, allowed, text)
         if allowed.ordered and list(ends) != sorted(ends):
@@ -116,20 +130,20 @@ def check_number(name: str, value: Any, allowed: Range, text: str = "") -> None:
         ValueError: with the name, the value, or `text` in its place, and what is allowed.
     """
     kind: Any = Integral if allowed.whole else Real
-    if isinstance(value, kind) and not isinstance(value, bool) and allowed.holds(value):
+    right = isinstance(value, kind) and not isinstance(value, bool)
+    if right and allowed.holds(value):
         return  # the texts below take longer than the check
-    number = "a whole number" if allowed.whole else "a number"
-    check_type(name, value, (kind,), f"{number}, {allowed}")
-    raise ValueError(f"{name} is {text or shown(value)}, allowed is {allowed}")
+    allowed_text = str(allowed) if right else allowed.of_kind()
+    raise ValueError(f"{name} is {text or shown(value)}, allowed is {allowed_text}")
 
 
 def ranged(config: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any, Range]]:
     """Yield (path, value, range) of every number with a range, also in nested dataclasses."""
-    for name, display_name, allowed in _fields(type(config)):
+    for name, display_name, allowed, optional in _fields(type(config)):
         value = getattr(config, name)
         if dataclasses.is_dataclass(value):
             yield from ranged(value, (*path, display_name))
-        elif allowed is not None and value is not None:
+        elif allowed is not None and not (optional and value is None):
             yield (*path, display_name), value, allowed
 
 
@@ -142,8 +156,9 @@ def is_finite(value: float) -> bool:
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Return whether a value of a file is a finite number; true and false are not."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and is_finite(value)
+    """Return whether a value is a finite number, numpy's included; true and false are not."""
+    known: Any = value
+    return isinstance(value, Real) and not isinstance(value, bool) and is_finite(known)
 
 
 def shown(value: object) -> str:
@@ -156,19 +171,22 @@ def shown(value: object) -> str:
 
 
 @functools.cache
-def _fields(cls: type) -> tuple[tuple[str, str, Range | None], ...]:
-    """Return (name, name in messages, range) of the fields of a dataclass."""
+def _fields(cls: type) -> tuple[tuple[str, str, Range | None, bool], ...]:
+    """Return (name, name in messages, range, whether it may be None) of a dataclass's fields."""
     hints = get_type_hints(cls, include_extras=True)
     fields = []
     for field in dataclasses.fields(cls):
         types = list(_types(hints[field.name]))
         metadata = [entry for part in types for entry in getattr(part, "__metadata__", ())]
         allowed = next((entry for entry in metadata if isinstance(entry, Range)), None)
-        if allowed and float not in types:
-            allowed = dataclasses.replace(allowed, whole=int in types)
+        if allowed:
+            parts = next((get_args(part) for part in types if get_origin(part) is tuple), None)
+            whole = allowed.whole if float in types else int in types
+            size = parts and (... if ... in parts else len(parts))
+            allowed = dataclasses.replace(allowed, whole=whole, size=size)
         names = (getattr(entry, "name", None) for entry in metadata)
         display_name = next((name for name in names if isinstance(name, str)), field.name)
-        fields.append((field.name, display_name, allowed))
+        fields.append((field.name, display_name, allowed, NoneType in types))
     return tuple(fields)
 
 

@@ -81,8 +81,9 @@ def test_arrays_are_written_as_numbers(tmp_path):
     vehicle_file.save_vehicle(vehicle, tmp_path / "v.toml")
     loaded = vehicle_file.load_vehicle(tmp_path / "v.toml")
     assert loaded == with_effects(linear_drag=((0.1, 0.2, 0.3),), mass_offset=(0.1,))
-    vehicle_file.save_vehicle(replace(PLAIN, mass=np.float64(0.7)), tmp_path / "v.toml")
-    assert vehicle_file.load_vehicle(tmp_path / "v.toml") == replace(PLAIN, mass=0.7)
+    for kind in (np.float64, np.float32):
+        vehicle_file.save_vehicle(replace(PLAIN, mass=kind(0.7)), tmp_path / "v.toml")
+        assert vehicle_file.load_vehicle(tmp_path / "v.toml") == replace(PLAIN, mass=kind(0.7))
 
 
 def test_an_impossible_vehicle_is_not_written(tmp_path):

@@ -1,5 +1,7 @@
 """Notes on probable mistakes in a track from a file."""
 
+import math
+
 import pytest
 
 from tests.tracks.formats.test_custom import GATE, write
@@ -42,6 +44,12 @@ def test_probable_mistakes_in_a_track_are_noted(tmp_path, text, said):
 
 PLACES, YAWS = ([0, 0, 1.3], [5, 1, 1.5], [9, 4, 1.3], [9, 9, 1.5]), (0.0, 15.0, 60.0, 100.0)
 
+LINE = [[5 * k, 0, 1.5] for k in range(8)], [0.0] * 8
+OVAL = (
+    [[8 * math.sin(k * math.pi / 4), -8 * math.cos(k * math.pi / 4), 1.5] for k in range(8)],
+    [45.0 * k for k in range(8)],
+)
+
 
 @pytest.mark.parametrize(
     ("places", "yaws", "said"),
@@ -51,7 +59,25 @@ PLACES, YAWS = ([0, 0, 1.3], [5, 1, 1.5], [9, 4, 1.3], [9, 9, 1.5]), (0.0, 15.0,
         (PLACES, [-yaw for yaw in YAWS], "with the opposite sign of all yaws 0.9"),
         (PLACES, [0.0, 0.26, 1.05, 1.75], "with yaws in radians 0.9"),
         ([PLACES[k] for k in (0, 2, 1, 3)], [YAWS[k] for k in (0, 2, 1, 3)], "check the order"),
-        (PLACES, [*YAWS[:3], 280.0], "check the order of the gates and each yaw_deg"),
+        *(
+            (
+                places,
+                [yaw + turn * (k == gate) for k, yaw in enumerate(yaws)],
+                f"gate {gate} {said}",
+            )
+            for places, yaws, gates, turn, said in (
+                (PLACES, YAWS, range(4), 180.0, "faces against"),
+                (*LINE, (0, 3, 7), 180.0, "faces against"),
+                (*LINE, (0, 3, 7), 90.0, "faces across"),
+                (*LINE, (0, 3, 7), -90.0, "faces across"),
+                (*OVAL, (0, 3, 7), 180.0, "faces against"),
+                (*OVAL, (3,), 90.0, "faces across"),
+            )
+            for gate in gates
+        ),
+        (*LINE, None),
+        (*OVAL, None),
+        ([*LINE[0][:3], [10, 0, 4.5]], [0.0, 0.0, 0.0, 180.0], None),  # up, and back above
     ],
 )
 def test_gates_that_do_not_face_along_the_path_are_noted(tmp_path, places, yaws, said):
@@ -65,9 +91,10 @@ def test_gates_that_do_not_face_along_the_path_are_noted(tmp_path, places, yaws,
 
 @pytest.mark.parametrize("family", ["zigzag", "circular", "ellipse", "random"])
 def test_tracks_of_the_families_face_along_their_path(family):
-    for level, seed in ((9, 1),):
-        notes = track_notes("one", make_track(family, level, seed))
-        assert not [note for note in notes if "along the path" in note]
+    for level in (0, 5, 9):
+        for seed in range(3):
+            notes = track_notes("one", make_track(family, level, seed))
+            assert not [note for note in notes if "the path" in note]
 
 
 def test_a_second_lap_through_the_same_gates_is_no_mistake(tmp_path):

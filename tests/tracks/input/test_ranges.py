@@ -7,18 +7,26 @@ import dataclasses
 import importlib
 import math
 import os
+import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, get_args, get_type_hints
 
+import numpy as np
 import pytest
 
+from policies.shipped import locate
 from suite.cli import COMMANDS
 from suite.delta.fit import FitConfig
 from suite.experiments import EXPERIMENTS
 from suite.train.config import QuadrotorConfig, TrainConfig
 from suite.train.ppo.config import PpoConfig
-from tracks.input.ranges import Range, as_path, check_ranges, is_finite, shown
+from tracks.common.toml_table import to_toml
+from tracks.geometry.camera import Camera
+from tracks.input.ranges import Range, as_path, check_ranges, is_finite, is_number, shown
 from tracks.input.reading import InputError, read_bytes, read_json, read_toml
+
+TWO = "allowed is a tuple of 2 numbers, each 1 to 179$"
 
 
 @dataclass(frozen=True)
@@ -32,6 +40,13 @@ class Outer:
     inner: Inner = dataclasses.field(default_factory=Inner)
     late_s: Annotated[float, Range(0.0, 10.0, above=True)] | None = None
     seeds: tuple[Annotated[int, Range(0, 9)], ...] = ()
+    camera: Camera = Camera()
+
+
+INNER: Any = Inner
+OUTER: Any = Outer
+CAMERA: Any = Camera
+"""The classes for values of wrong types, which a type checker refuses."""
 
 
 @pytest.mark.parametrize(
@@ -45,6 +60,16 @@ class Outer:
         (Outer(Inner(span=(0.0, 2.5))), r"inner.span is \(0.0, 2.5\), allowed is 0 to 2"),
         (Outer(Inner(span=(2.0, 1.0))), "inner.span is .*give the lower end"),
         (Outer(Inner(depth=-1.0)), "inner.depth is -1.0, allowed is 0 and more, inf included"),
+        *(
+            (OUTER(camera=CAMERA(fov_deg=fov)), f"^camera.fov_deg is {re.escape(repr(fov))}, {TWO}")
+            for fov in ([80, 60], (80,), (80, 60, 1), 80, None, ("a", 60), (True, 60))
+        ),
+        (
+            OUTER(seeds=(1, "a")),
+            r"seeds is \(1, 'a'\), allowed is a tuple of whole numbers, each 0",
+        ),
+        (OUTER(INNER(depth=(1.0,))), r"inner.depth is \(1.0,\), allowed is a number, 0 and more"),
+        (OUTER(INNER(depth=None)), "inner.depth is None, allowed is a number"),
     ],
 )
 def test_what_is_outside_of_its_range_is_refused_by_name(config, words):
@@ -59,6 +84,20 @@ def test_an_empty_text_is_no_path():
     with pytest.raises(ValueError, match="policy is '', allowed is a text or a path"):
         as_path("policy", "")
     assert str(as_path("policy", ".")) == "."
+
+
+def test_a_path_may_begin_with_the_folder_of_the_user(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert as_path("out", "~/runs") == locate("~/runs") == tmp_path / "runs"
+    assert as_path("out", Path("~")) == tmp_path and str(as_path("out", "a/~")) == "a/~"
+
+
+def test_numbers_of_numpy_are_numbers():
+    camera = CAMERA(range_m=np.float32(9), fov_deg=(np.float64(80), np.int64(60)))
+    check_ranges(OUTER(late_s=np.float16(1.5), seeds=(np.int8(3),), camera=camera))
+    assert is_number(np.float32(1.5)) and is_number(np.int64(3)) and hash(camera)
+    assert not any(map(is_number, (np.bool_(True), True, np.float32("nan"), "1", None)))
+    assert to_toml({"a": np.float32(1.5), "b": [np.int64(3)]}) == "a = 1.5\nb = [3]\n"
 
 
 def test_numbers_that_no_float_can_hold_are_shown_short():
