@@ -339,14 +339,12 @@ def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first
     config = json.loads((tmp_path / "a" / "run.json").read_text())["config"]
     assert config["policy"]["name"] == "race" and config["limits"]["silence_s"] == 0.1
     assert config["link"] == "simulated" and config["evaluation"]["time_limit_s"] == 0.2
-    fast = load_policy("race")
-    assert isinstance(fast, BlockPolicy)
-    assumed = (Note("contract", "race: no contract in it", "write one"),)
-    fast = replace(fast, spec=replace(fast.spec, rate_hz=2000.0), notes=assumed)
+    fast = Pursuit(spec=PolicySpec(rate_hz=2000.0))
+    fast.notes = (Note("contract", "race: no contract in it", "write one"),)
     monkeypatch.setattr(fly, "load_in_manner", lambda *_: fast)
     said = refused(capsys, asked, tmp_path / "b")
     assert "spec.rate_hz is 2000" in said and "race: no contract in it; write one" in said
-    fast = replace(fast, spec=replace(fast.spec, action=ActionSpec("motors")))
+    fast = replace(load_policy("race"), spec=PolicySpec(action=ActionSpec("motors")))
     assert "race: commands motors" in refused(capsys, asked, tmp_path / "b")
     assert not (tmp_path / "b").exists()
 
