@@ -19,7 +19,7 @@ from tracks.common.work import Workers
 
 ROOT = Path(__file__).resolve().parents[3]
 """Folder of the project, which has the four packages."""
-NO_RESULT = ("view", "importers", "logs", "faults", "envs", "policy_checks")
+NO_RESULT = ("view", "importers", "logs", "faults", "envs", "policy_checks", "input")
 """Names of the folders within packages whose code cannot change a flight."""
 FLIES = ("tracks", "policies", "eval")
 """Packages whose code can change a flight."""
