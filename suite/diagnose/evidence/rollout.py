@@ -47,7 +47,7 @@ def fly_windows(
         offset: (B, F) corrections of the start numbers: 12 of the measured start state, then those
             of the rotor speeds, at the knots if these are the input, else at the start.
         windows: B windows.
-        push: (B, KNOTS, 6) additional force and torque at the knots, see `Inputs.push_b`.
+        push: (B, K, 6) additional force and torque at K knots, see `Inputs.push_b`.
     """
     burn_in = windows.burn_in_rate_b.shape[1]
     edge_s, sample_s = jnp.asarray(windows.edge_s), jnp.asarray(windows.sample_s)
@@ -69,7 +69,7 @@ def fly_windows(
     rotor_speed = None
     if rotor_input:
         error = offset[:, STATE:].reshape(-1, KNOTS, 4)
-        rotor_speed = jnp.asarray(windows.rotor_speed) - jnp.matmul(_hats(middle_s), error)
+        rotor_speed = jnp.asarray(windows.rotor_speed) - jnp.matmul(_hats(middle_s, KNOTS), error)
         rotor_speed = jnp.swapaxes(rotor_speed, 0, 1)
         begin_speed = rotor_speed[0]
     else:
@@ -80,7 +80,7 @@ def fly_windows(
         unpack_command(command[burn_in:]),
         rotor_speed,
         voltage_drop=jnp.swapaxes(jnp.asarray(windows.voltage_drop), 0, 1) if voltage else None,
-        push_b=None if push is None else jnp.swapaxes(jnp.matmul(_hats(middle_s), push), 0, 1),
+        push_b=None if push is None else _push_at(middle_s, push),
     )
     spans = jax.tree.map(lambda field: field[burn_in:], spans)
     begin_s = jnp.asarray(windows.start_s)
@@ -181,10 +181,15 @@ def _acting_commands(windows: FlightWindows, delay: Any) -> Any:
     return (until - since) / held_s[..., None]
 
 
-def _hats(time_s: Any) -> Any:
-    """Return the hat function (B, S, KNOTS) of each knot at `time_s` (B, S) [s]: 1 at its knot."""
-    place = time_s / LENGTH_S * (KNOTS - 1)
-    return jnp.maximum(0.0, 1.0 - jnp.abs(place[..., None] - jnp.arange(KNOTS)))
+def _push_at(time_s: Any, push: Any) -> Any:
+    """Return the push (S, B, 6), linear between its K knots (B, K, 6), at `time_s` (B, S) [s]."""
+    return jnp.swapaxes(jnp.matmul(_hats(time_s, push.shape[1]), push), 0, 1)
+
+
+def _hats(time_s: Any, knots: int) -> Any:
+    """Return the hat function (B, S, K) of each of K `knots` at `time_s` (B, S) [s]: 1 at it."""
+    place = time_s / LENGTH_S * (knots - 1)
+    return jnp.maximum(0.0, 1.0 - jnp.abs(place[..., None] - jnp.arange(knots)))
 
 
 def _places(time_s: Any, edge_s: Any) -> Any:

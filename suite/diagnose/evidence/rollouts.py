@@ -250,15 +250,18 @@ class RolloutModel:
         """Return measured - simulated (W, N, 19) at the estimate `at`."""
         return self.linearise(at, windows, []).residual
 
-    def respond(self, at: Estimate, windows: FlightWindows) -> tuple[Linearisation, Flight]:
+    def respond(
+        self, at: Estimate, windows: FlightWindows, knots: int = KNOTS
+    ) -> tuple[Linearisation, Flight]:
         """Return residuals and slopes along disturbances, and the states (W, KNOTS, ...) at knots.
 
-        These are a force [m/s^2] and torque [rad/s^2] in body axes at one of the knots each.
+        These are a force [m/s^2] and torque [rad/s^2] in body axes at one of K `knots` each.
         """
         with jax.enable_x64(True):
             parts = [
                 jax.tree.map(
-                    lambda x, n=own: np.asarray(x)[:n], self._respond(self.given, at.theta, x, w)
+                    lambda x, n=own: np.asarray(x)[:n],
+                    self._respond(self.given, at.theta, x, w, knots),
                 )
                 for x, w, own in batches(at.free, windows._replace(input_error=None))
             ]
@@ -297,17 +300,18 @@ def compiled(
         return difference(values, integrator, flown, windows), flown
 
     def respond(
-        given: VehicleArrays, theta: Any, offset: Any, windows: FlightWindows
+        given: VehicleArrays, theta: Any, offset: Any, windows: FlightWindows, knots: int
     ) -> tuple[Any, Any, Flight]:
-        none = jnp.zeros((BATCH, KNOTS, 6))
+        none = jnp.zeros((BATCH, knots, 6))
 
         def along(direction: Any) -> Any:
-            tangent = jnp.broadcast_to(direction.reshape(KNOTS, 6), none.shape)
+            tangent = jnp.broadcast_to(direction.reshape(knots, 6), none.shape)
             pushed = partial(fly, given, theta, offset, windows)
             return jax.jvp(pushed, (none,), (tangent,), has_aux=True)
 
-        error, slopes, flown = jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(KNOTS * 6))
+        error, slopes, flown = jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(knots * 6))
         return -error, slopes, at_knots(flown, windows)
 
     linear = slopes_along(lambda *inputs: fly(*inputs)[0])
-    return fly, *(jax.jit(each, compiler_options=COMPILED) for each in (linear, respond))
+    compile_ = partial(jax.jit, compiler_options=COMPILED)
+    return fly, compile_(linear), compile_(respond, static_argnums=4)

@@ -2,10 +2,10 @@
 
 If the drone received commands between the rows of the log, these are taken as the mean of their
 neighbours. The true ones gave another thrust and torque. How large they are is estimated by a
-comparison with commands that hold until the next row, since the truth lies about as far on the
-other side. Thrust and torque at the knots of a window become nuisance parameters of this size, and
-what changes faster than the knots counts as noise. Commands at uncertain times (jitter) have such
-an error, too; there the comparison is with commands whose times are shifted by chance.
+comparison with commands that differ from the mean by chance. Thrust and torque at the knots of a
+window become nuisance parameters of this size, and what changes faster than the knots counts as
+noise. Commands at uncertain times (jitter) have such an error, too; there the comparison is with
+commands whose times are shifted by chance.
 """
 
 from __future__ import annotations
@@ -22,6 +22,14 @@ from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.thresholds import Thresholds
 
+FINE_KNOTS = 26
+"""Number of knots of a window for the error of unknown commands, 0.04 s apart: these change with
+each decision. Errors that last for less than the time between knots act as one that lasts so long;
+with fewer knots they would count as noise that is independent from row to row."""
+BETWEEN = 2.0 / 3.0
+"""Variance of an unknown command about its best estimate by the logged ones, relative to that of a
+logged command about the mean of its neighbours: 2/3 if commands are independent, 1/2 if they are a
+random walk, and less if they are smooth."""
 WIDE = 100.0
 """Standard deviation of an unknown thrust [m/s^2] and torque [rad/s^2] that data determine."""
 FORCE, COMMANDED = slice(0, 3), slice(2, 6)
@@ -105,14 +113,14 @@ def _share(
     return Share(float(best[0] / size[0]), float(error))
 
 
-def push_slopes(model: RolloutModel, linear: Linearisation) -> np.ndarray:
-    """Return slopes (W, N, 19, KNOTS, 6) along a push at a knot: force [m/s^2], torque [rad/s^2].
+def push_slopes(model: RolloutModel, linear: Linearisation, knots: int = KNOTS) -> np.ndarray:
+    """Return slopes (W, N, 19, K, 6) along a push at a knot: force [m/s^2], torque [rad/s^2].
 
     `FORCE` and `COMMANDED` are parts of its axes.
     """
     at = Estimate(model.space.array("start"), linear.offset)
-    slope = model.respond(at, linear.windows)[0].slope
-    return slope.reshape(*slope.shape[:3], KNOTS, 6)
+    slope = model.respond(at, linear.windows, knots)[0].slope
+    return slope.reshape(*slope.shape[:3], knots, 6)
 
 
 def with_input_error(
@@ -128,6 +136,56 @@ def with_input_error(
     if windows.input_error is not None:
         columns = np.concatenate([windows.input_error, columns], axis=-1)
     return windows._replace(input_error=columns)
+
+
+def with_weight_errors(model: RolloutModel, linear: Linearisation) -> FlightWindows:
+    """Return the windows of `linear` with errors of the weights in the mean of two commands.
+
+    Commands follow the flight, so that one in between may be nearer to the command before it than
+    to the next. And a part of each command may be noise, so that the mean of more commands is
+    nearer. One standard deviation of either, for thrust and each rate, is the difference of the
+    mean from the command before alone, and from the mean of the next but one on both sides.
+    """
+    windows, at = linear.windows, Estimate(model.space.array("start"), linear.offset)
+    known, bend = _known(windows)
+    columns = list[np.ndarray]()
+    for change in (-0.5 * np.diff(known, axis=1), -bend[:, :-1] - bend[:, 1:]):
+        for channel in np.eye(4):
+            other = _with_between(windows, change * channel)
+            columns.append(_zeroed(model.residual(at, other) - linear.residual)[0])
+    return with_input_error(windows, np.stack(columns, axis=-1)[..., None, :], 1.0)
+
+
+def as_likely(windows: FlightWindows) -> FlightWindows:
+    """Return `windows` with commands between the rows that are as likely as the mean of two.
+
+    They differ from the mean by chance, as much as `BETWEEN` says.
+    """
+    known, bend = _known(windows)
+    size = np.sqrt(BETWEEN * 0.5 * (bend[:, :-1] ** 2 + bend[:, 1:] ** 2))
+    return _with_between(windows, size * np.random.default_rng(0).choice((-1.0, 1.0), size.shape))
+
+
+def _known(windows: FlightWindows) -> tuple[np.ndarray, np.ndarray]:
+    """Return the logged commands (W, C, 4), and how far each is from the mean of its neighbours."""
+    known = np.asarray(windows.command)[:, ::2]
+    bend = known[:, 1:-1] - 0.5 * (known[:, :-2] + known[:, 2:])
+    return known, np.pad(bend, ((0, 0), (1, 1), (0, 0)), mode="edge")
+
+
+def _with_between(windows: FlightWindows, change: np.ndarray) -> FlightWindows:
+    """Return `windows` with the commands between the rows changed by `change` (W, C, 4)."""
+    command_s, command = (np.array(x) for x in (windows.command_s, windows.command))
+    added = np.zeros_like(command)
+    added[:, 1 : 2 * change.shape[1] : 2] = change
+    # The place after a command, those that pad the windows, and two before, have no neighbours.
+    is_real = np.isfinite(command_s)
+    added[np.arange(command.shape[1]) >= is_real.sum(axis=1, keepdims=True) - 3] = 0.0
+    length_s = np.diff(np.where(is_real, command_s, 0.0))[..., None]
+    total = np.cumsum(length_s * added[:, :-1], axis=1)
+    command_sum = np.array(windows.command_sum)
+    command_sum[:, 1:] += total
+    return windows._replace(command=command + added, command_sum=command_sum)
 
 
 def unknown_commands(
@@ -148,7 +206,8 @@ def unknown_commands(
 
     wide, whitening = with_error(WIDE)
     _, change = project_out(whitening, wide)
-    values = WIDE * change[:, -KNOTS * 4 :, 0].reshape(-1, KNOTS, 4)
+    knots = push.shape[3]
+    values = WIDE * change[:, -knots * 4 :, 0].reshape(-1, knots, 4)
     power = (values**2).mean(axis=1)
     # A window's own error counts as much as that of all windows.
     error = np.maximum(np.sqrt(0.5 * (power + power.mean(axis=0))), LEAST_PUSH)

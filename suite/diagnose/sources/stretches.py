@@ -26,11 +26,14 @@ from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.sources.input_error import (
     COMMANDED,
+    FINE_KNOTS,
+    as_likely,
     push_slopes,
     share_between,
     unknown_commands,
     with_input_error,
     with_model_error,
+    with_weight_errors,
 )
 from suite.diagnose.sources.source import DiagnosisInput
 from suite.diagnose.thresholds import Thresholds
@@ -74,8 +77,10 @@ class Stretches:
         linear = self.model.linearise(start_estimate(self.model, windows), windows, [])
         if self.push_error is not None:
             error = np.sqrt((self.push_error**2).mean(axis=0))
-            push = push_slopes(self.model, linear)[..., COMMANDED]
+            push = push_slopes(self.model, linear, FINE_KNOTS)[..., COMMANDED]
             windows = with_input_error(windows, push, error)
+        if self.cut.keywords.get("between"):
+            windows = with_weight_errors(self.model, linear._replace(windows=windows))
         flies = _finite(linear, self.limits)
         return take(windows, flies), int((~flies).sum())
 
@@ -119,7 +124,7 @@ def simulated_stretches(
             made = replace(made, coarser=coarser, coarser_share=0.5 if dense else 2.0)
     if not rotor_input and any(map(command_jitter_s, logs)):
         jittered = take(windows_of(jitter=True)[0], is_finite)
-        made, _ = _with_unknown(made, jittered)
+        made = _with_unknown(made, jittered)
     commands = [
         (log.time_s, log.rate_cmd_b)
         for log in logs
@@ -152,21 +157,22 @@ def _with_unknown_commands(made: Stretches) -> Stretches:
     assert windows is not None  # the same flights had some before
     linear, is_finite = _simulated(made.model, windows, made.limits)
     held = take(held_of(like=windows)[0], is_finite)
-    made, held = _with_unknown(replace(made, cut=windows_of, linear=linear), held)
-    return replace(made, coarser=held, coarser_share=2.0)
+    made = _with_unknown(replace(made, cut=windows_of, linear=linear), as_likely(linear.windows))
+    linear = made.linear._replace(windows=with_weight_errors(made.model, made.linear))
+    held = held._replace(input_error=linear.windows.input_error)
+    return replace(made, linear=linear, coarser=held, coarser_share=2.0)
 
 
-def _with_unknown(made: Stretches, other: FlightWindows) -> tuple[Stretches, FlightWindows]:
-    """Return the stretches and the `other` windows with the error of their commands.
+def _with_unknown(made: Stretches, other: FlightWindows) -> Stretches:
+    """Return the stretches with the error of their commands.
 
-    Those are the same windows with commands that are as likely.
+    The `other` windows are the same with commands that are as likely.
     """
-    push = push_slopes(made.model, made.linear)[..., COMMANDED]
     difference = _difference(made.model, made.linear, other)
+    push = push_slopes(made.model, made.linear, FINE_KNOTS)[..., COMMANDED]
     error, limits = unknown_commands(made.linear, push, difference, made.limits)
-    windows, other = (with_input_error(w, push, error) for w in (made.linear.windows, other))
-    linear = made.linear._replace(windows=windows)
-    return replace(made, linear=linear, limits=limits, push_error=error), other
+    linear = made.linear._replace(windows=with_input_error(made.linear.windows, push, error))
+    return replace(made, linear=linear, limits=limits, push_error=error)
 
 
 def check_count(count: int, limits: Thresholds) -> None:
