@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, make_dataclass, replace
@@ -99,19 +100,24 @@ def run(config: Any, console: Console) -> dict[str, Any]:
 
         seconds: dict[str, float] = {}
         for name, words in published.PUBLISHED.items():
+            own = [name, *words.split()]
             console.say(f"{len(seconds) + 1} of {len(published.PUBLISHED)}: {name}")
             started = time.monotonic()
             # The options of a page are parsed as in a command of its own.
-            _, page = parse("reproduce", [name, *words.split()])
-            _make_page(replace(config, experiment=page.experiment), console)
+            _, page = parse("reproduce", own)
+            given = [part for word in sys.argv for part in (own if word == "all" else [word])]
+            _make_page(replace(config, experiment=page.experiment), given, console)
             seconds[name] = round(time.monotonic() - started, 1)
             console.say(f"{name}: {duration(seconds[name])}")
         return {"seconds": seconds}
-    return _make_page(config, console)
+    return _make_page(config, sys.argv, console)
 
 
-def _make_page(config: Any, console: Console) -> dict[str, Any]:
-    """Run the experiment of a page and write its files; return the page's numbers for --json."""
+def _make_page(config: Any, words: Sequence[str], console: Console) -> dict[str, Any]:
+    """Run the experiment of a page and write its files; return the page's numbers for --json.
+
+    `words` are those of the command that makes this page, for its facts.
+    """
     from suite.experiments.pages.document import Workspace, check_page, write_document
     from suite.experiments.study.options import check
 
@@ -122,4 +128,4 @@ def _make_page(config: Any, console: Console) -> dict[str, Any]:
     name, document = module.rpartition(".")[2], importlib.import_module(module).document
     check_page(workspace.out, name)
     contents = document(config.experiment, workspace, console)
-    return write_document(workspace, name, config.experiment, contents, console)
+    return write_document(workspace, name, config.experiment, contents, words, console)

@@ -30,6 +30,8 @@ BETWEEN = 2.0 / 3.0
 """Variance of an unknown command about its best estimate by the logged ones, relative to that of a
 logged command about the mean of its neighbours: 2/3 if commands are independent, 1/2 if they are a
 random walk, and less if they are smooth."""
+REACTION = 0.3
+"""Standard deviation of how much an unknown rate command depends on the measured rate."""
 WIDE = 100.0
 """Standard deviation of an unknown thrust [m/s^2] and torque [rad/s^2] that data determine."""
 FORCE, COMMANDED = slice(0, 3), slice(2, 6)
@@ -138,21 +140,25 @@ def with_input_error(
     return windows._replace(input_error=columns)
 
 
-def with_weight_errors(model: RolloutModel, linear: Linearisation) -> FlightWindows:
-    """Return the windows of `linear` with errors of the weights in the mean of two commands.
+def with_mean_errors(model: RolloutModel, linear: Linearisation) -> FlightWindows:
+    """Return the windows of `linear` with systematic errors of the mean of two commands.
 
     Commands follow the flight, so that one in between may be nearer to the command before it than
-    to the next. And a part of each command may be noise, so that the mean of more commands is
-    nearer. One standard deviation of either, for thrust and each rate, is the difference of the
-    mean from the command before alone, and from the mean of the next but one on both sides.
+    to the next. A part of each command may be noise, so that the mean of more commands is nearer.
+    And a policy reacts to the flight in between, which looks like another gain of the rate loop.
+    One standard deviation of these errors, for thrust and each rate, is the difference of the mean
+    from the command before alone, that from the mean of the next but one on both sides, and
+    `REACTION`.
     """
     windows, at = linear.windows, Estimate(model.space.array("start"), linear.offset)
     known, bend = _known(windows)
-    columns = list[np.ndarray]()
-    for change in (-0.5 * np.diff(known, axis=1), -bend[:, :-1] - bend[:, 1:]):
-        for channel in np.eye(4):
-            other = _with_between(windows, change * channel)
-            columns.append(_zeroed(model.residual(at, other) - linear.residual)[0])
+    other = (bend[:, :-1] + bend[:, 1:], 0.5 * np.diff(known, axis=1))
+    changes = [-change * channel for change in other for channel in np.eye(4)]
+    changes += [-REACTION * _rates_between(windows) * channel for channel in np.eye(4)[1:]]
+    columns = [
+        _zeroed(model.residual(at, _with_between(windows, change)) - linear.residual)[0]
+        for change in changes
+    ]
     return with_input_error(windows, np.stack(columns, axis=-1)[..., None, :], 1.0)
 
 
@@ -171,6 +177,20 @@ def _known(windows: FlightWindows) -> tuple[np.ndarray, np.ndarray]:
     known = np.asarray(windows.command)[:, ::2]
     bend = known[:, 1:-1] - 0.5 * (known[:, :-2] + known[:, 2:])
     return known, np.pad(bend, ((0, 0), (1, 1), (0, 0)), mode="edge")
+
+
+def _rates_between(windows: FlightWindows) -> np.ndarray:
+    """Return the measured rates at the commands between the rows (W, C, 4); the thrust is 0."""
+    between_s = np.asarray(windows.command_s)[:, 1:-1:2]
+    between_s = np.where(np.isfinite(between_s), between_s, 0.0)
+    rates = np.zeros((*between_s.shape, 4))
+    measured = np.asarray(windows.valid)[:, :, SLICES["rates"].start]  # all axes, or none
+    for one in np.flatnonzero(measured.any(axis=1)):
+        rows = measured[one]
+        row_s, rate_b = windows.row_s[one][rows], windows.row.rate_b[one][rows]
+        for axis in range(3):
+            rates[one, :, 1 + axis] = np.interp(between_s[one], row_s, rate_b[:, axis])
+    return rates
 
 
 def _with_between(windows: FlightWindows, change: np.ndarray) -> FlightWindows:

@@ -32,8 +32,8 @@ from suite.diagnose.sources.input_error import (
     share_between,
     unknown_commands,
     with_input_error,
+    with_mean_errors,
     with_model_error,
-    with_weight_errors,
 )
 from suite.diagnose.sources.source import DiagnosisInput
 from suite.diagnose.thresholds import Thresholds
@@ -80,7 +80,7 @@ class Stretches:
             push = push_slopes(self.model, linear, FINE_KNOTS)[..., COMMANDED]
             windows = with_input_error(windows, push, error)
         if self.cut.keywords.get("between"):
-            windows = with_weight_errors(self.model, linear._replace(windows=windows))
+            windows = with_mean_errors(self.model, linear._replace(windows=windows))
         flies = _finite(linear, self.limits)
         return take(windows, flies), int((~flies).sum())
 
@@ -158,8 +158,9 @@ def _with_unknown_commands(made: Stretches) -> Stretches:
     linear, is_finite = _simulated(made.model, windows, made.limits)
     held = take(held_of(like=windows)[0], is_finite)
     made = _with_unknown(replace(made, cut=windows_of, linear=linear), as_likely(linear.windows))
-    linear = made.linear._replace(windows=with_weight_errors(made.model, made.linear))
-    held = held._replace(input_error=linear.windows.input_error)
+    # Held commands are a limit case of other weights: they are fitted without these errors.
+    held = held._replace(input_error=made.linear.windows.input_error)
+    linear = made.linear._replace(windows=with_mean_errors(made.model, made.linear))
     return replace(made, linear=linear, coarser=held, coarser_share=2.0)
 
 

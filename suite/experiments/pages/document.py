@@ -7,7 +7,6 @@ In NAME.md the generated part is between two comments, with hand-written text ar
 from __future__ import annotations
 
 import shlex
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -50,12 +49,17 @@ def check_page(out: Path, name: str) -> None:
 
 
 def write_document(
-    workspace: Workspace, name: str, config: Any, contents: PageContents, console: Console
+    workspace: Workspace,
+    name: str,
+    config: Any,
+    contents: PageContents,
+    words: Sequence[str],
+    console: Console,
 ) -> dict[str, Any]:
     """Write the charts `name`.png, `name`-2.png, ..., `name`.json and `name`.md to `workspace.out`.
 
     The page is written last, after everything that it shows. The `seed` of `config` goes into the
-    stamp (version, commit, seed).
+    stamp (version, commit, seed), and `words`, those of the command, into the facts.
 
     Returns:
         The contents of `name`.json, and `out`, the page's path.
@@ -65,7 +69,7 @@ def write_document(
         OSError: if a file cannot be written.
     """
     header, page = stamp(SCHEMA, config.seed), workspace.out / f"{name}.md"
-    facts = {**contents.facts, **_provenance(header)}
+    facts = {**contents.facts, **_provenance(header, words)}
     # A new page has a title, a summary and an empty generated part.
     summary = EXPERIMENTS.get(name, name)
     new_page = f"# {name}\n\n{summary[0].upper()}{summary[1:]}.\n\n{BEGIN}\n{END}\n"
@@ -105,12 +109,12 @@ def _split_page(text: str, path: Path) -> tuple[str, str]:
     return before, after
 
 
-def _provenance(header: Mapping[str, Any]) -> dict[str, str]:
+def _provenance(header: Mapping[str, Any], words: Sequence[str]) -> dict[str, str]:
     """Return command, commit, machine and engines, for the facts of a page."""
     computer = machine()
     engines = (f"{key} {package_versions()[key]}" for key in ("mujoco", "jax", "numpy"))
     return {
-        "command": f"`{shlex.join(['suite', *sys.argv[1:]])}`",
+        "command": f"`{shlex.join(['suite', *words[1:]])}`",
         "commit": f"{header['git_commit']}, version {header['suite_version']}",
         "machine": f"{computer['processor']}, {computer['cores']} cores; {', '.join(engines)}",
     }

@@ -45,7 +45,7 @@ def made(number="1"):
 
 def test_a_page_has_its_facts_tables_and_figures_and_keeps_other_text(tmp_path):
     place = Workspace(tmp_path / "docs", tmp_path)
-    said = write_document(place, "schemes", Config(7), made(), Console())
+    said = write_document(place, "schemes", Config(7), made(), ["suite"], Console())
     text = (tmp_path / "docs" / "schemes.md").read_text()
     assert text.startswith("# schemes\n\nPPO, our method, and our method without the field")
     assert f"\n\n{BEGIN}\n\n- recipe: quick\n- command: `" in text and text.endswith(f"{END}\n")
@@ -57,12 +57,12 @@ def test_a_page_has_its_facts_tables_and_figures_and_keeps_other_text(tmp_path):
     # Made again, it keeps the text around what is made.
     page = tmp_path / "docs" / "schemes.md"
     page.write_text(page.read_text().replace("# schemes", "# My own title") + "\nWhat it means.\n")
-    write_document(place, "schemes", Config(7), made("3"), Console())
+    write_document(place, "schemes", Config(7), made("3"), ["suite"], Console())
     text = page.read_text()
     assert text.startswith("# My own title\n\nPPO, our method")
     assert text.endswith(f"{END}\n\nWhat it means.\n")
     assert "| 3 | 2 |" in text and "| 1 | 2 |" not in text
-    write_document(place, "schemes", Config(7), made("3"), Console())
+    write_document(place, "schemes", Config(7), made("3"), ["suite"], Console())
     assert page.read_text() == text
 
 
@@ -310,13 +310,17 @@ def test_a_page_is_older_than_another_policy_or_other_code(tmp_path, capsys):
 
 
 def test_all_makes_every_page_by_the_command_of_the_published_one(tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr(command, "_make_page", lambda config, console: asked.append(config) or {})
+    asked, said = [], []
+    monkeypatch.setattr(
+        command, "_make_page", lambda config, words, _: asked.append(config) or said.append(words)
+    )
+    monkeypatch.setattr("sys.argv", ["suite", "reproduce", "all", "--out", str(tmp_path)])
     _, config = parse("reproduce", ["all", "--out", str(tmp_path)])
     assert list(command.run(config, Console())["seconds"]) == list(published.PUBLISHED)
     assert [type(c.experiment).__module__.rpartition(".")[2] for c in asked] == list(
         published.PUBLISHED
     )
+    assert said[0] == ["suite", "reproduce", "table2", "--seed", "9600000", "--out", str(tmp_path)]
     assert set(published.PUBLISHED) <= set(EXPERIMENTS)
     assert all(replace(c, experiment=None) == replace(config, experiment=None) for c in asked)
     compared = []
