@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from suite.diagnose.data.noise import Linearisation, Noise, measured_noise
+from suite.diagnose.data.sampling import interpolate
 from suite.diagnose.data.whitening import Whitening, block_of, make_whitening, project_out
 from suite.diagnose.data.windows import KNOTS, SLICES, FlightWindows
 from suite.diagnose.estimate.block import Estimate
@@ -38,6 +39,12 @@ FORCE, COMMANDED = slice(0, 3), slice(2, 6)
 """Axes of a push: those of a force, and those of the thrust and torque by commands."""
 LEAST_PUSH = 1e-3
 """Lower limit of the error of thrust [m/s^2] and torque [rad/s^2]."""
+
+
+def residual_change(model: RolloutModel, linear: Linearisation, other: FlightWindows) -> np.ndarray:
+    """Return the residuals (W, N, 19) of windows with `other` inputs, minus those of `linear`."""
+    at = Estimate(model.space.array("start"), linear.offset)
+    return model.residual(at, other) - linear.residual
 
 
 def with_model_error(
@@ -150,13 +157,13 @@ def with_mean_errors(model: RolloutModel, linear: Linearisation) -> FlightWindow
     from the command before alone, that from the mean of the next but one on both sides, and
     `REACTION`.
     """
-    windows, at = linear.windows, Estimate(model.space.array("start"), linear.offset)
+    windows = linear.windows
     known, bend = _known(windows)
     other = (bend[:, :-1] + bend[:, 1:], 0.5 * np.diff(known, axis=1))
     changes = [-change * channel for change in other for channel in np.eye(4)]
     changes += [-REACTION * _rates_between(windows) * channel for channel in np.eye(4)[1:]]
     columns = [
-        _zeroed(model.residual(at, _with_between(windows, change)) - linear.residual)[0]
+        _zeroed(residual_change(model, linear, _with_between(windows, change)))[0]
         for change in changes
     ]
     return with_input_error(windows, np.stack(columns, axis=-1)[..., None, :], 1.0)
@@ -183,14 +190,10 @@ def _rates_between(windows: FlightWindows) -> np.ndarray:
     """Return the measured rates at the commands between the rows (W, C, 4); the thrust is 0."""
     between_s = np.asarray(windows.command_s)[:, 1:-1:2]
     between_s = np.where(np.isfinite(between_s), between_s, 0.0)
-    rates = np.zeros((*between_s.shape, 4))
-    measured = np.asarray(windows.valid)[:, :, SLICES["rates"].start]  # all axes, or none
-    for one in np.flatnonzero(measured.any(axis=1)):
-        rows = measured[one]
-        row_s, rate_b = windows.row_s[one][rows], windows.row.rate_b[one][rows]
-        for axis in range(3):
-            rates[one, :, 1 + axis] = np.interp(between_s[one], row_s, rate_b[:, axis])
-    return rates
+    measured = np.asarray(windows.valid)[..., SLICES["rates"]]
+    rate_b = np.where(measured, windows.row.rate_b, np.nan)
+    rates = map(interpolate, between_s, np.asarray(windows.row_s), rate_b)
+    return np.pad(np.stack([*rates]), ((0, 0), (0, 0), (1, 0)))
 
 
 def _with_between(windows: FlightWindows, change: np.ndarray) -> FlightWindows:

@@ -22,13 +22,13 @@ from suite.diagnose.data.windows import (
     has_times_of_commands,
     take,
 )
-from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.sources.input_error import (
     COMMANDED,
     FINE_KNOTS,
     as_likely,
     push_slopes,
+    residual_change,
     share_between,
     unknown_commands,
     with_input_error,
@@ -115,7 +115,7 @@ def simulated_stretches(
     # Flights that a simulator flew with Euler steps, driven by commands, have no such error.
     if integrator != "euler" or rotor_input:
         coarser = take(windows_of(like=windows, stride=2)[0], is_finite)
-        limits = with_model_error(linear, _difference(model, linear, coarser), limits)
+        limits = with_model_error(linear, residual_change(model, linear, coarser), limits)
         made = replace(made, limits=limits)
         if rotor_input:
             # See `RolloutSource.sizes` for these shares.
@@ -135,7 +135,7 @@ def simulated_stretches(
         return made, warnings
     # The drone may have received commands between the rows.
     between = take(windows_of(between=True)[0], is_finite)
-    difference, push = _difference(model, linear, between), push_slopes(model, linear)
+    difference, push = residual_change(model, linear, between), push_slopes(model, linear)
     share = share_between(made.linear, difference, push, made.limits)
     if share.are_lacking(limits):
         return _with_unknown_commands(made), [*warnings, LACKING]
@@ -169,7 +169,7 @@ def _with_unknown(made: Stretches, other: FlightWindows) -> Stretches:
 
     The `other` windows are the same with commands that are as likely.
     """
-    difference = _difference(made.model, made.linear, other)
+    difference = residual_change(made.model, made.linear, other)
     push = push_slopes(made.model, made.linear, FINE_KNOTS)[..., COMMANDED]
     error, limits = unknown_commands(made.linear, push, difference, made.limits)
     linear = made.linear._replace(windows=with_input_error(made.linear.windows, push, error))
@@ -196,12 +196,6 @@ def _simulated(
     linear = model.linearise(start_estimate(model, windows), windows)
     is_finite = _finite(linear, limits)
     return take(linear, is_finite), is_finite
-
-
-def _difference(model: RolloutModel, linear: Linearisation, other: FlightWindows) -> np.ndarray:
-    """Return the residuals (W, N, 19) of windows with `other` inputs, minus those of `linear`."""
-    at = Estimate(model.space.array("start"), linear.offset)
-    return model.residual(at, other) - linear.residual
 
 
 def _finite(linear: Linearisation, limits: Thresholds) -> np.ndarray:
